@@ -1,0 +1,91 @@
+"""The vocabulary that every folder shares: channels, samples, windows, estimates, tallies.
+
+A leaf: it imports NumPy and nothing of this project.  Letters used everywhere:
+B batch, T samples, C channels, F frequencies, E elements, N states, P parameters, S sensors.
+Times are int64 nanoseconds since the Unix epoch; values are SI, float64; NaN means "not measured".
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+Outcome = Literal["used", "repaired", "dropped"]
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One measured signal of a system file and where recordings keep it."""
+
+    name: str  # "wheel_11l.displacement", "car_1l"
+    unit: str  # "m", "m/s", "m/s^2", "N"
+    noise: float  # standard deviation of one sample, in `unit`
+    mcap: str | None = None  # "/topic.field"
+    can: str | None = None  # "Message.Signal"
+    csv: str | None = None  # "column"
+
+
+@dataclass(frozen=True, slots=True)
+class SampleBlock:
+    """A run of samples in the order in which a reader met them (columnar for speed)."""
+
+    time: IntArray  # ns since epoch, shape (n,)
+    channel: NDArray[np.int32]  # index into the channels the reader was given, shape (n,)
+    value: FloatArray  # SI, shape (n,); NaN where the sender marked the value invalid
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """tau consecutive samples of every channel on one even time grid."""
+
+    start: int  # time of the first sample, ns since epoch
+    sample_rate: float  # Hz
+    values: FloatArray  # shape (T, C), columns in the order of the system's channels; NaN column = absent
+    outcome: Outcome = "used"
+    reason: str | None = None  # why it was repaired or dropped
+    repaired_samples: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What one window told about the P parameters: log-ratios to nominal, with their covariance."""
+
+    log_ratio: FloatArray  # log(theta / nominal), shape (P,)
+    covariance: FloatArray  # of log_ratio, shape (P, P); the prior's where not identifiable
+    identifiable: BoolArray  # shape (P,)
+    nrmse: float  # rms(error) / rms(measured), pooled over sensors
+    per_sensor: FloatArray  # nrmse of each sensor, shape (S,); NaN for an absent sensor
+    chi_square: float  # weighted residual power per degree of freedom, 1 when the model fits
+    adequate: bool  # False: the window does not fit the model; do not trust the numbers
+    converged: bool
+    iterations: int
+    states: FloatArray | None = None  # simulated states, shape (T, N), only when asked for
+
+
+@dataclass(slots=True)
+class Tally:
+    """Every message accounted for; `foreign` are messages that the system file does not name."""
+
+    used: int = 0
+    repaired: int = 0
+    dropped: int = 0
+    corrupt: int = 0
+    foreign: int = 0
+    reasons: Counter[str] = field(default_factory=Counter)
+
+    def as_dict(self) -> dict[str, int]:
+        return {
+            "used": self.used,
+            "repaired": self.repaired,
+            "dropped": self.dropped,
+            "corrupt": self.corrupt,
+            "foreign": self.foreign,
+        }
