@@ -1,0 +1,206 @@
+"""Assembly of a lumped system: M q'' + C q' + K q = loads, linear in masses, stiffnesses and dampings.
+
+    deflection      d = H q + G s            (E,)  s: displacements of the moving supports
+    element force   f = k d + c d'           (E,)  positive in extension
+    equations       M q'' = -H^T f + F p     (n,)  p: measured forces
+    sensors         accelerations etc. of points, deflections or forces of elements
+
+States are x = [q, q'] with q ordered [z, roll, pitch] body by body.  The drive vector of the state equations is
+u = [s1, s1', s2, s2', ..., p1, ...] in the order of the file's inputs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from model.schema import Body, ElementSensor, ForceInput, SupportInput, SystemFile
+from model.signals import FloatArray, IntArray
+
+ACCELERATION, VELOCITY, DISPLACEMENT, DEFLECTION, FORCE = range(5)
+SENSOR_KINDS = ("acceleration", "velocity", "displacement", "deflection", "force")
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One mode of free vibration."""
+
+    frequency: float  # undamped natural frequency, Hz
+    damping_ratio: float  # share of critical damping
+    shape: FloatArray  # displacements, largest entry 1, shape (n,), complex magnitude with sign
+    body: str  # the body that moves most (kinetic energy)
+
+
+@dataclass(frozen=True, slots=True)
+class Mechanics:
+    """The constant matrices of a system; element values and masses multiply them."""
+
+    dofs: tuple[str, ...]  # "car.z", "car.roll", ..., n of them
+    body_of_dof: IntArray  # index of the body, shape (n,)
+    mass: FloatArray  # nominal mass or inertia of each degree of freedom, shape (n,)
+    stiffness: FloatArray  # nominal, N/m, shape (E,)
+    damping: FloatArray  # nominal, N s/m, shape (E,)
+    H: FloatArray  # deflection per degree of freedom, shape (E, n)
+    G: FloatArray  # deflection per support displacement, shape (E, supports)
+    F: FloatArray  # generalised force per measured force, shape (n, forces)
+    S: FloatArray  # motion sensors: row over degrees of freedom; zero for element sensors, shape (S, n)
+    L: FloatArray  # element sensors: row over elements, shape (S, E)
+    sensor_kind: IntArray  # ACCELERATION .. FORCE, shape (S,)
+    support_drive: IntArray  # index in u of each support's displacement (its rate follows), shape (supports,)
+    force_drive: IntArray  # index in u of each force, shape (forces,)
+
+    @property
+    def n(self) -> int:
+        return len(self.dofs)
+
+    @property
+    def drives(self) -> int:
+        """Length of u."""
+        return 2 * len(self.support_drive) + len(self.force_drive)
+
+    def matrices(
+        self, stiffness: FloatArray | None = None, damping: FloatArray | None = None, mass: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A (2n, 2n), B (2n, u), C (S, 2n), D (S, u) for given element values; nominal where left out."""
+        k = self.stiffness if stiffness is None else stiffness
+        c = self.damping if damping is None else damping
+        m = self.mass if mass is None else mass
+        n, H, G = self.n, self.H, self.G
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:] = np.eye(n)
+        A[n:, :n] = -(H.T * k) @ H / m[:, None]
+        A[n:, n:] = -(H.T * c) @ H / m[:, None]
+        B = np.zeros((2 * n, self.drives))
+        B[n:, self.support_drive] = -(H.T * k) @ G / m[:, None]
+        B[n:, self.support_drive + 1] = -(H.T * c) @ G / m[:, None]
+        B[n:, self.force_drive] = self.F / m[:, None]
+        C, D = self._outputs(A, B, k, c)
+        return A, B, C, D
+
+    def _outputs(self, A: FloatArray, B: FloatArray, k: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+        n, kind = self.n, self.sensor_kind[:, None]
+        C = np.zeros((len(kind), 2 * n))
+        D = np.zeros((len(kind), self.drives))
+        C += np.where(kind == ACCELERATION, self.S @ A[n:], 0)
+        D += np.where(kind == ACCELERATION, self.S @ B[n:], 0)
+        C[:, n:] += np.where(kind == VELOCITY, self.S, 0)
+        C[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0)
+        of_deflection = np.where(kind == FORCE, self.L * k, np.where(kind == DEFLECTION, self.L, 0))
+        of_rate = np.where(kind == FORCE, self.L * c, 0)
+        C[:, :n] += of_deflection @ self.H
+        C[:, n:] += of_rate @ self.H
+        D[:, self.support_drive] += of_deflection @ self.G
+        D[:, self.support_drive + 1] += of_rate @ self.G
+        return C, D
+
+    def modes(self, bodies: tuple[str, ...]) -> list[Mode]:
+        """Modes at the nominal values, by rising frequency; rigid-body modes have frequency 0."""
+        A, *_ = self.matrices()
+        values, vectors = scipy.linalg.eig(A)
+        found = []
+        for i in np.argsort(np.abs(values)):
+            if values[i].imag < 0:
+                continue
+            shape = vectors[: self.n, i]
+            energy = self.mass * np.abs(shape) ** 2
+            per_body = np.bincount(self.body_of_dof, energy, len(bodies))
+            peak = shape[np.argmax(np.abs(shape))]
+            omega = abs(values[i])
+            ratio = -values[i].real / omega if omega > 0 else 0.0
+            real_shape = np.real(shape / peak) if peak != 0 else np.zeros(self.n)
+            found.append(Mode(omega / (2 * np.pi), ratio, real_shape, bodies[int(np.argmax(per_body))]))
+        return found
+
+    def unobservable_mode(self, bodies: tuple[str, ...]) -> Mode | None:
+        """A mode that no sensor sees (Popov-Belevitch-Hautus test at the nominal values), or None."""
+        A, _, C, _ = self.matrices()
+        scale = np.concatenate([np.ones(self.n), np.full(self.n, max(1.0, np.abs(np.linalg.eigvals(A)).max()))])
+        A = A * scale[None, :] / scale[:, None]
+        C = C * scale[None, :]
+        C = C / np.maximum(np.abs(C).max(axis=1, keepdims=True), 1e-300)
+        A_norm = max(np.abs(A).max(), 1e-300)
+        values = np.linalg.eigvals(A)
+        for value in values:
+            pencil = np.vstack([(value * np.eye(len(A)) - A) / A_norm, C])
+            if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-9:
+                frequency = abs(value) / (2 * np.pi)
+                return min(self.modes(bodies), key=lambda mode: abs(mode.frequency - frequency))
+        return None
+
+
+def assemble(file: SystemFile) -> Mechanics:
+    """Mechanics of a checked system file."""
+    first_dof: dict[str, int] = {}
+    dofs: list[str] = []
+    body_of_dof: list[int] = []
+    mass: list[float] = []
+    for index, (name, body) in enumerate(file.bodies.items()):
+        first_dof[name] = len(dofs)
+        for axis, inertia in (("z", body.mass.value), ("roll", body.roll_inertia), ("pitch", body.pitch_inertia)):
+            if inertia is not None:
+                dofs.append(f"{name}.{axis}")
+                body_of_dof.append(index)
+                mass.append(inertia)
+    n = len(dofs)
+
+    def point(name: str, position: tuple[float, float] | None) -> FloatArray:
+        """Vertical motion of a point of a body as a row over degrees of freedom."""
+        body: Body = file.bodies[name]
+        x, y = position if position is not None else body.position
+        row = np.zeros(n)
+        at = first_dof[name]
+        row[at] = 1.0
+        if body.roll_inertia is not None:
+            at += 1
+            row[at] = y - body.position[1]
+        if body.pitch_inertia is not None:
+            row[at + 1] = x - body.position[0]
+        return row
+
+    supports = [name for name, source in file.inputs.items() if isinstance(source, SupportInput)]
+    forces = [name for name, source in file.inputs.items() if isinstance(source, ForceInput)]
+    support_drive: list[int] = []
+    force_drive: list[int] = []
+    at = 0
+    for source in file.inputs.values():
+        (support_drive if isinstance(source, SupportInput) else force_drive).append(at)
+        at += 2 if isinstance(source, SupportInput) else 1
+
+    H = np.zeros((len(file.elements), n))
+    G = np.zeros((len(file.elements), len(supports)))
+    for e, element in enumerate(file.elements.values()):
+        for end, sign in ((element.upper, 1.0), (element.lower, -1.0)):
+            if end in file.bodies:
+                H[e] += sign * point(end, element.position)
+            elif end != "ground":
+                G[e, supports.index(end)] += sign
+    F = np.zeros((n, len(forces)))
+    for i, name in enumerate(forces):
+        source = file.inputs[name]
+        assert isinstance(source, ForceInput)
+        F[:, i] = point(source.body, source.position)
+    S = np.zeros((len(file.sensors), n))
+    L = np.zeros((len(file.sensors), len(file.elements)))
+    elements = list(file.elements)
+    for i, sensor in enumerate(file.sensors.values()):
+        if isinstance(sensor, ElementSensor):
+            L[i, elements.index(sensor.element)] = 1.0
+        else:
+            S[i] = point(sensor.body, sensor.position)
+    return Mechanics(
+        dofs=tuple(dofs),
+        body_of_dof=np.array(body_of_dof),
+        mass=np.array(mass),
+        stiffness=np.array([e.stiffness.value for e in file.elements.values()]),
+        damping=np.array([e.damping.value for e in file.elements.values()]),
+        H=H,
+        G=G,
+        F=F,
+        S=S,
+        L=L,
+        sensor_kind=np.array([SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]),
+        support_drive=np.array(support_drive, dtype=np.int64),
+        force_drive=np.array(force_drive, dtype=np.int64),
+    )

@@ -1,0 +1,186 @@
+"""A system: its file, its mechanics, its channels and the parameters to estimate."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from model.mechanics import Mechanics, assemble
+from model.schema import ForceInput, SupportInput, SystemFile, SystemFileError, parse_system_file, read_system_file
+from model.signals import Channel, FloatArray
+
+BUNDLED = Path(__file__).parent / "systems"
+MANCHESTER = BUNDLED / "manchester.yaml"
+MANCHESTER_DBC = BUNDLED / "bogie.dbc"
+
+_UNITS = {
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "mass": "kg",
+    "acceleration": "m/s^2",
+    "velocity": "m/s",
+    "displacement": "m",
+    "deflection": "m",
+    "force": "N",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """One unknown: `primary_11l.stiffness`, `car.mass`."""
+
+    name: str
+    element: str  # the element, or the body of a mass
+    quantity: str  # stiffness | damping | mass
+    unit: str
+    nominal: float
+
+
+@dataclass(frozen=True)
+class System:
+    """A checked system.  Parameters are ordered element by element: all stiffnesses, all dampings, then masses.
+
+    A body's mass parameter scales its mass and its inertias together (a load that is spread like the body).
+    """
+
+    file: SystemFile
+
+    @property
+    def name(self) -> str:
+        return self.file.name
+
+    @property
+    def sample_rate(self) -> float:
+        return self.file.sample_rate
+
+    @property
+    def window(self) -> int:
+        return self.file.window
+
+    @property
+    def hop(self) -> int:
+        """Samples between window starts; half a window unless the file says otherwise."""
+        return self.file.hop or max(1, self.file.window // 2)
+
+    @cached_property
+    def mechanics(self) -> Mechanics:
+        return assemble(self.file)
+
+    @cached_property
+    def elements(self) -> tuple[str, ...]:
+        return tuple(self.file.elements)
+
+    @cached_property
+    def bodies(self) -> tuple[str, ...]:
+        return tuple(self.file.bodies)
+
+    @cached_property
+    def sensors(self) -> tuple[str, ...]:
+        return tuple(self.file.sensors)
+
+    @cached_property
+    def inputs(self) -> tuple[Channel, ...]:
+        """Measured input signals, in the order of the file, displacement before velocity."""
+        channels = []
+        for name, source in self.file.inputs.items():
+            if isinstance(source, ForceInput):
+                channels.append(Channel(name, "N", source.noise, source.mcap, source.can, source.csv))
+                continue
+            for quantity, address in (("displacement", source.displacement), ("velocity", source.velocity)):
+                if address is not None:
+                    channels.append(
+                        Channel(
+                            f"{name}.{quantity}",
+                            _UNITS[quantity],
+                            address.noise,
+                            address.mcap,
+                            address.can,
+                            address.csv,
+                        )
+                    )
+        return tuple(channels)
+
+    @cached_property
+    def channels(self) -> tuple[Channel, ...]:
+        """Every measured signal: the inputs, then the sensors; the columns of a window."""
+        sensors = (
+            Channel(name, _UNITS[s.kind], s.noise, s.mcap, s.can, s.csv) for name, s in self.file.sensors.items()
+        )
+        return (*self.inputs, *sensors)
+
+    @cached_property
+    def drive_channels(self) -> tuple[int | None, ...]:
+        """For each entry of the drive vector u its column in a window; None: a support's unmeasured velocity."""
+        columns: list[int | None] = []
+        at = 0
+        for source in self.file.inputs.values():
+            columns.append(at)
+            at += 1
+            if isinstance(source, SupportInput):
+                columns.append(at if source.velocity is not None else None)
+                at += source.velocity is not None
+        return tuple(columns)
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        found = []
+        for quantity in ("stiffness", "damping"):
+            if quantity in self.file.estimate:
+                for name, element in self.file.elements.items():
+                    value = getattr(element, quantity)
+                    if not value.fixed:
+                        found.append(Parameter(f"{name}.{quantity}", name, quantity, _UNITS[quantity], value.value))
+        if "mass" in self.file.estimate:
+            for name, body in self.file.bodies.items():
+                if not body.mass.fixed:
+                    found.append(Parameter(f"{name}.mass", name, "mass", "kg", body.mass.value))
+        return tuple(found)
+
+    @cached_property
+    def nominal(self) -> FloatArray:
+        """Nominal values of the parameters, shape (P,)."""
+        return np.array([p.nominal for p in self.parameters])
+
+    @cached_property
+    def digest(self) -> str:
+        """Hash of everything that the mechanics depends on; addresses and comments do not count."""
+        keep = self.file.model_dump(mode="json")
+        for group in ("inputs", "sensors"):
+            for signal in keep[group].values():
+                for part in (signal, signal.get("displacement") or {}, signal.get("velocity") or {}):
+                    for address in ("mcap", "can", "csv"):
+                        part.pop(address, None)
+        keep.pop("hop")
+        return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def load_system(path: str | Path = MANCHESTER) -> System:
+    """Load and check a system file; the bundled Manchester vehicle by default.
+
+    Errors: `SystemFileError`, one line that names file, line and key, also when the sensors cannot observe the
+    system whose parameters are to be estimated.
+    """
+    return checked(System(read_system_file(path)), str(path))
+
+
+def parse_system(text: str, source: str = "system file") -> System:
+    """The same from text."""
+    return checked(System(parse_system_file(text, source)), source)
+
+
+def checked(system: System, source: str) -> System:
+    """Refuse a system whose sensors miss a whole mode: its parameters could not be told from any record."""
+    if not system.parameters:
+        return system
+    hidden = system.mechanics.unobservable_mode(system.bodies)
+    if hidden is not None:
+        raise SystemFileError(
+            f"{source}: sensors: no sensor sees the {hidden.frequency:.3g} Hz mode of {hidden.body}; "
+            f"add a sensor on {hidden.body} (or on an element attached to it)"
+        )
+    return system
