@@ -223,7 +223,7 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
         raise SystemFileError(f"{source}: {_explain(error, node)}") from None
 
 
-def _explain(error: ValidationError, node: yaml.Node) -> str:
+def _explain(error: ValidationError, node: yaml.Node | None) -> str:
     """The first problem as `line N: key: message`."""
     first = error.errors()[0]
     location = [str(part) for part in first["loc"]]
@@ -246,7 +246,7 @@ def _explain(error: ValidationError, node: yaml.Node) -> str:
     return f"line {line}: {'.'.join(keys)}: {message}"
 
 
-def _existing_keys(node: yaml.Node, location: list[str]) -> list[str]:
+def _existing_keys(node: yaml.Node | None, location: list[str]) -> list[str]:
     """Drop the parts of a pydantic location (union tags, validators) that are not keys of the file."""
     keys: list[str] = []
     for part in location:
@@ -258,7 +258,7 @@ def _existing_keys(node: yaml.Node, location: list[str]) -> list[str]:
     return keys
 
 
-def _child(node: yaml.Node, key: str) -> tuple[yaml.Node, yaml.Node] | None:
+def _child(node: yaml.Node | None, key: str) -> tuple[yaml.Node, yaml.Node] | None:
     if isinstance(node, yaml.MappingNode):
         for name, value in node.value:
             if name.value == key:
@@ -268,8 +268,8 @@ def _child(node: yaml.Node, key: str) -> tuple[yaml.Node, yaml.Node] | None:
     return None
 
 
-def _line_of(node: yaml.Node, keys: list[str]) -> int:
-    line = node.start_mark.line
+def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
+    line = node.start_mark.line if node is not None else 0
     for key in keys:
         child = _child(node, key)
         if child is None:

@@ -11,7 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from model.mechanics import Mechanics, assemble
-from model.schema import ForceInput, SupportInput, SystemFile, SystemFileError, parse_system_file, read_system_file
+from model.schema import (
+    Address,
+    ForceInput,
+    SupportInput,
+    SystemFile,
+    SystemFileError,
+    parse_system_file,
+    read_system_file,
+)
 from model.signals import Channel, FloatArray
 
 BUNDLED = Path(__file__).parent / "systems"
@@ -28,6 +36,10 @@ _UNITS = {
     "deflection": "m",
     "force": "N",
 }
+
+
+def _channel(name: str, quantity: str, at: Address) -> Channel:
+    return Channel(name, _UNITS[quantity], at.noise, at.mcap, at.can, at.csv)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,28 +101,17 @@ class System:
         channels = []
         for name, source in self.file.inputs.items():
             if isinstance(source, ForceInput):
-                channels.append(Channel(name, "N", source.noise, source.mcap, source.can, source.csv))
+                channels.append(_channel(name, "force", source))
                 continue
-            for quantity, address in (("displacement", source.displacement), ("velocity", source.velocity)):
-                if address is not None:
-                    channels.append(
-                        Channel(
-                            f"{name}.{quantity}",
-                            _UNITS[quantity],
-                            address.noise,
-                            address.mcap,
-                            address.can,
-                            address.csv,
-                        )
-                    )
+            channels.append(_channel(f"{name}.displacement", "displacement", source.displacement))
+            if source.velocity is not None:
+                channels.append(_channel(f"{name}.velocity", "velocity", source.velocity))
         return tuple(channels)
 
     @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Every measured signal: the inputs, then the sensors; the columns of a window."""
-        sensors = (
-            Channel(name, _UNITS[s.kind], s.noise, s.mcap, s.can, s.csv) for name, s in self.file.sensors.items()
-        )
+        sensors = (_channel(name, sensor.kind, sensor) for name, sensor in self.file.sensors.items())
         return (*self.inputs, *sensors)
 
     @cached_property
