@@ -1,0 +1,204 @@
+"""What a diagnosis says: the data behind the JSON of the contract and behind the pictures.
+
+`Report.to_dict()` is the public form.  `Report.evidence` holds the arrays that pictures are drawn from; every key is
+optional.  With T samples of the held-out part, S sensors in the system's order, i the number of a finding:
+
+    validation.time (T,) s, validation.measured / .baseline / .augmented (T, S), validation.noise (S,)
+    localization.names (L,), localization.score (L,)
+    finding.i.time / .deflection / .rate / .force_before / .force_after (n,)
+    finding.i.curve_axis ("deflection" | "rate"), .curve_x / .curve_mean / .curve_std / .curve_law (m,)
+    finding.i.loop_x / .loop_y (p,)
+    finding.i.map_d (a,), .map_v (b,), .map_force / .map_std (b, a)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """One identified number of the nominal structure."""
+
+    name: str  # "primary_11l.stiffness"
+    value: float
+    std: float
+    nominal: float
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "value": _number(self.value),
+            "std": _number(self.std),
+            "nominal": _number(self.nominal),
+            "unit": self.unit,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class LawParameter:
+    """One identified number of a law."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "name": self.name,
+            "value": _number(self.value),
+            "std": _number(self.std),
+            "unit": self.unit,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class FitFigures:
+    """Free-run error relative to the measured signal, on samples that no fit saw."""
+
+    nrmse: float  # sqrt of the mean over sensors of per_sensor^2
+    per_sensor: Mapping[str, float]  # rms(error) / rms(measured)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "nrmse": _number(self.nrmse),
+            "per_sensor": {k: _number(v) for k, v in self.per_sensor.items()},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One row of the evidence table: a law at a place, as it was tried."""
+
+    location: str
+    effect: str
+    score: float  # chi-square of the screening
+    p_value: float  # corrected for everything that was tried
+    delta_bic: float | None = None  # against the baseline; None: screened only
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "location": self.location,
+            "effect": self.effect,
+            "score": _number(self.score),
+            "p_value": _number(self.p_value),
+            "delta_bic": _number(self.delta_bic),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that was left out, where, and how surely."""
+
+    location: str  # element, body, sensor or input
+    effect: str  # a word of the contract's table
+    parameters: tuple[LawParameter, ...]
+    p_value: float
+    delta_bic: float  # against the model without this finding; negative: better
+    runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
+    runner_up_location: str | None = None
+    family: str | None = None  # where no single law beats its look-alikes
+    advice: str | None = None  # what would separate the look-alikes
+    sentence: str = ""
+    parameter_covariance: NDArray[np.float64] | None = None  # of `parameters`, shape (p, p)
+
+    def to_dict(self) -> dict[str, Any]:
+        result: dict[str, Any] = {
+            "location": self.location,
+            "effect": self.effect,
+            "parameters": [p.to_dict() for p in self.parameters],
+            "p_value": _number(self.p_value),
+            "delta_bic": _number(self.delta_bic),
+            "runner_up": None,
+            "sentence": self.sentence,
+        }
+        if self.runner_up is not None:
+            result["runner_up"] = {
+                "effect": self.runner_up[0],
+                "delta_bic": _number(self.runner_up[1]),
+            }
+            if self.runner_up_location is not None:
+                result["runner_up"]["location"] = self.runner_up_location
+        if self.family is not None:
+            result["family"] = self.family
+        if self.advice is not None:
+            result["advice"] = self.advice
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingFacts:
+    """What was diagnosed."""
+
+    file: str
+    seconds: float
+    samples: int
+    lost: int
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"file": self.file, "seconds": self.seconds, "samples": self.samples, "lost": self.lost}
+
+
+@dataclass(slots=True)
+class Report:
+    """The answer of one diagnosis."""
+
+    system: str
+    recording: RecordingFacts
+    verdict: Verdict
+    baseline: tuple[ParameterValue, ...]
+    baseline_validation: FitFigures
+    findings: tuple[Finding, ...]
+    augmented: tuple[ParameterValue, ...]
+    augmented_validation: FitFigures
+    noise_floor: FitFigures
+    localization: Mapping[str, float]  # location -> best score
+    candidates: tuple[Candidate, ...] = ()
+    changes: tuple[str, ...] = ()  # parameters that left their nominal value, in words
+    explained: float | None = None  # share of the excess error that the findings explain, held-out part
+    summary: str = ""
+    advice: tuple[str, ...] = ()  # what could not be decided and why
+    evidence: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON of the contract, with extra keys that readers may ignore."""
+        return {
+            "system": self.system,
+            "recording": self.recording.to_dict(),
+            "verdict": self.verdict,
+            "baseline": {
+                "parameters": [p.to_dict() for p in self.baseline],
+                "validation": self.baseline_validation.to_dict(),
+            },
+            "findings": [f.to_dict() for f in self.findings],
+            "augmented": {
+                "parameters": [p.to_dict() for p in self.augmented],
+                "validation": self.augmented_validation.to_dict(),
+            },
+            "noise_floor": self.noise_floor.to_dict(),
+            "localization": {k: _number(v) for k, v in self.localization.items()},
+            "candidates": [c.to_dict() for c in self.candidates],
+            "changes": list(self.changes),
+            "explained": _number(self.explained),
+            "summary": self.summary,
+            "advice": list(self.advice),
+        }
+
+    as_dict = to_dict
+
+
+def _number(value: float | None) -> float | None:
+    """A float that JSON can hold: None stands for what is not finite."""
+    if value is None or not math.isfinite(value):
+        return None
+    return float(value)
