@@ -1,0 +1,52 @@
+"""The account of one input: what became of every message, and what a user must be told about it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+from model.signals import Tally
+
+
+class UnreadableRecording(ValueError):
+    """The input cannot be read at all; the message is one line that says what, where and what to do."""
+
+
+@dataclass(slots=True)
+class Account:
+    """Filled by a reader while it reads.
+
+    `tally` counts messages (MCAP messages, CAN frames, CSV rows): each exactly once, with a reason for each one
+    that was not used.  `values` counts single values of used messages that were treated as missing.
+    """
+
+    tally: Tally = field(default_factory=Tally)
+    values: Counter[str] = field(default_factory=Counter)  # reason -> values treated as missing
+    problems: list[str] = field(default_factory=list)  # one line each, for the user
+    incomplete: bool = False  # something that was recorded could not be read
+    vehicle: str | None = None
+    contents: Counter[str] = field(default_factory=Counter)  # topic or CAN id -> messages in the input
+
+    def drop(self, count: int, reason: str) -> None:
+        """Messages that the system file names but that carry nothing usable."""
+        if count:
+            self.tally.dropped += count
+            self.tally.reasons[reason] += count
+
+    def corrupt(self, count: int, reason: str) -> None:
+        """Messages that could not be read; the recording is incomplete."""
+        if count:
+            self.tally.corrupt += count
+            self.tally.reasons[reason] += count
+            self.incomplete = True
+
+    def foreign(self, count: int, reason: str = "not named by the system file") -> None:
+        """Messages that the system file does not name."""
+        if count:
+            self.tally.foreign += count
+            self.tally.reasons[reason] += count
+
+    def problem(self, line: str, *, incomplete: bool = True) -> None:
+        """One line for the user; by default it also marks the recording as incomplete."""
+        self.problems.append(line)
+        self.incomplete = self.incomplete or incomplete

@@ -1,0 +1,209 @@
+"""Vector BLF: log containers inflated one by one, their CAN objects read in columns.
+
+python-can makes one Python object per frame, which alone would take most of the time of a replay; its BLF
+writer and reader are the reference for the layout (and that of Toby Lorenz' vector_blf).  Objects other than CAN
+messages (markers, statistics, other buses) are not messages and are passed over.
+"""
+
+from __future__ import annotations
+
+import datetime
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from replay.account import Account, UnreadableRecording
+from replay.frames import FrameBlock
+
+FILE_HEADER = struct.Struct("<4sLBBBBBBBBQQLL8H8H")
+OBJECT_BASE = struct.Struct("<4sHHLL")  # signature, header size, header version, object size, type
+CONTAINER = struct.Struct("<H6xL4x")  # compression, inflated size
+CONTAINER_TYPE, ERROR_TYPES = 10, (2, 73, 104)
+CLASSIC_TYPES, FD_TYPE, FD64_TYPE = (1, 86), 100, 101
+HEADER_BYTES = {1: 32, 2: 40}  # base and rest, by header version
+TEN_MICROSECONDS = 1  # value of the object's flags: the time stamp counts 10 us, else 1 ns
+LARGEST_OBJECT = 1 << 28
+RESYNC_BYTES = 1 << 20
+
+
+def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
+    """Blocks of one container each; damage is skipped and put into the account."""
+    with path.open("rb") as file:
+        header = file.read(FILE_HEADER.size)
+        if len(header) < FILE_HEADER.size or header[:4] != b"LOGG":
+            raise UnreadableRecording(f"{path}: not a BLF file (it does not begin with LOGG)")
+        fields = FILE_HEADER.unpack(header)
+        file.seek(fields[1])
+        reader = _Objects(_system_time(fields[14:22], account), account)
+        for data in _containers(file, account):
+            yield from reader.read(data)
+    if reader.tail.strip(b"\0"):
+        account.problem(f"file ends inside an object after {reader.seconds:.1f} s; what came before was read")
+    expected = fields[12]  # number of objects that the writer counted; 0 when it did not finish
+    if account.incomplete and expected > reader.objects:
+        account.corrupt(expected - reader.objects, "in a part of the file that cannot be read")
+
+
+def _containers(file: BinaryIO, account: Account) -> Iterator[bytes | None]:
+    """Inflated containers in file order; None where something is missing between two of them."""
+    while base := file.read(OBJECT_BASE.size):
+        if len(base) < OBJECT_BASE.size:
+            account.problem("file ends inside a container header; what came before was read")
+            return
+        signature, _, _, size, kind = OBJECT_BASE.unpack(base)
+        if signature != b"LOBJ" or not OBJECT_BASE.size <= size <= LARGEST_OBJECT:
+            at = file.tell() - OBJECT_BASE.size
+            account.problem(f"no object at byte {at}: damaged; reading goes on at the next one")
+            yield None
+            if not _seek_object(file, at + 1):
+                return
+            continue
+        body = file.read(size - OBJECT_BASE.size)
+        file.read(size % 4)
+        cut = len(body) < size - OBJECT_BASE.size
+        if cut:
+            account.problem("file ends inside a container; what came before the cut was read")
+        if kind != CONTAINER_TYPE:
+            yield base + body
+            continue
+        if len(body) < CONTAINER.size:
+            return
+        yield _inflate(body, account)
+
+
+def _inflate(body: bytes, account: Account) -> bytes | None:
+    method, size = CONTAINER.unpack_from(body)
+    packed = body[CONTAINER.size :]
+    if method == 0:
+        return packed
+    if method != 2:
+        account.problem(f"a container with unknown compression {method} was passed over")
+        return None
+    try:
+        return zlib.decompressobj().decompress(packed, max(size, 1))
+    except zlib.error as error:
+        account.problem(f"a damaged container of {size} bytes was passed over ({error})")
+        return None
+
+
+def _seek_object(file: BinaryIO, position: int) -> bool:
+    """Place the file at the next object's signature."""
+    file.seek(position)
+    while block := file.read(RESYNC_BYTES):
+        found = block.find(b"LOBJ")
+        if found >= 0:
+            file.seek(position + found)
+            return True
+        position += max(len(block) - 3, 1)
+        file.seek(position)
+        if len(block) < RESYNC_BYTES:
+            return False
+    return False
+
+
+class _Objects:
+    """Cuts inflated data into objects; one that straddles two containers waits in `tail`."""
+
+    def __init__(self, start: int, account: Account) -> None:
+        self.start = start  # ns since epoch
+        self.account = account
+        self.tail = b""
+        self.objects = 0
+        self.seconds = 0.0  # last time seen, since the start of the measurement
+
+    def read(self, data: bytes | None) -> Iterator[FrameBlock]:
+        if data is None:  # the rest of a straddling object is lost
+            self.tail = b""
+            return
+        data = self.tail + data
+        offsets, kinds, end = self._walk(data)
+        self.tail = data[end:]
+        if not offsets:
+            return
+        self.objects += len(offsets)
+        octets = np.frombuffer(data, dtype=np.uint8)
+        block = _columns(octets, np.array(offsets), np.array(kinds), self.start, self.account)
+        if block is not None:
+            self.seconds = (int(block.time[-1]) - self.start) / 1e9
+            yield block
+
+    def _walk(self, data: bytes) -> tuple[list[int], list[int], int]:
+        """Offsets and types of the whole objects, and where the unfinished rest begins."""
+        offsets, kinds = [], []
+        find, unpack, total = data.find, OBJECT_BASE.unpack_from, len(data)
+        position = 0
+        while position + OBJECT_BASE.size <= total:
+            found = find(b"LOBJ", position, position + 8)
+            if found < 0:
+                found = find(b"LOBJ", position)
+                if position:
+                    self.account.problem("a damaged object inside a container was passed over")
+                if found < 0:
+                    return offsets, kinds, total
+            if found + OBJECT_BASE.size > total:
+                return offsets, kinds, found
+            _, _, _, size, kind = unpack(data, found)
+            if size < OBJECT_BASE.size or size > LARGEST_OBJECT:
+                position = found + 4
+                continue
+            if found + size > total:
+                return offsets, kinds, found
+            offsets.append(found)
+            kinds.append(kind)
+            position = found + size
+        return offsets, kinds, position
+
+
+def _columns(
+    octets: NDArray[np.uint8], offsets: NDArray[np.intp], kinds: NDArray[np.intp], start: int, account: Account
+) -> FrameBlock | None:
+    account.foreign(int(np.isin(kinds, ERROR_TYPES).sum()), "error frame")
+    is_classic, is_fd, is_fd64 = np.isin(kinds, CLASSIC_TYPES), kinds == FD_TYPE, kinds == FD64_TYPE
+    message = is_classic | is_fd | is_fd64
+    if not message.any():
+        return None
+    offsets, is_fd, is_fd64 = offsets[message], is_fd[message], is_fd64[message]
+    version = _field(octets, offsets + 6, "<u2")
+    body = offsets + np.where(version == 2, HEADER_BYTES[2], HEADER_BYTES[1])
+    ticks = _field(octets, offsets + 24, "<u8").astype(np.int64)
+    unit = np.where(_field(octets, offsets + 16, "<u4") == TEN_MICROSECONDS, 10_000, 1)
+    width = 64 if (is_fd | is_fd64).any() else 8
+    data = np.zeros((len(body), width), dtype=np.uint8)
+    length = np.minimum(np.where(is_fd64, octets[body + 2], octets[body + 3]), 8)
+    length = np.where(is_fd, _clipped(octets, body + 14), np.where(is_fd64, octets[body + 2], length))
+    length = np.minimum(length, width).astype(np.uint8)
+    payload = body + np.where(is_fd, 20, np.where(is_fd64, 40, 8))
+    columns = np.arange(width)
+    inside = columns < length[:, None]
+    index = np.minimum(payload[:, None] + columns, len(octets) - 1)
+    data[inside] = octets[index][inside]
+    identifier = _field(octets, body + 4, "<u4") & np.uint32(0x9FFFFFFF)
+    remote = np.where(is_fd64, octets[body + 12] & 0x10, octets[body + 2] & 0x80) != 0
+    account.foreign(int(remote.sum()), "remote frame")
+    keep = ~remote
+    return FrameBlock(start + (ticks * unit)[keep], identifier[keep], length[keep], data[keep])
+
+
+def _field(octets: NDArray[np.uint8], offsets: NDArray[np.intp], dtype: str) -> NDArray[np.unsignedinteger]:
+    size = np.dtype(dtype).itemsize
+    return np.ascontiguousarray(octets[offsets[:, None] + np.arange(size)]).view(dtype)[:, 0]
+
+
+def _clipped(octets: NDArray[np.uint8], offsets: NDArray[np.intp]) -> NDArray[np.uint8]:
+    return octets[np.minimum(offsets, len(octets) - 1)]
+
+
+def _system_time(fields: tuple[int, ...], account: Account) -> int:
+    """Windows SYSTEMTIME (UTC) as ns since epoch; 0 when the writer left it empty."""
+    year, month, _, day, hour, minute, second, milli = fields
+    try:
+        moment = datetime.datetime(year, month, day, hour, minute, second, tzinfo=datetime.UTC)
+    except ValueError:
+        account.problem("no start time in the BLF header; times count from 1970", incomplete=False)
+        return 0
+    return int(moment.timestamp()) * 1_000_000_000 + milli * 1_000_000

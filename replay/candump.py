@@ -1,0 +1,71 @@
+"""Linux can-utils `candump -l` logs: `(seconds.micros) interface ID#DATA`, FD as `ID##FDATA`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from replay.account import Account, UnreadableRecording
+from replay.frames import EXTENDED, FrameBlock
+from replay.textframes import LineFrames, decimal_ns, line_batches
+
+ERROR_FLAG = 0x2000_0000
+
+
+def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
+    """Blocks of some thousand frames; lines that are no frames are counted as corrupt."""
+    first = True
+    for lines in line_batches(path):
+        batch = LineFrames()
+        damaged = 0
+        for line in lines:
+            parts = line.split()
+            if not parts:
+                continue
+            try:
+                frame = _frame(parts)
+            except (ValueError, IndexError):
+                damaged += 1
+                continue
+            if isinstance(frame, str):
+                account.foreign(1, frame)
+            else:
+                batch.add(*frame)
+        if first and not batch.time and damaged:
+            raise UnreadableRecording(f"{path}: no candump log (a line reads `(seconds) interface ID#DATA`)")
+        first = False
+        if damaged:
+            account.corrupt(damaged, "line is no frame")
+            cut = "; the file ends inside a line" if not lines[-1].endswith(b"\n") else ""
+            account.problem(f"{damaged} lines near {_near(batch)} are no frames{cut}")
+        if batch.time:
+            yield batch.block(account)
+
+
+def _frame(parts: list[bytes]) -> tuple[int, int, bytes] | str:
+    """(time, identifier, payload digits) of one line, or the reason why it is no data frame."""
+    stamp, body = parts[0], parts[2]
+    if stamp[:1] != b"(" or stamp[-1:] != b")":
+        raise ValueError("no time stamp")
+    time = decimal_ns(stamp[1:-1])
+    identifier, separator, payload = body.partition(b"#")
+    frame_id = int(identifier, 16)
+    if not separator:
+        raise ValueError("no frame")
+    if len(identifier) > 3:
+        if frame_id & ERROR_FLAG:
+            return "error frame"
+        frame_id |= EXTENDED
+    if payload[:1] == b"#":
+        payload = payload[2:]
+    elif payload[:1] in (b"R", b"r"):
+        return "remote frame"
+    elif len(payload) > 16:
+        payload = payload[:16] if payload[16:17] == b"_" else payload  # can-utils' `_` before a raw DLC
+    if len(payload) % 2 or len(payload) > 128:
+        raise ValueError("half a byte")
+    return time, frame_id, payload
+
+
+def _near(batch: LineFrames) -> str:
+    return f"{batch.time[-1] / 1e9:.3f} s" if batch.time else "the start of the file"

@@ -1,0 +1,194 @@
+"""Messages of one MCAP topic to numbers: JSON, protobuf and ROS 2 CDR, addressed as `/topic.field`.
+
+A field may be nested and indexed: `/imu/data.linear_acceleration.z`, `/scan.ranges[3]`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, Literal
+
+import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Channel as McapChannel
+from mcap.records import Schema
+from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
+from mcap_ros2.decoder import DecoderFactory as Ros2Factory
+
+from model.signals import FloatArray, IntArray
+from replay.account import Account
+from replay.mcapfile import Messages
+
+TimeSource = Literal["auto", "header", "publish", "log"]
+STAMP_PATHS = (("header", "stamp"), ("timestamp",), ("stamp",))
+STAMP_PARTS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs"))
+TOKEN = re.compile(r"[^.\[\]]+")
+Path = tuple[str | int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A wanted number of a topic's messages."""
+
+    channel: int
+    path: Path
+    source: TimeSource
+
+
+def parse_field(text: str) -> Path:
+    """`a.b[2].c` -> ("a", "b", 2, "c")."""
+    return tuple(int(token) if token.isdigit() else token for token in TOKEN.findall(text))
+
+
+class Topic:
+    """Decodes the messages of one topic; `decode` is None when its encoding cannot be read."""
+
+    def __init__(self, channel: McapChannel, schema: Schema | None, fields: Sequence[Field], account: Account) -> None:
+        self.name = channel.topic
+        self.fields = list(fields)
+        self.account = account
+        self.is_json = channel.message_encoding == "json"
+        self.decode: Callable[[bytes], Any] | None = json.loads if self.is_json else None
+        self._checked = False
+        for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
+            try:
+                self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
+            except (McapError, ValueError, TypeError, UnicodeDecodeError) as error:
+                account.problem(f"schema of topic {self.name} cannot be read: {error}")
+        if self.decode is None:
+            account.problem(f"topic {self.name}: encoding {channel.message_encoding!r} cannot be read here")
+
+    def samples(self, messages: Messages) -> tuple[IntArray, IntArray, FloatArray]:
+        """Place (n,), time (n, k) and value (n, k) of the k fields; unreadable messages are counted, not given."""
+        documents, good = self._documents(messages.data)
+        place = np.array(messages.place, dtype=np.int64)[good]
+        log = np.array(messages.log_time, dtype=np.uint64).astype(np.int64)[good]
+        publish = np.array(messages.publish_time, dtype=np.uint64).astype(np.int64)[good]
+        value = np.empty((len(documents), len(self.fields)))
+        time = np.empty((len(documents), len(self.fields)), dtype=np.int64)
+        if documents:
+            self._check_fields(documents[0])
+        stamps = self._stamps(documents)
+        for column, wanted in enumerate(self.fields):
+            value[:, column] = self._column(documents, wanted.path)
+            time[:, column] = _choose(wanted.source, stamps, publish, log)
+        missing = np.isnan(value)
+        self.account.values["missing or not a number"] += int(missing.sum())
+        nothing = missing.all(axis=1)
+        self.account.drop(int(nothing.sum()), "no valid value")
+        self.account.tally.used += int((~nothing).sum())
+        return place, time, value
+
+    def _documents(self, data: list[bytes]) -> tuple[list[Any], np.ndarray]:
+        if self.decode is None:
+            self.account.drop(len(data), "encoding that cannot be read")
+            return [], np.zeros(len(data), dtype=bool)
+        if self.is_json:  # one call for the whole batch is twice as fast as one a message
+            try:
+                documents = json.loads(b"[" + b",".join(data) + b"]")
+                if len(documents) == len(data):
+                    return documents, np.ones(len(data), dtype=bool)
+            except ValueError:
+                pass  # some message is damaged: find it below
+        documents = []
+        good = np.zeros(len(data), dtype=bool)
+        reasons: Counter[str] = Counter()
+        for index, item in enumerate(data):
+            try:
+                documents.append(self.decode(item))
+                good[index] = True
+            except Exception as error:  # decoders raise what their generated code happens to raise
+                reasons[type(error).__name__] += 1
+        self.account.corrupt(len(data) - len(documents), f"message of {self.name} cannot be decoded")
+        for reason, count in reasons.items():
+            self.account.problem(f"{count} messages of {self.name} cannot be decoded ({reason})")
+        return documents, good
+
+    def _column(self, documents: list[Any], path: Path) -> FloatArray:
+        if self.is_json and len(path) == 1:
+            name = path[0]
+            try:
+                column = [document[name] for document in documents]
+            except (KeyError, TypeError, IndexError):
+                column = [walk(document, path) for document in documents]
+        else:
+            column = [walk(document, path) for document in documents]
+        if not set(map(type, column)) <= {float, int}:
+            column = [_number(item) for item in column]
+        values = np.array(column, dtype=np.float64)
+        values[~np.isfinite(values)] = np.nan
+        return values
+
+    def _stamps(self, documents: list[Any]) -> IntArray | None:
+        """Header stamps in ns, 0 where empty; None when the messages have none."""
+        if not documents or all(field.source in ("publish", "log") for field in self.fields):
+            return None
+        for path in STAMP_PATHS:
+            stamp = walk(documents[0], path)
+            for parts in STAMP_PARTS:
+                if all(isinstance(walk(stamp, (part,)), int) for part in parts):
+                    return np.array([_stamp_ns(walk(item, path), parts) for item in documents], dtype=np.int64)
+        return None
+
+    def _check_fields(self, document: Any) -> None:
+        """Once: say which wanted fields the first message does not have."""
+        if self._checked:
+            return
+        self._checked = True
+        for wanted in self.fields:
+            if walk(document, wanted.path) is None:
+                names = _names(document)
+                text = ".".join(map(str, wanted.path))
+                near = get_close_matches(text, names, n=3, cutoff=0.3) or names[:5]
+                line = f"topic {self.name} has no field {text!r}; nearest: {', '.join(near)}"
+                self.account.problem(line, incomplete=False)
+
+
+def walk(item: Any, path: Path | tuple[str, ...]) -> Any:
+    """The part of a decoded message at `path`, or None."""
+    for token in path:
+        try:
+            if isinstance(token, int) or isinstance(item, dict):
+                item = item[token]
+            else:
+                item = getattr(item, token)
+        except (KeyError, IndexError, TypeError, AttributeError):
+            return None
+    return item
+
+
+def _number(item: Any) -> float:
+    if isinstance(item, bool) or not isinstance(item, (int, float)):
+        return float("nan")
+    return float(item)
+
+
+def _stamp_ns(stamp: Any, parts: tuple[str, str]) -> int:
+    whole, rest = walk(stamp, (parts[0],)), walk(stamp, (parts[1],))
+    if not isinstance(whole, int) or not isinstance(rest, int):
+        return 0
+    return whole * 1_000_000_000 + rest
+
+
+def _choose(source: TimeSource, stamps: IntArray | None, publish: IntArray, log: IntArray) -> IntArray:
+    """The time that was asked for; where it is empty (0), the next best."""
+    sent = np.where(publish > 0, publish, log)
+    if source == "log":
+        return log
+    if source == "publish" or stamps is None:
+        return sent
+    return np.where(stamps > 0, stamps, sent)
+
+
+def _names(document: Any) -> list[str]:
+    if isinstance(document, dict):
+        return [str(name) for name in document]
+    descriptor = getattr(document, "DESCRIPTOR", None)
+    if descriptor is not None:
+        return [field.name for field in descriptor.fields]
+    return [str(name) for name in getattr(document, "__slots__", ())]

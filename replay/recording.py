@@ -1,0 +1,113 @@
+"""`open_recording`: any supported file as a stream of sample blocks with its account."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from model.signals import Channel, SampleBlock, Tally
+from replay import asc, blf, candump, csvtable, mcaptopics, mf4
+from replay.account import Account, UnreadableRecording
+from replay.candecode import CanDecoder
+from replay.frames import FrameBlock
+
+FrameReader = Callable[[Path, Account], Iterator[FrameBlock]]
+
+CAN_READERS: dict[str, FrameReader] = {
+    ".blf": blf.frames,
+    ".asc": asc.frames,
+    ".log": candump.frames,
+    ".mf4": mf4.frames,
+}
+EXTENSIONS = (".mcap", *CAN_READERS, ".csv")
+
+
+class Recording:
+    """One file, read once from its beginning to its end by `blocks()`.
+
+    `tally`, `problems`, `vehicle` and `incomplete` are complete when `blocks()` has ended.
+    """
+
+    def __init__(self, path: Path, channels: Sequence[Channel], source: Iterator[SampleBlock], account: Account):
+        self.path = path
+        self.channels = tuple(channels)
+        self.account = account
+        self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
+        self._source = source
+
+    def blocks(self) -> Iterator[SampleBlock]:
+        """Blocks in file order; raises UnreadableRecording when none of the channels is in the file."""
+        for block in self._source:
+            if len(block.time):
+                self.seen[block.channel[~np.isnan(block.value)]] = True
+                yield block
+        if not self.seen.any():
+            raise UnreadableRecording(self._nothing())
+        if not self.seen.all():
+            names = [channel.name for channel, seen in zip(self.channels, self.seen, strict=True) if not seen]
+            more = f" and {len(names) - 5} more" if len(names) > 5 else ""
+            self.account.problem(f"no values of {', '.join(names[:5])}{more}", incomplete=False)
+
+    def _nothing(self) -> str:
+        contents = [f"{name} ({count})" if count else name for name, count in self.account.contents.most_common(8)]
+        more = " ..." if len(self.account.contents) > 8 else ""
+        holds = f"it holds {', '.join(contents)}{more}" if contents else "it holds no messages"
+        trouble = f"; {self.account.problems[0]}" if self.account.problems else ""
+        return f"{self.path}: none of the system file's channels is in it; {holds}{trouble}"
+
+    @property
+    def tally(self) -> Tally:
+        """Messages by what became of them."""
+        return self.account.tally
+
+    @property
+    def problems(self) -> list[str]:
+        """One line each."""
+        return self.account.problems
+
+    @property
+    def vehicle(self) -> str | None:
+        """The vehicle that the recording names, where its format can."""
+        return self.account.vehicle
+
+    @property
+    def incomplete(self) -> bool:
+        """Some of what was recorded is missing or damaged."""
+        return self.account.incomplete
+
+
+def open_recording(
+    path: str | Path,
+    channels: Sequence[Channel],
+    *,
+    dbc: str | Path | None = None,
+    time_source: str | Mapping[str, str] = "auto",
+) -> Recording:
+    """Choose the reader by the file's extension; raises UnreadableRecording with one line.
+
+    `dbc` is the CAN database that CAN recordings need.  `time_source` (MCAP): "auto" (header stamp where the
+    messages carry one, else publish time), "header", "publish" or "log"; or a table by channel name.
+    """
+    path = Path(path)
+    extension = path.suffix.lower()
+    if extension not in EXTENSIONS:
+        raise UnreadableRecording(f"{path}: cannot read files of this kind; known are {' '.join(EXTENSIONS)}")
+    if not path.is_file():
+        raise UnreadableRecording(f"{path}: no such file")
+    account = Account()
+    if extension == ".mcap":
+        source = mcaptopics.blocks(path, channels, account, time_source)
+    elif extension == ".csv":
+        source = csvtable.blocks(path, channels, account)
+    else:
+        if dbc is None:
+            raise UnreadableRecording(f"{path}: a CAN recording needs a CAN database; name it with --dbc")
+        source = _decoded(CAN_READERS[extension](path, account), CanDecoder(channels, dbc), account)
+    return Recording(path, channels, source, account)
+
+
+def _decoded(frames: Iterator[FrameBlock], decoder: CanDecoder, account: Account) -> Iterator[SampleBlock]:
+    for block in frames:
+        yield decoder.decode(block, account)
