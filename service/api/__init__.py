@@ -1,0 +1,1 @@
+"""The HTTP side; status codes exist here and nowhere else."""

@@ -1,0 +1,87 @@
+"""What clients send: strict models, so that a wrong body is refused and never repaired in silence."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+
+from model.signals import FloatArray, Window
+from service.api.problems import Problem
+from service.engine import Engine
+from service.times import NANOSECONDS
+
+VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
+Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
+RATE_TOLERANCE = 1e-3  # relative; a clock that is off by more would shift stiffnesses by more than their bound
+
+
+class Strict(BaseModel):
+    """No coercion, no unknown keys."""
+
+    model_config = ConfigDict(strict=True, extra="forbid")
+
+
+class WindowBody(Strict):
+    """One window: the same number of samples of every channel, SI units."""
+
+    vehicle: VehicleId
+    sample_rate: Annotated[Number, Field(gt=0, description="Hz; the system file's")]
+    channels: dict[str, list[Number]] = Field(
+        description="samples by channel; a sensor may be missing, an input may not"
+    )
+    start: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
+        default=None,
+        description="time of the first sample, ns since the Unix epoch; needed with ?track=true",
+    )
+
+
+class DiagnoseBody(Strict):
+    """What to look into: a recording that was uploaded before, or a vehicle's last minute."""
+
+    recording: str | None = Field(default=None, max_length=36)
+    vehicle: VehicleId | None = None
+
+
+def window_values(body: WindowBody, engine: Engine) -> FloatArray:
+    """The body as values of shape (T, C), NaN for absent sensors.
+
+    Raises a 422 Problem that names the field: unknown channel, missing input, wrong length, wrong rate.
+    """
+    system = engine.system
+    wrong: list[dict[str, str]] = []
+    if abs(body.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
+        wrong.append(
+            _wrong("sample_rate", f"is {body.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz")
+        )
+    names = {channel.name: i for i, channel in enumerate(system.channels)}
+    for name, samples in body.channels.items():
+        if name not in names:
+            wrong.append(_wrong(f"channels.{name[:160]}", f"is no channel of {system.name}"))
+        elif len(samples) != system.window:
+            wrong.append(_wrong(f"channels.{name}", f"has {len(samples)} samples, a window has {system.window}"))
+    wrong += [
+        _wrong(f"channels.{channel.name}", "is missing; without every input nothing can be identified")
+        for channel in system.inputs
+        if channel.name not in body.channels
+    ]
+    if not any(sensor in body.channels for sensor in system.sensors):
+        wrong.append(_wrong("channels", "hold no sensor; without any nothing can be identified"))
+    if wrong:
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        raise Problem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:20])
+    values = np.full((system.window, len(names)), np.nan)
+    for name, samples in body.channels.items():
+        values[:, names[name]] = samples
+    return values
+
+
+def as_window(body: WindowBody, values: FloatArray, start: int) -> Window:
+    """The window that the tracker and the store know, its start rounded to the sample grid."""
+    step = NANOSECONDS / body.sample_rate
+    return Window(round(round(start / step) * step), body.sample_rate, values)
+
+
+def _wrong(field: str, detail: str) -> dict[str, str]:
+    return {"field": field, "detail": detail}

@@ -1,0 +1,97 @@
+"""Every error as RFC 9457 `application/problem+json`."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from http import HTTPStatus
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import Response
+from pydantic import ValidationError
+from starlette.exceptions import HTTPException
+
+from service.errors import Busy, NotFound, UserError
+
+MEDIA_TYPE = "application/problem+json"
+SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
+
+log = logging.getLogger("sprung.api")
+
+
+class Problem(Exception):
+    """An answer that is an error.  `errors` name the fields: `{"field": "channels.car_1l", "detail": "..."}`."""
+
+    def __init__(
+        self,
+        status: int,
+        detail: str,
+        errors: Sequence[Mapping[str, str]] = (),
+        headers: Mapping[str, str] | None = None,
+    ) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.detail = detail
+        self.errors = list(errors)
+        self.headers = dict(headers or {})
+
+
+def problem_response(problem: Problem, instance: str) -> Response:
+    """The answer on the wire."""
+    body: dict[str, Any] = {
+        "type": "about:blank",
+        "title": HTTPStatus(problem.status).phrase,
+        "status": problem.status,
+        "detail": problem.detail,
+        "instance": instance,
+    }
+    if problem.errors:
+        body["errors"] = problem.errors
+    return Response(json.dumps(body), problem.status, problem.headers, MEDIA_TYPE)
+
+
+def from_validation(error: ValidationError, prefix: str = "") -> Problem:
+    """422 that names the fields which are wrong; the values themselves are not repeated."""
+    found = error.errors(include_url=False, include_input=False, include_context=False)
+    errors = [
+        {"field": prefix + (".".join(map(str, e["loc"])) or "body"), "detail": e["msg"]} for e in found[:SHOWN_ERRORS]
+    ]
+    first = errors[0]
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    return Problem(422, f"{first['field']}: {first['detail']}{more}", errors)
+
+
+def install(app: FastAPI) -> None:
+    """Answer every exception of the app with a problem."""
+
+    async def on_problem(request: Request, error: Exception) -> Response:
+        return problem_response(_as_problem(error), request.url.path)
+
+    for kind in (Problem, HTTPException, RequestValidationError, UserError, Busy, NotFound, Exception):
+        app.add_exception_handler(kind, on_problem)
+
+
+def _as_problem(error: Exception) -> Problem:
+    match error:
+        case Problem():
+            return error
+        case HTTPException():
+            return Problem(error.status_code, str(error.detail), headers=error.headers)
+        case RequestValidationError():
+            errors = [
+                {"field": ".".join(str(part) for part in e["loc"] if part != "body"), "detail": str(e["msg"])}
+                for e in error.errors()[:SHOWN_ERRORS]
+            ]
+            return Problem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
+        case Busy():
+            return Problem(503, str(error), headers={"Retry-After": "1"})
+        case NotFound():
+            return Problem(404, str(error))
+        case UserError():
+            return Problem(422, str(error))
+        case _:
+            log.error("unexpected error", exc_info=error)
+            return Problem(500, "an unexpected error; the service's log has the details")

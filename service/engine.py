@@ -1,0 +1,80 @@
+"""The model side of the service, loaded once: system, identifier and tracker, and what the store keeps of them."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from model.signals import Estimate, FloatArray
+from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from model.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
+from service.errors import UserError
+from service.settings import Settings
+
+log = logging.getLogger("sprung.engine")
+
+
+class Identifies(Protocol):
+    """The part of `model.identify.Identifier` that the service uses."""
+
+    @property
+    def digest(self) -> str:
+        """Names system and estimator; estimates of another digest are not comparable."""
+
+    def identify(self, values: FloatArray, states: bool = False) -> list[Estimate]:
+        """Estimates of windows, values of shape (B, T, C)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """Everything that turns windows into tracked parameters."""
+
+    system: System
+    identifier: Identifies
+    tracker: Tracker
+    dbc: Path | None = None
+
+    @property
+    def digest(self) -> str:
+        """The key of the model under which estimates are stored."""
+        return self.identifier.digest
+
+    def description(self) -> dict[str, Any]:
+        """What the store must know to read its arrays without this code."""
+        return {
+            "parameters": [{"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in self.system.parameters],
+            "sensors": list(self.system.sensors),
+            "window": self.system.window,
+            "sample_rate": self.system.sample_rate,
+        }
+
+    def load_state(self, data: dict[str, Any]) -> TrackerState:
+        """A stored tracker state; one of an older format starts anew rather than stopping the service."""
+        try:
+            return TrackerState.from_dict(data)
+        except TrackerStateError as error:
+            log.warning("a stored tracker state cannot be read (%s); the vehicle's baseline is learned anew", error)
+            return self.tracker.initial_state()
+
+
+def load_engine(settings: Settings) -> Engine:
+    """Load the system file and the trained estimator that belongs to it.
+
+    Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
+    """
+    from model.identify import load_identifier  # torch takes a second; a bad system file is told before
+
+    path = settings.system or MANCHESTER
+    system = load_system(path)
+    dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
+    if not system.parameters:
+        raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
+    return Engine(system, load_identifier(system, settings.weights), make_tracker(system), dbc)
+
+
+def make_tracker(system: System) -> Tracker:
+    """The tracker of a system, told its window and hop."""
+    rate = system.sample_rate
+    return Tracker(system.parameters, TrackerSettings(window=system.window / rate, hop=system.hop / rate))

@@ -1,0 +1,117 @@
+"""Prometheus metrics: one registry per application, series bounded by a budget of vehicles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from model.signals import Tally
+from service.board import Board, Entry
+from service.times import NANOSECONDS
+
+STAGE_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
+VALUES = {
+    "stiffness": ("sprung_stiffness_newtons_per_meter", "Stiffness, posterior mean"),
+    "damping": ("sprung_damping_newton_seconds_per_meter", "Damping coefficient, posterior mean"),
+    "mass": ("sprung_mass_kilograms", "Mass, posterior mean"),
+}
+
+
+class Metrics:
+    """Everything that `GET /metrics` shows."""
+
+    def __init__(self, board: Board, parameter_vehicles: int) -> None:
+        self.registry = CollectorRegistry()
+        self.registry.register(FleetCollector(board, parameter_vehicles))
+        self.frames = Counter(
+            "sprung_frames_total",
+            "Messages read, by what became of them",
+            ["source", "outcome"],
+            registry=self.registry,
+        )
+        self.duration = Histogram(
+            "sprung_identify_duration_seconds",
+            "Time from a window to its stored estimate, by stage",
+            ["stage"],
+            registry=self.registry,
+            buckets=STAGE_BUCKETS,
+        )
+
+    def observe(self, seconds: Mapping[str, float]) -> None:
+        """Durations of stages."""
+        for stage, value in seconds.items():
+            self.duration.labels(stage).observe(value)
+
+    def count_frames(self, source: str, before: Tally, now: Tally) -> None:
+        """Add what a source has read since `before`."""
+        old = before.as_dict()
+        for outcome, total in now.as_dict().items():
+            self.frames.labels(source, outcome).inc(total - old[outcome])
+
+    def render(self) -> bytes:
+        """The text exposition format."""
+        return generate_latest(self.registry)
+
+
+class FleetCollector(Collector):
+    """Reads the board at every scrape, so that a vehicle which is forgotten leaves no series behind.
+
+    Per-parameter and per-sensor series (about 110 a vehicle of 24 parameters) are given for the vehicles heard
+    from most recently, as many as the budget allows; the history of the others is in the store.
+    """
+
+    def __init__(self, board: Board, parameter_vehicles: int) -> None:
+        self._board = board
+        self._budget = parameter_vehicles
+
+    def collect(self) -> Iterator[Metric]:
+        """Families of all vehicles, then of those within the budget."""
+        entries = self._board.entries()
+        yield from _vehicle_families(entries)
+        yield from _parameter_families(entries[: self._budget])
+
+    def describe(self) -> Iterator[Metric]:
+        """Nothing is collected at registration."""
+        return iter(())
+
+
+def _vehicle_families(entries: list[Entry]) -> Iterator[Metric]:
+    windows = CounterMetricFamily("sprung_windows", "Windows by outcome", labels=["vehicle", "outcome"])
+    alarms = GaugeMetricFamily("sprung_alarms_active", "Alarms that are active", labels=["vehicle", "severity"])
+    last = GaugeMetricFamily("sprung_last_window_timestamp_seconds", "Start of the newest window", labels=["vehicle"])
+    for entry in entries:
+        view = entry.view
+        for outcome, count in entry.windows.items():
+            windows.add_metric([view.vehicle, outcome], count)
+        for severity, count in view.active_by_severity().items():
+            alarms.add_metric([view.vehicle, severity], count)
+        if view.last_window_ns is not None:
+            last.add_metric([view.vehicle], view.last_window_ns / NANOSECONDS)
+    yield from (windows, alarms, last)
+
+
+def _parameter_families(entries: list[Entry]) -> Iterator[Metric]:
+    values = {
+        quantity: GaugeMetricFamily(name, text, labels=["vehicle", "element"])
+        for quantity, (name, text) in VALUES.items()
+    }
+    labels = ["vehicle", "element", "quantity"]
+    ratio = GaugeMetricFamily("sprung_parameter_ratio", "Estimate over the vehicle's own baseline", labels=labels)
+    spread = GaugeMetricFamily(
+        "sprung_parameter_ratio_stddev", "Standard deviation of sprung_parameter_ratio", labels=labels
+    )
+    fit = GaugeMetricFamily("sprung_fit_nrmse", "rms(error) / rms(measured)", labels=["vehicle", "sensor"])
+    for entry in entries:
+        view = entry.view
+        for p in view.parameters:
+            if p.identifiable:
+                values[p.quantity].add_metric([view.vehicle, p.element], p.value)
+            if p.drift is not None:
+                ratio.add_metric([view.vehicle, p.element, p.quantity], 1.0 + p.drift)
+                spread.add_metric([view.vehicle, p.element, p.quantity], p.drift_std)
+        for sensor, nrmse in view.per_sensor.items():
+            fit.add_metric([view.vehicle, sensor], nrmse)
+    yield from (*values.values(), ratio, spread, fit)

@@ -1,0 +1,11 @@
+"""Run by Alembic: migrate the connection that `service.store.engine.migrate` hands over."""
+
+from __future__ import annotations
+
+from alembic import context
+
+from service.store.schema import metadata
+
+context.configure(connection=context.config.attributes["connection"], target_metadata=metadata, render_as_batch=True)
+with context.begin_transaction():
+    context.run_migrations()

@@ -1,0 +1,204 @@
+"""Windows of one vehicle -> estimates -> tracker -> store: each window once, whoever brings it and however often."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from sqlalchemy import Connection
+
+from model.signals import Estimate, Window
+from model.tracker import TrackerState
+from service.compute import Compute, Priority
+from service.engine import Engine
+from service.store import Store, fleet, history
+from service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from service.times import now_ns
+
+FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
+
+
+@dataclass(slots=True)
+class Batch:
+    """What became of a batch of windows."""
+
+    vehicle: str
+    records: list[WindowRecord]  # one per window, in order of time
+    fresh: list[Window]  # those that were not stored before
+    late: int  # fresh, but older than what the tracker had seen: stored, not tracked
+    state: TrackerState  # after the batch
+    seconds: dict[str, float] = field(default_factory=dict)  # by stage
+
+
+@dataclass(slots=True)
+class _Vehicle:
+    """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
+
+    revision: int
+    last_window_ns: int
+    state: TrackerState
+
+
+class Pipeline:
+    """Feeds windows through the model into the store.  Safe to share between threads and processes."""
+
+    def __init__(
+        self,
+        engine: Engine,
+        store: Store,
+        compute: Compute,
+        listeners: Sequence[Callable[[Batch], None]] = (),
+        vehicles_in_memory: int = FORGET_BEYOND,
+        clock: Callable[[], int] = now_ns,
+    ) -> None:
+        self.engine = engine
+        self.store = store
+        self._compute = compute
+        self._listeners = listeners
+        self._limit = vehicles_in_memory
+        self._clock = clock
+        self._vehicles: OrderedDict[str, _Vehicle] = OrderedDict()
+        self._lock = threading.Lock()
+        with store.write() as connection:
+            self.model_id = fleet.ensure_model(
+                connection, engine.digest, engine.system.name, engine.description(), clock()
+            )
+
+    def process(
+        self,
+        vehicle: str,
+        windows: Sequence[Window],
+        recording_id: str | None = None,
+        priority: Priority = Priority.BATCH,
+    ) -> Batch:
+        """Identify, track and store windows; those that are stored already are read back instead.
+
+        windows: in order of time.  Returns when the transaction is committed.
+        """
+        with self.store.read() as connection:
+            known = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+        fresh = [w for w in windows if w.start not in known]
+        started = time.perf_counter()
+        estimates = self._identify(fresh, priority)
+        seconds = {"identify": time.perf_counter() - started}
+        batch = self._commit(vehicle, fresh, estimates, recording_id)
+        batch.seconds |= seconds
+        if known:
+            stored = {record.start: record for record in batch.records} | known
+            batch.records = [stored[w.start] for w in windows]
+        for listener in self._listeners:
+            listener(batch)
+        return batch
+
+    def track(self, vehicle: str, window: Window, estimate: Estimate) -> Batch:
+        """Track and store one window that was identified elsewhere."""
+        with self.store.read() as connection:
+            known = known_windows(connection, vehicle, self.model_id, [window.start])
+        batch = self._commit(vehicle, [] if known else [window], [] if known else [estimate], None)
+        batch.records = batch.records or list(known.values())
+        for listener in self._listeners:
+            listener(batch)
+        return batch
+
+    def state(self, vehicle: str) -> TrackerState:
+        """The vehicle's tracker state as stored; the initial one for a vehicle never seen."""
+        with self.store.read() as connection:
+            return self._current(connection, vehicle).state
+
+    def _identify(self, windows: list[Window], priority: Priority) -> list[Estimate | None]:
+        whole = [w.values for w in windows if w.outcome != "dropped"]
+        if not whole:
+            return [None] * len(windows)
+        values = np.stack(whole)  # shape (B, T, C)
+        found = iter(self._compute.run(lambda: self.engine.identifier.identify(values), priority))
+        return [None if w.outcome == "dropped" else next(found) for w in windows]
+
+    def _commit(
+        self,
+        vehicle: str,
+        windows: list[Window],
+        estimates: Sequence[Estimate | None],
+        recording_id: str | None,
+    ) -> Batch:
+        now = self._clock()
+        started = time.perf_counter()
+        with self.store.write() as connection:
+            fleet.ensure_vehicle(connection, vehicle, now)
+            at = self._current(connection, vehicle)
+            # another process may have stored some of them while this one was identifying
+            raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+            records, after = self._follow(at, windows, estimates, set(raced))
+            new = [record for record in records if record.start not in raced]
+            tracked = time.perf_counter()
+            if new:
+                add_windows(connection, vehicle, self.model_id, new, now, recording_id)
+                history.add_to_rollups(connection, vehicle, self.model_id, new, now)
+                after = replace(after, revision=at.revision + 1)
+                self._save(connection, vehicle, after, now)
+        self._remember(vehicle, after)
+        done = time.perf_counter()
+        return Batch(
+            vehicle,
+            [raced.get(record.start, record) for record in records],
+            [w for w in windows if w.start not in raced],
+            sum(record.solved is not None and not record.tracked for record in new),
+            after.state,
+            {"track": tracked - started, "store": done - tracked},
+        )
+
+    def _follow(
+        self,
+        at: _Vehicle,
+        windows: list[Window],
+        estimates: Sequence[Estimate | None],
+        skip: set[int],
+    ) -> tuple[list[WindowRecord], _Vehicle]:
+        """Feed the windows that are newer than what the tracker has seen, in order."""
+        state, last = at.state, at.last_window_ns
+        records = []
+        for window, estimate in zip(windows, estimates, strict=True):
+            posterior = None
+            if estimate is not None and window.start > last and window.start not in skip:
+                state = self.engine.tracker.update(state, estimate, window.start)
+                last = window.start
+                posterior = Posterior(*self.engine.tracker.posterior(state))
+            records.append(
+                WindowRecord(
+                    window.start,
+                    window.outcome,
+                    window.reason,
+                    window.repaired_samples,
+                    posterior is not None,
+                    None if estimate is None else Solved.of(estimate),
+                    posterior,
+                )
+            )
+        return records, replace(at, state=state, last_window_ns=last)
+
+    def _current(self, connection: Connection, vehicle: str) -> _Vehicle:
+        """The vehicle's tracker: from memory when that is still what is stored, else read anew."""
+        with self._lock:
+            held = self._vehicles.get(vehicle)
+        revision = fleet.tracker_revision(connection, vehicle, self.model_id)
+        if held is not None and held.revision == revision:
+            return held
+        row = fleet.load_tracker(connection, vehicle, self.model_id)
+        if row is None:
+            return _Vehicle(0, -1, self.engine.tracker.initial_state())
+        return _Vehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
+
+    def _save(self, connection: Connection, vehicle: str, at: _Vehicle, now: int) -> None:
+        row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
+        fleet.save_tracker(connection, vehicle, self.model_id, row, now)
+        fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+
+    def _remember(self, vehicle: str, at: _Vehicle) -> None:
+        with self._lock:
+            self._vehicles[vehicle] = at
+            self._vehicles.move_to_end(vehicle)
+            while len(self._vehicles) > self._limit:
+                self._vehicles.popitem(last=False)

@@ -1,0 +1,65 @@
+"""Every setting of the service in one place, read once at start and passed down.
+
+Environment variables `SPRUNG_<NAME>` set the defaults of the command line's options.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+
+def default_data_dir() -> Path:
+    """Where this platform keeps a user's application data."""
+    if sys.platform == "win32":
+        base = Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local"))
+    elif sys.platform == "darwin":
+        base = Path.home() / "Library" / "Application Support"
+    else:
+        base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
+    return base / "sprung"
+
+
+class Settings(BaseSettings):
+    """Bounds are deliberate: every queue, body, file and label set of the service has one."""
+
+    model_config = SettingsConfigDict(env_prefix="SPRUNG_", frozen=True, extra="ignore")
+
+    data_dir: Path = Field(default_factory=default_data_dir)  # uploads, reports and the embedded store
+    store: str | None = None  # SQLAlchemy URL; None: sprung.db in data_dir
+    system: Path | None = None  # None: the bundled Manchester vehicle
+    dbc: Path | None = None  # None: the bundled DBC, when the system is the bundled one
+    weights: Path | None = None  # directory of a trained estimator; None: the bundled one
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=8000, ge=0, le=65535)
+    max_body_bytes: int = Field(default=2_000_000, gt=0)  # one window of 28 channels is about 60 kB
+    max_upload_bytes: int = Field(default=2_000_000_000, gt=0)
+    shutdown_seconds: int = Field(default=20, gt=0)
+
+    compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503
+    job_queue: int = Field(default=16, gt=0)  # uploads and diagnoses waiting before 503
+    batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction
+    torch_threads: int = Field(default=0, ge=0)  # 0: as many as torch chooses
+
+    parameter_series_vehicles: int = Field(default=20, ge=0)  # vehicles with per-parameter metrics
+    vehicles_in_memory: int = Field(default=256, gt=0)  # tracker states held between windows
+    ring_vehicles: int = Field(default=16, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
+    ring_seconds: float = Field(default=60.0, gt=0)
+
+    misfit_windows: int = Field(default=40, gt=1)  # consecutive windows that are looked at
+    misfit_share: float = Field(default=0.8, gt=0, le=1)  # of them not fitting, to start a diagnosis
+    misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
+
+    retention_windows_days: float = Field(default=30.0, gt=0)  # counted from when a window was stored
+    retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
+    retention_uploads_days: float = Field(default=7.0, gt=0)
+
+    @property
+    def store_url(self) -> str:
+        """The store's SQLAlchemy URL."""
+        return self.store or f"sqlite:///{self.data_dir / 'sprung.db'}"

@@ -1,0 +1,135 @@
+"""Opening a store: the engine, SQLite's pragmas, migrations, and transactions."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import Connection, Engine, Table, create_engine, event, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import make_url
+from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
+
+from service.errors import UserError
+
+BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
+UPSERT_DIALECTS = ("sqlite", "postgresql")
+
+
+class Store:
+    """Transactions on one database.  Safe to share between threads."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self._writing = threading.Lock()  # one writer a process: SQLite has one anyway, and waiting is fair here
+
+    @contextmanager
+    def read(self) -> Iterator[Connection]:
+        """A consistent snapshot."""
+        with self.engine.connect() as connection, connection.begin():
+            yield connection
+
+    @contextmanager
+    def write(self) -> Iterator[Connection]:
+        """One transaction, committed at the end, rolled back when anything raises."""
+        with self._writing, self.engine.connect() as connection:
+            connection = connection.execution_options(sprung_write=True)
+            with connection.begin():
+                yield connection
+
+    def close(self) -> None:
+        """Close every connection; SQLite then folds its write-ahead log into the file."""
+        self.engine.dispose()
+
+
+def open_store(url: str) -> Store:
+    """The store at a SQLAlchemy URL (or the path of an SQLite file), migrated to the newest schema.
+
+    Raises UserError when the URL is not one or the database cannot be opened.
+    """
+    if "://" not in url:
+        url = f"sqlite:///{url}"
+    try:
+        parsed = make_url(url)
+        if parsed.get_backend_name() not in UPSERT_DIALECTS:
+            raise UserError(f"store {url}: only {' and '.join(UPSERT_DIALECTS)} URLs are supported")
+        if parsed.get_backend_name() == "sqlite":
+            engine = _sqlite_engine(url, parsed.database)
+        else:
+            engine = create_engine(parsed)
+        store = Store(engine)
+        migrate(store)
+    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
+        raise UserError(f"store {url}: not a usable database URL ({_first_line(error)})") from error
+    except (DatabaseError, OSError) as error:
+        raise UserError(f"store {url}: cannot be opened ({_first_line(error)})") from error
+    return store
+
+
+def migrate(store: Store) -> None:
+    """Bring the schema to the newest revision; nothing happens when it is there already."""
+    config = Config()
+    config.set_main_option("script_location", "service:migrations")
+    config.set_main_option("path_separator", "os")
+    with store.write() as connection:
+        config.attributes["connection"] = connection
+        command.upgrade(config, "head")
+
+
+def insert_or_ignore(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:
+    """Insert rows; one whose key is there already is left as it is."""
+    if rows:
+        connection.execute(_dialect_insert(connection)(table).on_conflict_do_nothing(), rows)
+
+
+def upsert(connection: Connection, table: Table, rows: Sequence[dict[str, Any]], key: Sequence[str]) -> None:
+    """Insert rows, or overwrite the columns outside `key` where the key is there already.
+
+    All rows must give the same columns; columns that are not given keep their values.
+    """
+    if not rows:
+        return
+    statement = _dialect_insert(connection)(table)
+    changed = {name: statement.excluded[name] for name in rows[0] if name not in key}
+    connection.execute(statement.on_conflict_do_update(index_elements=list(key), set_=changed), rows)
+
+
+def _dialect_insert(connection: Connection) -> Any:
+    return {"sqlite": sqlite.insert, "postgresql": postgresql.insert}[connection.dialect.name]
+
+
+def _sqlite_engine(url: str, database: str | None) -> Engine:
+    if not database or database == ":memory:":
+        raise UserError(f"store {url}: give a file, as in sqlite:////var/lib/sprung/sprung.db")
+    Path(database).expanduser().parent.mkdir(parents=True, exist_ok=True)
+    engine = create_engine(url, connect_args={"timeout": BUSY_MILLISECONDS / 1000})
+    event.listen(engine, "connect", _on_sqlite_connect)
+    event.listen(engine, "begin", _on_sqlite_begin)
+    return engine
+
+
+def _on_sqlite_connect(connection: Any, _record: Any) -> None:
+    # the driver must not open transactions by itself: reads would not be snapshots, and a read that turns
+    # into a write fails at once instead of waiting
+    connection.isolation_level = None
+    for pragma in (
+        f"busy_timeout = {BUSY_MILLISECONDS}",
+        "journal_mode = WAL",  # readers do not wait for the writer
+        "synchronous = NORMAL",  # with WAL: durable against a crash of the process, consistent against power loss
+        "foreign_keys = ON",
+    ):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _on_sqlite_begin(connection: Connection) -> None:
+    writes = connection.get_execution_options().get("sprung_write", False)
+    connection.execute(text("BEGIN IMMEDIATE" if writes else "BEGIN"))
+
+
+def _first_line(error: Exception) -> str:
+    return str(getattr(error, "orig", None) or error).splitlines()[0]

@@ -1,0 +1,175 @@
+"""The tables.  Changes go through a new file in `service/migrations/versions`; a test compares the two.
+
+Times are ns since the Unix epoch.  Arrays (`LargeBinary`) are little-endian float64 in the order of the
+model's parameters or sensors, which its row in `models` names: one row per window instead of one per window
+and parameter keeps the store small (about 1 kB a window) and its inserts fast.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import (
+    JSON,
+    BigInteger,
+    Boolean,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    UniqueConstraint,
+)
+
+metadata = MetaData(
+    naming_convention={
+        "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+        "uq": "uq_%(table_name)s_%(column_0_N_name)s",
+        "fk": "fk_%(table_name)s_%(column_0_N_name)s",
+        "pk": "pk_%(table_name)s",
+    }
+)
+
+vehicles = Table(
+    "vehicles",
+    metadata,
+    Column("id", String(128), primary_key=True),
+    Column("created_ns", BigInteger, nullable=False),
+)
+
+models = Table(  # what was identified with: a system file and a trained estimator
+    "models",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("digest", String(80), nullable=False, unique=True),
+    Column("system", String(200), nullable=False),
+    Column("description", JSON, nullable=False),  # {"parameters": [{name, unit, nominal}], "sensors": [name]}
+    Column("created_ns", BigInteger, nullable=False),
+)
+
+recordings = Table(
+    "recordings",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=True),
+    Column("name", String(255), nullable=False),  # as the user called it; never used as a path
+    Column("source", String(20), nullable=False),  # file, upload, live
+    Column("file", String(64), nullable=True),  # name inside the upload folder, chosen by the service
+    Column("size_bytes", BigInteger, nullable=True),
+    Column("tally", JSON, nullable=True),  # {"used": n, ...}
+    Column("created_ns", BigInteger, nullable=False),
+    Column("finished_ns", BigInteger, nullable=True),
+)
+
+windows = Table(
+    "windows",
+    metadata,
+    # SQLite numbers rows by itself only for the type INTEGER
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
+    Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
+    Column("start_ns", BigInteger, nullable=False),
+    Column("stored_ns", BigInteger, nullable=False),
+    Column("recording_id", String(36), ForeignKey("recordings.id"), nullable=True),
+    Column("outcome", String(10), nullable=False),  # used, repaired, dropped
+    Column("reason", String(200), nullable=True),
+    Column("repaired_samples", Integer, nullable=False),
+    Column("tracked", Boolean, nullable=False),  # False: dropped, or older than what the tracker had seen
+    Column("nrmse", Float, nullable=True),
+    Column("chi_square", Float, nullable=True),
+    Column("adequate", Boolean, nullable=True),
+    Column("converged", Boolean, nullable=True),
+    Column("iterations", Integer, nullable=True),
+    Column("log_ratio", LargeBinary, nullable=True),  # log(theta / nominal), shape (P,)
+    Column("std", LargeBinary, nullable=True),  # of log_ratio, shape (P,)
+    Column("identifiable", LargeBinary, nullable=True),  # one byte each, shape (P,)
+    Column("per_sensor", LargeBinary, nullable=True),  # nrmse, shape (S,)
+    UniqueConstraint("vehicle_id", "start_ns", "model_id"),
+    Index("ix_windows_stored_ns", "stored_ns"),
+)
+
+posteriors = Table(  # what the tracker believed after that window
+    "posteriors",
+    metadata,
+    Column(
+        "window_id",
+        BigInteger().with_variant(Integer, "sqlite"),
+        ForeignKey("windows.id", ondelete="CASCADE"),
+        primary_key=True,
+    ),
+    Column("log_ratio", LargeBinary, nullable=False),  # shape (P,)
+    Column("std", LargeBinary, nullable=False),  # shape (P,)
+)
+
+rollups = Table(  # posteriors over long ranges
+    "rollups",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), primary_key=True),
+    Column("resolution_s", Integer, primary_key=True),
+    Column("bucket_ns", BigInteger, primary_key=True),
+    Column("windows", Integer, nullable=False),
+    Column("mean", LargeBinary, nullable=False),  # of log_ratio, shape (P,)
+    Column("std", LargeBinary, nullable=False),  # mean of the posterior's std, shape (P,)
+    Column("low", LargeBinary, nullable=False),
+    Column("high", LargeBinary, nullable=False),
+    Column("updated_ns", BigInteger, nullable=False),
+)
+
+tracker_states = Table(
+    "tracker_states",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), primary_key=True),
+    Column("last_window_ns", BigInteger, nullable=False),  # start of the last window that was fed
+    Column("revision", Integer, nullable=False),
+    Column("state", JSON, nullable=False),
+    Column("updated_ns", BigInteger, nullable=False),
+)
+
+reports = Table(
+    "reports",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=True),
+    Column("recording_id", String(36), ForeignKey("recordings.id"), nullable=True),
+    Column("verdict", String(40), nullable=False),
+    Column("report", JSON, nullable=False),
+    Column("created_ns", BigInteger, nullable=False),
+)
+
+alarms = Table(
+    "alarms",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
+    Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
+    Column("kind", String(10), nullable=False),  # change, misfit
+    Column("parameter", String(160), nullable=False),  # empty for a misfit: NULL would not be unique
+    Column("opened_ns", BigInteger, nullable=False),
+    Column("onset_ns", BigInteger, nullable=False),
+    Column("closed_ns", BigInteger, nullable=True),
+    Column("change", Float, nullable=True),  # relative to the vehicle's own baseline
+    Column("std", Float, nullable=True),
+    Column("peak", Float, nullable=True),  # the largest change so far
+    Column("severity", String(20), nullable=False),
+    Column("report_id", String(36), ForeignKey("reports.id"), nullable=True),
+    UniqueConstraint("vehicle_id", "model_id", "kind", "parameter", "opened_ns"),
+)
+
+jobs = Table(
+    "jobs",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("kind", String(20), nullable=False),  # recording, diagnosis
+    Column("state", String(10), nullable=False),  # queued, running, done, failed
+    Column("recording_id", String(36), ForeignKey("recordings.id"), nullable=True),
+    Column("vehicle_id", String(128), nullable=True),
+    Column("progress", Float, nullable=False),  # 0..1
+    Column("result", JSON, nullable=True),
+    Column("error", String(500), nullable=True),
+    Column("created_ns", BigInteger, nullable=False),
+    Column("updated_ns", BigInteger, nullable=False),
+)

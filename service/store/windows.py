@@ -1,0 +1,199 @@
+"""Windows and what was made of them: stored once per vehicle, start and model."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Connection, Row, select
+
+from model.signals import BoolArray, Estimate, FloatArray
+from service.store.engine import insert_or_ignore
+from service.store.schema import posteriors, windows
+
+IN_LIMIT = 500  # values in one IN (...): below every dialect's bound on parameters
+
+
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """The part of an `Estimate` that is kept."""
+
+    log_ratio: FloatArray  # log(theta / nominal), shape (P,)
+    std: FloatArray  # of log_ratio, shape (P,)
+    identifiable: BoolArray  # shape (P,)
+    nrmse: float
+    per_sensor: FloatArray  # nrmse, shape (S,); NaN for an absent sensor
+    chi_square: float
+    adequate: bool
+    converged: bool
+    iterations: int
+
+    @classmethod
+    def of(cls, estimate: Estimate) -> Solved:
+        """Keep the variances, drop the correlations: 2 kB a window that nothing reads again."""
+        return cls(
+            estimate.log_ratio,
+            np.sqrt(np.diagonal(estimate.covariance)),
+            estimate.identifiable,
+            float(estimate.nrmse),
+            estimate.per_sensor,
+            float(estimate.chi_square),
+            bool(estimate.adequate),
+            bool(estimate.converged),
+            int(estimate.iterations),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Posterior:
+    """What the tracker believed after a window."""
+
+    log_ratio: FloatArray  # shape (P,)
+    std: FloatArray  # shape (P,)
+
+
+@dataclass(frozen=True, slots=True)
+class WindowRecord:
+    """One window as the store keeps it."""
+
+    start: int  # ns since epoch
+    outcome: str  # used, repaired, dropped
+    reason: str | None
+    repaired_samples: int
+    tracked: bool  # False: dropped, or older than what the tracker had seen
+    solved: Solved | None  # None where dropped
+    posterior: Posterior | None  # None where not tracked
+
+
+def add_windows(
+    connection: Connection,
+    vehicle: str,
+    model_id: int,
+    records: Sequence[WindowRecord],
+    stored_ns: int,
+    recording_id: str | None,
+) -> None:
+    """Store windows whose key is not there yet; the others are left as they are."""
+    shared = {
+        "vehicle_id": vehicle,
+        "model_id": model_id,
+        "stored_ns": stored_ns,
+        "recording_id": recording_id,
+    }
+    insert_or_ignore(connection, windows, [shared | _window_row(record) for record in records])
+    tracked = {record.start: record.posterior for record in records if record.posterior is not None}
+    insert_or_ignore(
+        connection,
+        posteriors,
+        [
+            {
+                "window_id": window_id,
+                "log_ratio": pack(tracked[start].log_ratio),
+                "std": pack(tracked[start].std),
+            }
+            for start, window_id in _ids(connection, vehicle, model_id, tracked).items()
+        ],
+    )
+
+
+def known_windows(
+    connection: Connection, vehicle: str, model_id: int, starts: Iterable[int]
+) -> dict[int, WindowRecord]:
+    """Those of the windows that are stored already, by start."""
+    found: dict[int, WindowRecord] = {}
+    query = (
+        select(windows, posteriors.c.log_ratio.label("posterior"), posteriors.c.std.label("posterior_std"))
+        .join(posteriors, posteriors.c.window_id == windows.c.id, isouter=True)
+        .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    )
+    for part in _parts(starts):
+        for row in connection.execute(query.where(windows.c.start_ns.in_(part))):
+            found[row.start_ns] = _record(row)
+    return found
+
+
+def latest_window(connection: Connection, vehicle: str, model_id: int) -> WindowRecord | None:
+    """The newest window of a vehicle that was identified."""
+    query = (
+        select(windows, posteriors.c.log_ratio.label("posterior"), posteriors.c.std.label("posterior_std"))
+        .join(posteriors, posteriors.c.window_id == windows.c.id, isouter=True)
+        .where(
+            windows.c.vehicle_id == vehicle,
+            windows.c.model_id == model_id,
+            windows.c.outcome != "dropped",
+        )
+        .order_by(windows.c.start_ns.desc())
+        .limit(1)
+    )
+    row = connection.execute(query).first()
+    return None if row is None else _record(row)
+
+
+def pack(values: FloatArray) -> bytes:
+    """Little-endian float64 bytes."""
+    return np.ascontiguousarray(values, dtype="<f8").tobytes()
+
+
+def unpack(data: bytes) -> FloatArray:
+    """The inverse of `pack`, as a read-only array."""
+    return np.frombuffer(data, dtype="<f8").astype(np.float64, copy=False)
+
+
+def _window_row(record: WindowRecord) -> dict[str, Any]:
+    row: dict[str, Any] = {
+        "start_ns": record.start,
+        "outcome": record.outcome,
+        "reason": record.reason,
+        "repaired_samples": record.repaired_samples,
+        "tracked": record.tracked,
+    }
+    solved = record.solved
+    return row | {
+        "nrmse": None if solved is None else solved.nrmse,
+        "chi_square": None if solved is None else solved.chi_square,
+        "adequate": None if solved is None else solved.adequate,
+        "converged": None if solved is None else solved.converged,
+        "iterations": None if solved is None else solved.iterations,
+        "log_ratio": None if solved is None else pack(solved.log_ratio),
+        "std": None if solved is None else pack(solved.std),
+        "identifiable": None if solved is None else np.asarray(solved.identifiable, np.uint8).tobytes(),
+        "per_sensor": None if solved is None else pack(solved.per_sensor),
+    }
+
+
+def _record(row: Row[Any]) -> WindowRecord:
+    solved = None
+    if row.log_ratio is not None:
+        identifiable: NDArray[np.bool_] = np.frombuffer(row.identifiable, np.uint8).astype(np.bool_)
+        solved = Solved(
+            unpack(row.log_ratio),
+            unpack(row.std),
+            identifiable,
+            row.nrmse,
+            unpack(row.per_sensor),
+            row.chi_square,
+            row.adequate,
+            row.converged,
+            row.iterations,
+        )
+    posterior = None if row.posterior is None else Posterior(unpack(row.posterior), unpack(row.posterior_std))
+    return WindowRecord(row.start_ns, row.outcome, row.reason, row.repaired_samples, row.tracked, solved, posterior)
+
+
+def _ids(connection: Connection, vehicle: str, model_id: int, starts: Iterable[int]) -> dict[int, int]:
+    query = select(windows.c.start_ns, windows.c.id).where(
+        windows.c.vehicle_id == vehicle, windows.c.model_id == model_id
+    )
+    return {
+        row.start_ns: row.id
+        for part in _parts(starts)
+        for row in connection.execute(query.where(windows.c.start_ns.in_(part)))
+    }
+
+
+def _parts(starts: Iterable[int]) -> Iterable[list[int]]:
+    values = list(starts)
+    return (values[i : i + IN_LIMIT] for i in range(0, len(values), IN_LIMIT))

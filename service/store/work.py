@@ -1,0 +1,131 @@
+"""Recordings, jobs and reports."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import Connection, Table, insert, select, update
+
+from service.store.schema import jobs, recordings, reports
+
+UNFINISHED = ("queued", "running")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingRow:
+    """A file or stream that was read."""
+
+    id: str
+    vehicle_id: str | None
+    name: str
+    source: str
+    file: str | None
+    size_bytes: int | None
+    tally: dict[str, Any] | None
+    created_ns: int
+    finished_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class JobRow:
+    """Work that goes on after its request was answered."""
+
+    id: str
+    kind: str
+    state: str
+    recording_id: str | None
+    vehicle_id: str | None
+    progress: float
+    result: dict[str, Any] | None
+    error: str | None
+    created_ns: int
+    updated_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReportRow:
+    """A mismatch report."""
+
+    id: str
+    vehicle_id: str | None
+    recording_id: str | None
+    verdict: str
+    report: dict[str, Any]
+    created_ns: int
+
+
+def new_id() -> str:
+    """A random identifier that tells nothing and cannot be guessed."""
+    return str(uuid.uuid4())
+
+
+def add_recording(connection: Connection, row: RecordingRow) -> None:
+    """Store a recording's row."""
+    connection.execute(insert(recordings).values(**_as_dict(row)))
+
+
+def finish_recording(
+    connection: Connection, recording_id: str, vehicle: str | None, tally: dict[str, Any], now: int
+) -> None:
+    """Write down what reading the recording came to."""
+    connection.execute(
+        update(recordings)
+        .where(recordings.c.id == recording_id)
+        .values(vehicle_id=vehicle, tally=tally, finished_ns=now)
+    )
+
+
+def get_recording(connection: Connection, recording_id: str) -> RecordingRow | None:
+    """A recording by id."""
+    row = _one(connection, recordings, recording_id)
+    return None if row is None else RecordingRow(*row)
+
+
+def add_job(connection: Connection, row: JobRow) -> None:
+    """Store a job's row."""
+    connection.execute(insert(jobs).values(**_as_dict(row)))
+
+
+def update_job(connection: Connection, job_id: str, now: int, **values: Any) -> None:
+    """Change columns of a job."""
+    connection.execute(update(jobs).where(jobs.c.id == job_id).values(updated_ns=now, **values))
+
+
+def get_job(connection: Connection, job_id: str) -> JobRow | None:
+    """A job by id."""
+    row = _one(connection, jobs, job_id)
+    return None if row is None else JobRow(*row)
+
+
+def unfinished_jobs(connection: Connection) -> Sequence[JobRow]:
+    """Jobs that a previous process accepted and did not finish, oldest first."""
+    query = select(jobs).where(jobs.c.state.in_(UNFINISHED)).order_by(jobs.c.created_ns)
+    return [JobRow(*row) for row in connection.execute(query)]
+
+
+def add_report(connection: Connection, row: ReportRow) -> None:
+    """Store a report."""
+    connection.execute(insert(reports).values(**_as_dict(row)))
+
+
+def get_report(connection: Connection, report_id: str) -> ReportRow | None:
+    """A report by id."""
+    row = _one(connection, reports, report_id)
+    return None if row is None else ReportRow(*row)
+
+
+def list_reports(connection: Connection, vehicle: str, limit: int) -> list[ReportRow]:
+    """Reports of a vehicle, newest first."""
+    query = select(reports).where(reports.c.vehicle_id == vehicle).order_by(reports.c.created_ns.desc()).limit(limit)
+    return [ReportRow(*row) for row in connection.execute(query)]
+
+
+def _one(connection: Connection, table: Table, key: str) -> Any:
+    return connection.execute(select(table).where(table.c.id == key)).first()
+
+
+def _as_dict(row: Any) -> dict[str, Any]:
+    return {name: getattr(row, name) for name in row.__slots__}
