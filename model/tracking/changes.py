@@ -1,0 +1,122 @@
+"""Own baseline of every parameter, and sequential tests for a change from it.
+
+Page's test (CUSUM) on the log-likelihood ratio of "changed by `size`" against "as the baseline", two-sided, on the
+marginal of each parameter: the estimate of one parameter is unbiased whatever its neighbours do, so a jump in one
+does not alarm another.  Arrays are (..., P): one vehicle, or many at once for Monte Carlo.  Nothing here knows how
+windows were made; noise is what `variance` says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from model.signals import BoolArray, FloatArray, IntArray
+from model.tracking.settings import TrackerSettings, design
+
+STEPS = 6.0  # windows that an alarm needs at least: one window counts at most threshold / STEPS
+QUIET = 0.25  # share of the threshold below which a baseline may still be refined
+RECOVERY_SHARE = 1 / 3  # recovery tests 0 against this share of the design change: a dead zone against flapping
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """Sums for the baseline and running statistics of the tests."""
+
+    learned: FloatArray  # s of used windows, shape (..., P)
+    weight: FloatArray  # sum of 1 / variance, shape (..., P)
+    weighted: FloatArray  # sum of log-ratio / variance, shape (..., P)
+    up: FloatArray  # log-likelihood ratio for an increase, shape (..., P)
+    down: FloatArray
+    up_since: IntArray  # ns, when `up` last left zero, shape (..., P)
+    down_since: IntArray
+    recovery: FloatArray  # log-likelihood ratio for "healthy again", shape (..., P)
+    active: NDArray[np.int8]  # -1, 0, +1: the change that is alarmed, shape (..., P)
+
+    @property
+    def baseline(self) -> FloatArray:
+        """Log-ratio to nominal of the vehicle's own healthy state, shape (..., P); NaN before any window."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.where(self.weight > 0, self.weighted / self.weight, np.nan)
+
+    @property
+    def baseline_variance(self) -> FloatArray:
+        """Shape (..., P); infinite before any window."""
+        with np.errstate(divide="ignore"):
+            return np.where(self.weight > 0, 1.0 / self.weight, np.inf)
+
+
+def start(shape: tuple[int, ...]) -> Changes:
+    zeros = np.zeros(shape)
+    since = np.zeros(shape, dtype=np.int64)
+    return Changes(zeros, zeros, zeros, zeros, zeros, since, since, zeros, np.zeros(shape, dtype=np.int8))
+
+
+def update(
+    changes: Changes,
+    value: FloatArray,  # log-ratios of one window, shape (..., P)
+    variance: FloatArray,  # of independent information: scatter and overlap included, shape (..., P)
+    mask: BoolArray,  # measured by this window, shape (..., P)
+    *,
+    seconds: float,  # of signal that no earlier window held
+    time: int,  # ns, centre of the window
+    settings: TrackerSettings,
+) -> Changes:
+    """After one window: learns or tests."""
+    evidence = settings.evidence(value.shape[-1])
+    learned = changes.learned + np.where(mask, seconds, 0.0)
+    armed = mask & (changes.learned >= settings.learning)
+    safe = np.where(mask, variance, 1.0)
+    baseline = changes.weighted / np.maximum(changes.weight, np.finfo(float).tiny)
+    spread = 1.0 / np.maximum(changes.weight, settings.prior**-2)
+    size, threshold = design(evidence, settings.change, spread)
+    offset = np.where(armed, value - baseline, 0.0)
+    scale = np.where(armed, size / safe, 0.0)
+    most = threshold / STEPS
+    up = _page(changes.up, scale * (offset - size / 2), most, threshold)
+    down = _page(changes.down, scale * (-offset - size / 2), most, threshold)
+    up_since = np.where((changes.up == 0) & (up > 0), time, changes.up_since)
+    down_since = np.where((changes.down == 0) & (down > 0), time, changes.down_since)
+
+    closed, active, recovery = np.zeros_like(armed), changes.active, changes.recovery
+    if active.any():
+        mild = RECOVERY_SHARE
+        healthy = scale * mild * (mild * size / 2 - active * offset)
+        recovery = _page(recovery, np.where(active != 0, healthy, 0.0), most, threshold)
+        closed = (active != 0) & (recovery >= settings.recovery_evidence)
+        active = np.where(closed, 0, active)
+    highest = np.maximum(up, down)
+    crossed = armed & (active == 0) & ~closed & (highest >= threshold)
+    active = np.where(crossed, np.where(up >= down, 1, -1), active).astype(np.int8)
+
+    quiet = (highest < QUIET * threshold) & (active == 0) & (spread > settings.baseline_std**2)
+    learning = mask & (~armed | quiet)
+    gain = np.where(learning, 1.0 / safe, 0.0)
+    return Changes(
+        learned,
+        changes.weight + gain,
+        changes.weighted + gain * np.where(mask, value, 0.0),
+        np.where(closed, 0.0, up),
+        np.where(closed, 0.0, down),
+        up_since,
+        down_since,
+        np.where(active == 0, 0.0, recovery),
+        active,
+    )
+
+
+def _page(statistic: FloatArray, increment: FloatArray, most: FloatArray, threshold: FloatArray) -> FloatArray:
+    """One step of Page's test; bounded increments, so that one outlying window neither alarms nor clears."""
+    bounded = np.minimum(np.maximum(increment, -2.0 * most), most)
+    return np.minimum(np.maximum(statistic + bounded, 0.0), 2.0 * threshold)
+
+
+def relearn(changes: Changes, rows: BoolArray) -> Changes:
+    """Forgets the baseline where `rows` (..., P), e.g. after a repair."""
+    zero = {
+        name: np.where(rows, 0.0, getattr(changes, name))
+        for name in ("learned", "weight", "weighted", "up", "down", "recovery")
+    }
+    return replace(changes, active=np.where(rows, 0, changes.active).astype(np.int8), **zero)

@@ -1,0 +1,45 @@
+"""Do windows still fit?  Their residual power against the vehicle's own noise floor, and the estimator's verdict."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+REFERENCE = 2.0  # standard deviations above the floor that count as normal
+MOST = 4.0  # one window adds at most this less REFERENCE
+THRESHOLD = 20.0  # so ten windows in a row at least; 2 h k = 80: Gaussian scatter alone never gets there
+LEAST_SPREAD = 0.1  # of log chi-square; windows of one vehicle differ by that with speed and track
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Noise floor of log chi-square (mean and spread over learning) and a one-sided Page test on it."""
+
+    windows: int = 0  # that the floor was learned from
+    mean: float = 0.0
+    moment: float = 0.0  # sum of squared deviations (Welford)
+    statistic: float = 0.0
+    rising_since: int = 0  # ns, when the statistic last left zero
+    misfit_since: int | None = None  # ns; None: windows fit
+
+
+def update(fit: Fit, chi_square: float, adequate: bool, learning: bool, time: int) -> Fit:
+    """After one window; `time` in ns.  The floor is learned from adequate windows while `learning`."""
+    usable = math.isfinite(chi_square) and chi_square > 0
+    level = math.log(chi_square) if usable else math.inf
+    if adequate and usable and learning:
+        count = fit.windows + 1
+        mean = fit.mean + (level - fit.mean) / count
+        fit = replace(fit, windows=count, mean=mean, moment=fit.moment + (level - fit.mean) * (level - mean))
+    score = MOST
+    if adequate and usable:
+        spread = max(LEAST_SPREAD, math.sqrt(fit.moment / max(fit.windows - 1, 1)))
+        score = min(MOST, (level - fit.mean) / spread) if fit.windows else 0.0
+    statistic = min(max(0.0, fit.statistic + max(score, -MOST) - REFERENCE), 1.5 * THRESHOLD)
+    rising = time if fit.statistic == 0 and statistic > 0 else fit.rising_since
+    since = fit.misfit_since
+    if since is None and statistic >= THRESHOLD:
+        since = rising
+    elif since is not None and statistic == 0:
+        since = None
+    return replace(fit, statistic=statistic, rising_since=rising, misfit_since=since)

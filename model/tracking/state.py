@@ -1,0 +1,149 @@
+"""The tracker's state: a small frozen value that goes through JSON and comes back bit for bit."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from model.signals import FloatArray, IntArray
+from model.tracking.changes import Changes
+from model.tracking.filter import Belief
+from model.tracking.misfit import Fit
+from model.tracking.scatter import Scatter
+from model.tracking.surprise import Surprise
+
+FORMAT = 1
+
+Kind = Literal["change", "misfit"]
+Severity = Literal["warning", "alarm"]
+Health = Literal["ok", "maintenance_required", "out_of_specification", "check_function", "failure"]
+
+
+class TrackerStateError(ValueError):
+    """A stored state that can't be read, or that belongs to other parameters."""
+
+
+@dataclass(frozen=True, slots=True)
+class Alarm:
+    """A change of one parameter from the vehicle's own baseline, or windows that stopped fitting."""
+
+    kind: Kind
+    parameter: str | None  # None for a misfit
+    onset: int  # ns, estimated time of the change
+    opened: int  # ns, centre of the window that gave the evidence
+    severity: Severity
+    change: float | None = None  # relative to the baseline, now; None for a misfit
+    std: float | None = None
+    peak: float | None = None  # the largest change so far, signed
+    closed: int | None = None  # ns; None: active
+
+    @property
+    def key(self) -> tuple[str, str | None, int]:
+        """What names an alarm for as long as it lives."""
+        return self.kind, self.parameter, self.opened
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerState:
+    """All that the tracker knows about one vehicle; `update` makes a new one.  P parameters."""
+
+    names: tuple[str, ...]
+    time: int | None  # ns, start of the last window that was seen
+    last: int | None  # ns, start of the last window that was used
+    anchored: int | None  # ns, start of the window that `scatter` compares with
+    used: int  # windows fused
+    rejected: int  # windows not fused: inadequate, not converged, or without a proper covariance
+    outliers: int  # windows fused with bounded influence
+    belief: Belief
+    scatter: Scatter
+    surprise: Surprise
+    changes: Changes
+    fit: Fit
+    alarms: tuple[Alarm, ...]  # active and closed, oldest first
+
+    @property
+    def active(self) -> tuple[Alarm, ...]:
+        return tuple(alarm for alarm in self.alarms if alarm.closed is None)
+
+    @property
+    def misfit_since(self) -> int | None:
+        """ns since when windows don't fit; None while they do."""
+        return self.fit.misfit_since
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain JSON values; arrays as base64 of little-endian bytes, so that nothing is rounded."""
+        upper = np.triu_indices(len(self.belief.mean))
+        return {
+            "format": FORMAT,
+            "names": list(self.names),
+            "time": self.time,
+            "last": self.last,
+            "anchored": self.anchored,
+            "used": self.used,
+            "rejected": self.rejected,
+            "outliers": self.outliers,
+            "belief": _pack_all({"mean": self.belief.mean, "covariance": self.belief.covariance[upper]}),
+            "scatter": _pack_all(asdict(self.scatter)),
+            "surprise": _pack_all(asdict(self.surprise)),
+            "changes": _pack_all(asdict(self.changes)),
+            "fit": asdict(self.fit),
+            "alarms": [asdict(alarm) for alarm in self.alarms],
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> TrackerState:
+        """Raises TrackerStateError with what is wrong."""
+        if data.get("format") != FORMAT:
+            raise TrackerStateError(
+                f"stored tracker state has format {data.get('format')!r}; this version reads format {FORMAT}"
+            )
+        try:
+            return cls(
+                names=tuple(data["names"]),
+                time=data["time"],
+                last=data["last"],
+                anchored=data["anchored"],
+                used=data["used"],
+                rejected=data["rejected"],
+                outliers=data["outliers"],
+                belief=_belief(**_unpack_all(data["belief"])),
+                scatter=Scatter(**_unpack_all(data["scatter"])),
+                surprise=Surprise(**_unpack_all(data["surprise"])),
+                changes=Changes(**_unpack_all(data["changes"])),
+                fit=Fit(**data["fit"]),
+                alarms=tuple(Alarm(**alarm) for alarm in data["alarms"]),
+            )
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise TrackerStateError(f"stored tracker state can't be read: {error!r}") from error
+
+
+def _belief(mean: FloatArray, covariance: FloatArray) -> Belief:
+    upper = np.triu_indices(len(mean))
+    full = np.zeros((len(mean), len(mean)))
+    full[upper] = covariance
+    full.T[upper] = covariance
+    return Belief(mean, full)
+
+
+def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:
+    return {name: _pack(array) for name, array in arrays.items()}
+
+
+def _unpack_all(packed: Mapping[str, str]) -> dict[str, Any]:
+    return {name: _unpack(text) for name, text in packed.items()}
+
+
+def _pack(array: Any) -> str:
+    kind = array.dtype.newbyteorder("<").str
+    return kind + ":" + base64.b64encode(array.astype(kind).tobytes()).decode("ascii")
+
+
+def _unpack(text: str) -> Any:
+    kind, _, body = text.partition(":")
+    if kind not in ("<f8", "<i8", "|i1"):
+        raise TrackerStateError(f"stored tracker state holds an array of unknown type {kind!r}")
+    return np.frombuffer(base64.b64decode(body, validate=True), dtype=kind).copy()
