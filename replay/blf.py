@@ -134,7 +134,8 @@ class _Objects:
 
     def _walk(self, data: bytes) -> tuple[list[int], list[int], int]:
         """Offsets and types of the whole objects, and where the unfinished rest begins."""
-        offsets, kinds = [], []
+        offsets: list[int] = []
+        kinds: list[int] = []
         find, unpack, total = data.find, OBJECT_BASE.unpack_from, len(data)
         position = 0
         while position + OBJECT_BASE.size <= total:

@@ -205,9 +205,7 @@ def _plan(channels: Sequence[Channel], database: Database) -> list[MessagePlan]:
         name, _, signal_name = channel.can.partition(".")
         message = _named(messages, name, f"channel {channel.name}: the CAN database has no message", "messages")
         signals = {signal.name: signal for signal in message.signals}
-        signal = _named(
-            signals, signal_name, f"channel {channel.name}: CAN message {name} has no signal", "signals"
-        )
+        signal = _named(signals, signal_name, f"channel {channel.name}: CAN message {name} has no signal", "signals")
         frame_id = message.frame_id | (EXTENDED if message.is_extended_frame else 0)
         plan = plans.setdefault(name, MessagePlan(name, frame_id))
         plan.signals.append(_signal_plan(index, signal, signals, message))

@@ -87,9 +87,7 @@ def _fast(lines: list[str], separator: str, width: int, columns: list[int]) -> F
         return None
 
 
-def _careful(
-    lines: list[str], separator: str, width: int, columns: list[int], account: Account
-) -> FloatArray:
+def _careful(lines: list[str], separator: str, width: int, columns: list[int], account: Account) -> FloatArray:
     rows = []
     for row in csv.reader(lines, delimiter=separator):
         if not row:

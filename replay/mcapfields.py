@@ -153,10 +153,7 @@ def walk(item: Any, path: Path | tuple[str, ...]) -> Any:
     """The part of a decoded message at `path`, or None."""
     for token in path:
         try:
-            if isinstance(token, int) or isinstance(item, dict):
-                item = item[token]
-            else:
-                item = getattr(item, token)
+            item = item[token] if isinstance(token, int) or isinstance(item, dict) else getattr(item, token)
         except (KeyError, IndexError, TypeError, AttributeError):
             return None
     return item

@@ -143,7 +143,9 @@ class McapFile:
         """After a record that cannot be right: place the file at the next chunk of the index, if there is one."""
         if summary is not None:
             later = sorted(index.chunk_start_offset for index in summary.chunks if index.chunk_start_offset > at)
-            self.account.problem(f"damaged at byte {at}; {'went on at the next chunk' if later else 'nothing after it'}")
+            self.account.problem(
+                f"damaged at byte {at}; {'went on at the next chunk' if later else 'nothing after it'}"
+            )
             if later:
                 file.seek(later[0])
                 return True

@@ -79,6 +79,4 @@ def _block(file: McapFile, batch: Batch, topics: dict[int, Topic | None], accoun
     if not places:
         return None
     order = np.argsort(np.concatenate(places), kind="stable")
-    return SampleBlock(
-        np.concatenate(times)[order], np.concatenate(indices)[order], np.concatenate(values)[order]
-    )
+    return SampleBlock(np.concatenate(times)[order], np.concatenate(indices)[order], np.concatenate(values)[order])

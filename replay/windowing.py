@@ -1,0 +1,257 @@
+"""Streams of samples to windows on one even grid."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
+from replay.grid import REACH, SLOWEST, Placed, fill, place, resample
+from replay.stream import Jump, Order
+
+FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
+COHERENT = 0.5  # mean resultant length of the phases above which they have a common phase
+
+
+class Windower:
+    """Samples in, whole, repaired or dropped windows out, each once and in order.
+
+    The grid begins at the first sample; windows start every `hop` samples.  The result depends on the samples and
+    their order only, not on how they are cut into blocks.  A window is emitted once the stream is `delay` past its
+    end.  Memory: one window, the delay and the pause that is still waited for.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[Channel],
+        sample_rate: float,
+        window: int,
+        hop: int | None = None,
+        *,
+        inputs: frozenset[str] | int = 0,
+        longest_gap: int = 2,
+        largest_share: float = 0.03,
+        delay: float = 0.5,
+        pause: float = 5.0,
+    ) -> None:
+        """`inputs`: names (or number of leading) channels without which a window is worthless; `longest_gap`
+        consecutive samples and `largest_share` of a window's samples may be repaired; `delay`: s that samples may
+        come out of order; `pause`: s of silence after which the grid starts anew."""
+        self.channels = tuple(channels)
+        self.sample_rate = float(sample_rate)
+        self.window = int(window)
+        self.hop = int(hop) if hop else max(self.window // 2, 1)
+        if self.window < 4 or not self.sample_rate > 0:
+            raise ValueError(f"a window needs at least 4 samples and a positive rate, not {window} at {sample_rate}")
+        names = [channel.name for channel in channels]
+        wanted = set(names[:inputs]) if isinstance(inputs, int) else set(inputs)
+        self.is_input = np.array([name in wanted for name in names])
+        self.longest_gap = longest_gap
+        self.largest_share = largest_share
+        self.order = Order(delay, pause, confirm=max(8, 2 * len(names)))
+        self.delay = delay
+        self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
+        self.expected = 0  # samples that the emitted windows should hold, each counted once
+        self.lost = 0  # of these, samples that did not come or were invalid
+        self._period = 1e9 / self.sample_rate  # ns
+        self._pending: list[SampleBlock] = []
+        self._origin: float | None = None  # ns of row 0 of the next window
+        self._overlap = (0, 0)  # samples and lost samples of the last window that the next one shares
+        self._first_row = True  # the next window is the first of its grid: nothing lies before it
+
+    def push(self, block: SampleBlock) -> list[Window]:
+        """Windows that this block completed."""
+        out: list[Window] = []
+        for piece in self.order.push(block):
+            if isinstance(piece, Jump):
+                out += self._finish()
+                self.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
+                continue
+            self._pending.append(piece)
+            if self._origin is None:
+                self._origin = float(piece.time[0])
+        if self._origin is not None and self.order.newest is not None:
+            horizon = self.order.newest - self.delay * 1e9
+            rows = int(np.floor((horizon - self._origin) / self._period)) - REACH
+            out += self._emit(rows, ended=False)
+        return out
+
+    def flush(self) -> list[Window]:
+        """At the end of the stream: the windows that are still whole."""
+        self.order.flush()
+        self.reasons.update(self.order.counts)
+        self.order.counts.clear()
+        return self._finish()
+
+    def _finish(self) -> list[Window]:
+        """Emit what the current grid still holds and forget it."""
+        out: list[Window] = []
+        if self._origin is not None and self._pending:
+            last = max(float(block.time.max()) for block in self._pending)
+            rows = int(np.rint((last - self._origin) / self._period)) + 1
+            out = self._emit(rows, ended=True)
+        self.expected += self._overlap[0]
+        self.lost += self._overlap[1]
+        self._pending, self._origin, self._first_row, self._overlap = [], None, True, (0, 0)
+        return out
+
+    def _emit(self, rows: int, *, ended: bool) -> list[Window]:
+        """All windows within the next `rows` rows; the grid follows the samples' phase from window to window."""
+        out: list[Window] = []
+        while (count := (rows - self.window) // self.hop + 1) > 0 and self._origin is not None:
+            samples = self._gather()
+            batch = _Batch(self, samples, count, after=0 if ended else REACH)
+            moved = batch.first_out_of_phase()
+            for index in range(count if moved is None else moved):
+                out.append(batch.window(index))
+            done = count if moved is None else moved
+            self._origin += done * self.hop * self._period
+            rows -= done * self.hop
+            if moved is not None:
+                self._origin += batch.phase[moved] * self._period
+            self._first_row = self._first_row and done == 0
+            self._forget(samples)
+        return out
+
+    def _count(self, gone: BoolArray) -> None:
+        """Count every sample once: a window answers for its first `hop` rows, the last one for all of them."""
+        self.expected += gone[: self.hop].size
+        self.lost += int(gone[: self.hop].sum())
+        self._overlap = (gone[self.hop :].size, int(gone[self.hop :].sum()))
+
+    def _gather(self) -> SampleBlock:
+        if len(self._pending) > 1:
+            self._pending = [
+                SampleBlock(
+                    np.concatenate([block.time for block in self._pending]),
+                    np.concatenate([block.channel for block in self._pending]),
+                    np.concatenate([block.value for block in self._pending]),
+                )
+            ]
+        return self._pending[0]
+
+    def _forget(self, samples: SampleBlock) -> None:
+        keep = samples.time >= (self._origin or 0.0) - (REACH + 1) * self._period
+        self._pending = [SampleBlock(samples.time[keep], samples.channel[keep], samples.value[keep])]
+
+
+class _Batch:
+    """Several consecutive windows at once: everything that can be done for all of them together."""
+
+    def __init__(self, owner: Windower, samples: SampleBlock, count: int, after: int) -> None:
+        self.owner = owner
+        self.count = count
+        self.before = 0 if owner._first_row else REACH
+        self.rows = self.before + (count - 1) * owner.hop + owner.window + after
+        self.origin = owner._origin or 0.0
+        base = int(self.origin)  # differences of int64, so that no nanosecond is lost
+        self.offset = ((samples.time - base) - (self.origin - base)) / owner._period + self.before
+        self.samples = samples
+        channels = len(owner.channels)
+        self.placed: Placed = place(self.offset, samples.channel, samples.value, self.rows, channels)
+        self.starts = self.before + owner.hop * np.arange(count)
+        self.ends = self.starts + owner.window
+        self.filled = fill(self.placed.value, owner.longest_gap)
+        missing = np.isnan(self.placed.value)
+        self.missing = self._per_window(missing)  # (W, C)
+        self.unfilled = self._per_window(np.isnan(self.filled))
+        self.off_grid = self._per_window(self.placed.off_grid)
+        self.conflict = self._per_window(self.placed.conflict)
+        self.phase, self.coherence = self._phases()
+        self.by_channel: list[tuple[FloatArray, FloatArray]] | None = None
+
+    def _per_window(self, mask: BoolArray) -> IntArray:
+        total = np.concatenate([np.zeros((1, mask.shape[1]), dtype=np.int64), np.cumsum(mask, axis=0)])
+        return total[self.ends] - total[self.starts]
+
+    def _phases(self) -> tuple[FloatArray, FloatArray]:
+        """Circular mean of the samples' offsets from their rows, in periods, and its resultant length: (W,) each."""
+        total = np.concatenate([np.zeros((1, 2)), np.cumsum(self.placed.phase, axis=0)])
+        cosine, sine = (total[self.ends] - total[self.starts]).T
+        present = (~np.isnan(self.placed.value)).sum(axis=1)
+        number = np.r_[0, np.cumsum(present)]
+        number = np.maximum(number[self.ends] - number[self.starts], 1)
+        return np.arctan2(sine, cosine) / (2.0 * np.pi), np.hypot(sine, cosine) / number
+
+    def first_out_of_phase(self) -> int | None:
+        """The first window for which the grid must move to stay with the samples."""
+        out = np.flatnonzero((np.abs(self.phase) > FOLLOW) & (self.coherence > COHERENT))
+        return int(out[0]) if len(out) else None
+
+    def window(self, index: int) -> Window:
+        """The window, judged: used, repaired or dropped."""
+        owner = self.owner
+        rows = slice(self.starts[index], self.ends[index])
+        values = self.filled[rows].copy()
+        missing = self.missing[index].copy()
+        unfilled = self.unfilled[index].copy()
+        conflict = self.conflict[index].copy()
+        gone = np.isnan(self.placed.value[rows])
+        notes: list[str] = []
+        for channel in np.flatnonzero(self.off_grid[index]):
+            column, note = self._resampled(int(channel), rows)
+            values[:, channel] = column
+            gone[:, channel] = np.isnan(column)
+            missing[channel] = unfilled[channel] = int(gone[:, channel].sum())
+            conflict[channel] = 0
+            if note:
+                notes.append(note)
+        absent = missing == owner.window
+        values[:, absent] = np.nan
+        owner._count(gone)
+        start = round(self.origin + index * owner.hop * owner._period)
+        reason = self._reason(absent, missing, unfilled, conflict)
+        if reason:
+            owner.reasons[reason] += 1
+            return Window(start, owner.sample_rate, values, "dropped", reason)
+        repaired = int(missing[~absent].sum())
+        if repaired:
+            notes.insert(0, "missing samples interpolated")
+        if notes:
+            owner.reasons[notes[0]] += 1
+            return Window(start, owner.sample_rate, values, "repaired", "; ".join(notes[:4]), repaired)
+        return Window(start, owner.sample_rate, values)
+
+    def _reason(self, absent: BoolArray, missing: IntArray, unfilled: IntArray, conflict: IntArray) -> str | None:
+        """Why the window must be dropped, or None."""
+        owner = self.owner
+        if absent.all():
+            return "no samples"
+        names = [channel.name for channel in owner.channels]
+        lacking = np.flatnonzero(absent & owner.is_input)
+        if len(lacking):
+            return f"missing input {names[lacking[0]]}"
+        present = ~absent
+        cells = owner.window * int(present.sum())
+        if conflict[present].sum() > owner.largest_share * cells:
+            return "clock stepped back"
+        if missing[present].sum() > owner.largest_share * cells:
+            return "too many missing samples"
+        broken = np.flatnonzero(present & (unfilled > 0))
+        if len(broken):
+            return f"gap in {names[broken[0]]}"
+        return None
+
+    def _resampled(self, channel: int, rows: slice) -> tuple[FloatArray, str | None]:
+        offset, value = self._samples_of(channel)
+        near = slice(*np.searchsorted(offset, [rows.start - REACH - 1, rows.stop + REACH + 1]))
+        grid = np.arange(rows.start, rows.stop, dtype=np.float64)
+        column, rate = resample(offset[near], value[near], grid)
+        name, own = self.owner.channels[channel].name, rate * self.owner.sample_rate
+        if 0.0 < rate < SLOWEST * (1.0 - 1e-3):
+            return column, f"{name} too slow ({own:.3g} Hz)"
+        if 0.0 < rate < 0.98:
+            return column, f"{name} interpolated from {own:.3g} Hz"
+        return column, None
+
+    def _samples_of(self, channel: int) -> tuple[FloatArray, FloatArray]:
+        if self.by_channel is None:
+            order = np.lexsort((self.offset, self.samples.channel))
+            bounds = np.searchsorted(self.samples.channel[order], np.arange(len(self.owner.channels) + 1))
+            self.by_channel = [
+                (self.offset[order[a:b]], self.samples.value[order[a:b]])
+                for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+            ]
+        return self.by_channel[channel]
