@@ -1,0 +1,145 @@
+"""Cases to recordings: batches through the integrator, then noise, faults, files and labels."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.generator import track
+from benchmarks.generator.draw import Case
+from benchmarks.generator.files import WRITERS
+from benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
+from benchmarks.generator.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+SLACK = 0.6  # s simulated beyond the last sample, for the filter and for lags
+FORMATS = ("mcap", "blf", "mcap", "log", "mcap", "asc")
+
+
+def _plant(vehicle: Vehicle, cases: list[Case]) -> Plant:
+    batch = len(cases)
+    inertia = np.repeat(vehicle.inertia[:, None], batch, 1)
+    mode, drive = np.zeros((4, batch)), np.zeros((4, batch))
+    mode[0] = 10.0
+    slots = []
+    for column, case in enumerate(cases):
+        if case.mass_scale:
+            inertia[vehicle.on_body(case.mass_scale[0]), column] *= case.mass_scale[1]
+        if case.flex:
+            mode[:, column] = [*case.flex[:3], 1.0]
+        if case.drive:
+            drive[:, column] = [*case.drive, np.random.default_rng(case.seed + 1).uniform(0, 2 * np.pi)]
+        slots += [Slot(column, vehicle.elements.index(e), law, p) for e, law, p in case.effects]
+    values = [[[getattr(c, q)[e] for c in cases] for e in vehicle.elements] for q in ("stiffness", "damping")]
+    return Plant(np.array(values[0]), np.array(values[1]), inertia, mode, drive, slots)
+
+
+def _delayed(signal: Array, lag: float) -> Array:
+    """A fractional delay by a windowed sinc; flat to about 45 Hz."""
+    reach = 40
+    whole = int(np.floor(lag * SAMPLE_RATE))
+    n = np.arange(-reach, reach + 1)
+    kernel = np.sinc(n - (lag * SAMPLE_RATE - whole)) * np.kaiser(2 * reach + 1, 8.0)
+    padded = np.concatenate([np.full(reach + whole, signal[0]), signal, np.full(reach, signal[-1])])
+    return np.convolve(padded, kernel / kernel.sum(), mode="valid")[: signal.size]
+
+
+def _measure(vehicle: Vehicle, case: Case, clean: Array, samples: int) -> Array:
+    """Noise and the case's fault on the true signals; returns (samples, channels)."""
+    rng = np.random.default_rng(case.seed)
+    noise = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
+    scale, values = noise.copy(), clean[:samples].copy()
+    names = [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
+    index, kind, value = -1, "", 0.0
+    if case.fault:
+        channel, kind, value = case.fault
+        index = names.index(channel)
+        if kind == "sensor_gain":
+            values[:, index] *= value
+        elif kind == "sensor_lag":
+            values[:, index] = _delayed(clean[:, index], value)[:samples]
+        elif kind == "sensor_bias":
+            values[:, index] += value
+        elif kind == "sensor_noise":
+            scale[index] *= value
+    values += rng.normal(size=values.shape) * scale
+    if kind == "sensor_stuck":
+        start = min(int(value * SAMPLE_RATE), samples // 2)
+        values[start:, index] = values[start, index]
+    return values
+
+
+def make_recordings(
+    vehicle: Vehicle,
+    cases: list[Case],
+    seconds: float = 60.0,
+    batch: int = 32,
+    progress: Callable[[str], None] | None = None,
+) -> Iterator[tuple[Case, Array, list[float]]]:
+    """Each case with its measured channels (T, C) in the order displacements, velocities, sensors, and the
+    strength of each of its laws (rms of the law's force over rms of the element's linear force)."""
+    samples = round(seconds * SAMPLE_RATE)
+    for first in range(0, len(cases), batch):
+        group = cases[first : first + batch]
+        tables = [
+            track.wheels(
+                np.random.default_rng(case.seed + 2), WARM_UP + seconds + SLACK + 2, case.speed, case.level,
+                vehicle.input_position, vehicle.input_side, joint_spacing=case.joints,
+            )
+            for case in group
+        ]
+        displacement = np.stack([t[0] for t in tables], axis=2)
+        velocity = np.stack([t[1] for t in tables], axis=2)
+        plant = _plant(vehicle, group)
+        said = (lambda part, n=first: progress(f"{n}+{part:.0%} of {len(cases)}")) if progress else None
+        clean, strength = simulate(vehicle, plant, displacement, velocity, seconds + SLACK / 2, said)
+        for column, case in enumerate(group):
+            own = [float(s) for s, slot in zip(strength, plant.slots, strict=True) if slot.column == column]
+            yield case, _measure(vehicle, case, clean[:, :, column], samples), own
+
+
+def label(case: Case, strengths: list[float], seconds: float) -> dict[str, Any]:
+    """One entry of labels.json, in the form of the published labels, with the generator's extras."""
+    entry: dict[str, Any] = {
+        "verdict": case.verdict(), "seconds": seconds, "findings": case.findings(),
+        "stiffness": case.stiffness, "damping": case.damping, **case.change,
+        "kind": case.kind, "strength": strengths, "speed": case.speed, "joints": case.joints,
+        "track_level": case.level,
+    }
+    if case.flex:
+        entry["flex"] = case.flex
+    if case.drive:
+        entry["drive"] = case.drive
+    if case.mass_scale:
+        entry["mass_scale"] = case.mass_scale[1]
+    if case.fault:
+        entry["sensor"] = list(case.fault)
+    return entry
+
+
+def write_set(
+    vehicle: Vehicle,
+    cases: list[Case],
+    folder: Path,
+    seconds: float = 60.0,
+    formats: tuple[str, ...] = FORMATS,
+    batch: int = 32,
+    progress: Callable[[str], None] | None = None,
+) -> Path:
+    """Writes one file per case and labels.json (rewritten after every file); returns the labels' path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    labels: dict[str, Any] = {}
+    path = folder / "labels.json"
+    for number, (case, values, own) in enumerate(make_recordings(vehicle, cases, seconds, batch, progress)):
+        kind = formats[number % len(formats)]
+        name = f"concealed-{number:03d}.{kind}"
+        WRITERS[kind](folder / name, vehicle, values, f"concealed-{number:03d}")
+        labels[name] = label(case, own, seconds)
+        path.write_text(json.dumps(labels, indent=1), encoding="utf-8")
+    return path
