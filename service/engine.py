@@ -16,6 +16,18 @@ from service.settings import Settings
 log = logging.getLogger("sprung.engine")
 
 
+class StageTimes(Protocol):
+    """Seconds by stage."""
+
+    @property
+    def estimate(self) -> float:
+        """The trained estimator."""
+
+    @property
+    def refine(self) -> float:
+        """The refinement through the simulator."""
+
+
 class Identifies(Protocol):
     """The part of `model.identify.Identifier` that the service uses."""
 
@@ -23,8 +35,12 @@ class Identifies(Protocol):
     def digest(self) -> str:
         """Names system and estimator; estimates of another digest are not comparable."""
 
-    def identify(self, values: FloatArray, states: bool = False) -> list[Estimate]:
-        """Estimates of windows, values of shape (B, T, C)."""
+    @property
+    def times(self) -> StageTimes:
+        """Seconds spent in the stages of the last batch."""
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """Estimates of windows, shape (B, T, C); `start`: log-ratios to begin from, shape (B, P)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +65,12 @@ class Engine:
             "window": self.system.window,
             "sample_rate": self.system.sample_rate,
         }
+
+    def identify(self, values: FloatArray, states: bool = False) -> tuple[list[Estimate], dict[str, float]]:
+        """Estimates of windows, values of shape (B, T, C), and the seconds they took by stage."""
+        estimates = self.identifier.identify(values, states=states)
+        times = self.identifier.times
+        return estimates, {"estimate": times.estimate, "refine": times.refine}
 
     def load_state(self, data: dict[str, Any]) -> TrackerState:
         """A stored tracker state; one of an older format starts anew rather than stopping the service."""

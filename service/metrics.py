@@ -109,7 +109,7 @@ def _parameter_families(entries: list[Entry]) -> Iterator[Metric]:
         for p in view.parameters:
             if p.identifiable:
                 values[p.quantity].add_metric([view.vehicle, p.element], p.value)
-            if p.drift is not None:
+            if p.drift is not None and p.drift_std is not None:
                 ratio.add_metric([view.vehicle, p.element, p.quantity], 1.0 + p.drift)
                 spread.add_metric([view.vehicle, p.element, p.quantity], p.drift_std)
         for sensor, nrmse in view.per_sensor.items():

@@ -82,9 +82,7 @@ class Pipeline:
         with self.store.read() as connection:
             known = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
-        started = time.perf_counter()
-        estimates = self._identify(fresh, priority)
-        seconds = {"identify": time.perf_counter() - started}
+        estimates, seconds = self._identify(fresh, priority)
         batch = self._commit(vehicle, fresh, estimates, recording_id)
         batch.seconds |= seconds
         if known:
@@ -109,13 +107,15 @@ class Pipeline:
         with self.store.read() as connection:
             return self._current(connection, vehicle).state
 
-    def _identify(self, windows: list[Window], priority: Priority) -> list[Estimate | None]:
+    def _identify(self, windows: list[Window], priority: Priority) -> tuple[list[Estimate | None], dict[str, float]]:
+        """Estimates, None for dropped windows; and seconds by stage."""
         whole = [w.values for w in windows if w.outcome != "dropped"]
         if not whole:
-            return [None] * len(windows)
+            return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
-        found = iter(self._compute.run(lambda: self.engine.identifier.identify(values), priority))
-        return [None if w.outcome == "dropped" else next(found) for w in windows]
+        estimates, seconds = self._compute.run(lambda: self.engine.identify(values), priority)
+        found = iter(estimates)
+        return [None if w.outcome == "dropped" else next(found) for w in windows], seconds
 
     def _commit(
         self,

@@ -51,8 +51,7 @@ class Settings(BaseSettings):
     ring_vehicles: int = Field(default=16, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
     ring_seconds: float = Field(default=60.0, gt=0)
 
-    misfit_windows: int = Field(default=40, gt=1)  # consecutive windows that are looked at
-    misfit_share: float = Field(default=0.8, gt=0, le=1)  # of them not fitting, to start a diagnosis
+    misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 
     retention_windows_days: float = Field(default=30.0, gt=0)  # counted from when a window was stored
@@ -63,3 +62,13 @@ class Settings(BaseSettings):
     def store_url(self) -> str:
         """The store's SQLAlchemy URL."""
         return self.store or f"sqlite:///{self.data_dir / 'sprung.db'}"
+
+    @property
+    def uploads(self) -> Path:
+        """Where uploads and excerpts lie, under names that the service chose."""
+        return self.data_dir / "uploads"
+
+    @property
+    def reports(self) -> Path:
+        """Where the pages and pictures of mismatch reports lie, a folder each."""
+        return self.data_dir / "reports"

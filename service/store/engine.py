@@ -38,7 +38,7 @@ class Store:
     def write(self) -> Iterator[Connection]:
         """One transaction, committed at the end, rolled back when anything raises."""
         with self._writing, self.engine.connect() as connection:
-            connection = connection.execution_options(sprung_write=True)
+            connection.execution_options(sprung_write=True)
             with connection.begin():
                 yield connection
 

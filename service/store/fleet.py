@@ -172,3 +172,14 @@ def attach_report(connection: Connection, vehicle: str, model_id: int, report_id
         )
         .values(report_id=report_id)
     )
+
+
+def recent_vehicles(connection: Connection, model_id: int, limit: int) -> list[str]:
+    """Vehicles whose trackers were fed last, the newest first."""
+    query = (
+        select(tracker_states.c.vehicle_id)
+        .where(tracker_states.c.model_id == model_id)
+        .order_by(tracker_states.c.updated_ns.desc())
+        .limit(limit)
+    )
+    return list(connection.execute(query).scalars())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -87,6 +87,7 @@ def history(
     resolution: seconds per point; below a minute made from raw windows, above from roll-ups; 0 gives raw windows.
     """
     level = max((level for level in LEVELS if level <= resolution), default=None)
+    newest_first: Iterator[Point]
     if level is None:
         query = (
             select(windows.c.start_ns, posteriors.c.log_ratio, posteriors.c.std)
@@ -115,7 +116,7 @@ def history(
     return found[::-1]
 
 
-def bucketed(points: Iterable[Point], resolution: float) -> Iterable[Point]:
+def bucketed(points: Iterable[Point], resolution: float) -> Iterator[Point]:
     """Merge points in order of time, either way, that fall into the same bucket of `resolution` seconds."""
     width = round(resolution * NANOSECONDS)
     current: Point | None = None

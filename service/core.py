@@ -1,0 +1,110 @@
+"""The application without its doors: everything wired once, at start, from the settings."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+
+from model.signals import Tally
+from service.board import Board
+from service.compute import Compute
+from service.diagnoses import Diagnoses
+from service.engine import Engine
+from service.feed import OnTally
+from service.housekeeping import Housekeeping
+from service.jobs import Handler, Jobs
+from service.metrics import Metrics
+from service.pipeline import Batch, Pipeline
+from service.recordings import RecordingJobs
+from service.ring import Rings
+from service.settings import Settings
+from service.store import Store, fleet, open_store
+from service.store.windows import latest_window
+from service.views import VehicleView, vehicle_view
+
+log = logging.getLogger("sprung")
+
+
+@dataclass(slots=True)
+class Core:
+    """What the API, the pages and the feeds share."""
+
+    settings: Settings
+    engine: Engine
+    store: Store
+    compute: Compute
+    pipeline: Pipeline
+    board: Board
+    metrics: Metrics
+    jobs: Jobs
+    diagnoses: Diagnoses
+    housekeeping: Housekeeping
+    stopping: threading.Event
+
+    def tally_counter(self, source: str) -> OnTally:
+        """A callback that adds to `sprung_frames_total` what a source has read since the last call."""
+        before = Tally()
+
+        def count(now: Tally) -> None:
+            nonlocal before
+            self.metrics.count_frames(source, before, now)
+            before = replace(now, reasons=now.reasons.copy())
+
+        return count
+
+    def start(self) -> None:
+        """Take up what was left, begin housekeeping."""
+        self.board.restore(stored_views(self))
+        self.jobs.start()
+        self.housekeeping.start()
+
+    def close(self) -> None:
+        """Finish what was accepted, then let go of the store."""
+        self.stopping.set()
+        with ExitStack() as stack:  # in reverse order, each even when another fails
+            stack.callback(self.store.close)
+            stack.callback(self.compute.close)
+            stack.callback(self.jobs.close)
+            stack.callback(self.housekeeping.close)
+
+
+def build_core(settings: Settings, engine: Engine) -> Core:
+    """Wire the application.  Raises UserError when the store cannot be opened."""
+    store = open_store(settings.store_url)
+    compute = Compute(settings.compute_queue)
+    board = Board(engine, settings.vehicles_in_memory)
+    metrics = Metrics(board, settings.parameter_series_vehicles)
+    rings = Rings(
+        settings.ring_vehicles,
+        settings.ring_seconds,
+        len(engine.system.channels),
+        engine.system.sample_rate,
+    )
+    stopping = threading.Event()
+    listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
+    pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory)
+    diagnoses = Diagnoses(settings, engine, store, rings, pipeline.model_id)
+    recordings = RecordingJobs(settings, pipeline)
+    handlers: dict[str, Handler] = {"recording": recordings.run, "diagnosis": diagnoses.run}
+    jobs = Jobs(store, handlers, settings.job_queue)
+    diagnoses.jobs = jobs
+    listeners.append(diagnoses.on_batch)
+    housekeeping = Housekeeping(settings, store)
+    core = Core(settings, engine, store, compute, pipeline, board, metrics, jobs, diagnoses, housekeeping, stopping)
+    recordings.tally_counter = core.tally_counter
+    return core
+
+
+def stored_views(core: Core) -> list[VehicleView]:
+    """Views of the vehicles heard from last, from the store, oldest first."""
+    views = []
+    with core.store.read() as connection:
+        for vehicle in fleet.recent_vehicles(connection, core.pipeline.model_id, core.settings.vehicles_in_memory):
+            row = fleet.load_tracker(connection, vehicle, core.pipeline.model_id)
+            if row is not None:
+                last = latest_window(connection, vehicle, core.pipeline.model_id)
+                views.append(vehicle_view(core.engine, vehicle, core.engine.load_state(row.state), last))
+    return views[::-1]

@@ -1,0 +1,69 @@
+"""Uploaded recordings as jobs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from replay import UnreadableRecording
+from service.errors import UserError
+from service.feed import Fed, OnTally, feed_file
+from service.jobs import Progress
+from service.pipeline import Batch, Pipeline
+from service.settings import Settings
+from service.store import Store, fleet, work
+from service.store.work import JobRow
+from service.times import now_ns
+
+
+def _uncounted(_source: str) -> OnTally:
+    return lambda tally: None
+
+
+class RecordingJobs:
+    """Runs jobs of kind `recording`: a file from the upload folder, through the pipeline."""
+
+    def __init__(self, settings: Settings, pipeline: Pipeline) -> None:
+        self._settings = settings
+        self._pipeline = pipeline
+        self.tally_counter: Callable[[str], OnTally] = _uncounted
+
+    def run(self, job: JobRow, progress: Progress) -> dict[str, Any]:
+        """Returns the summary of what was read."""
+        path, row = stored_file(self._settings, self._pipeline.store, job)
+        vehicle = job.vehicle_id or None
+
+        def on_batch(_batch: Batch) -> None:
+            progress.step(0.0)  # the length of a recording is known only at its end
+
+        try:
+            fed = feed_file(
+                self._pipeline,
+                path,
+                vehicle=vehicle,
+                recording_id=row.id,
+                batch_windows=self._settings.batch_windows,
+                on_batch=on_batch,
+                on_tally=self.tally_counter("upload"),
+            )
+        except UnreadableRecording as error:
+            raise UserError(str(error).replace(str(path), row.name)) from error
+        return self._finish(row, fed)
+
+    def _finish(self, row: work.RecordingRow, fed: Fed) -> dict[str, Any]:
+        now = now_ns()
+        with self._pipeline.store.write() as connection:
+            fleet.ensure_vehicle(connection, fed.vehicle, now)
+            work.finish_recording(connection, row.id, fed.vehicle, fed.summary(), now)
+        return {"recording": row.id} | fed.summary()
+
+
+def stored_file(settings: Settings, store: Store, job: JobRow) -> tuple[Path, work.RecordingRow]:
+    """The file of a job's recording; raises UserError when it is no longer kept."""
+    with store.read() as connection:
+        row = work.get_recording(connection, job.recording_id or "")
+    path = None if row is None or row.file is None else settings.uploads / row.file
+    if row is None or path is None or not path.is_file():
+        raise UserError("the recording's file is no longer kept; upload it again")
+    return path, row
