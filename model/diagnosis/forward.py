@@ -1,0 +1,325 @@
+"""What the sensors should show: nominal structure with any terms in place, driven by the measured inputs.
+
+The linear part is mapped bin by bin.  The force of a law is found along the trajectory that it shapes itself:
+
+    d = d_linear + D f,   f = law(d, d')        over the whole record at once
+
+by a fixed-point iteration with Anderson acceleration (Walker and Ni 2011) on an oversampled grid, around the
+equivalent linear law (`Term.preload`, carried by the plant), so that only the law's curvature is left to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
+
+import numpy as np
+from scipy.linalg import expm
+
+from model.diagnosis.catalogue import BodyLaw, SensorLaw, SpringDamper
+from model.diagnosis.hysteresis import force_along
+from model.diagnosis.measured import Part
+from model.diagnosis.plant import Plant, Structure
+from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from model.diagnosis.terms import Term, impedance, split
+from model.signals import FloatArray
+from model.system import System
+
+_TOLERANCE = 1e-6  # of the law's force
+_ITERATIONS = 60
+_HISTORY = 8
+
+
+def structure_of(
+    system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()
+) -> Structure:
+    """Structure for log-ratios `theta` (P,) of the system's parameters, with the laws of bodies in place."""
+    mechanics = system.mechanics
+    for term in terms:
+        if isinstance(term.law, BodyLaw) and term.law.load is None:
+            body = system.bodies.index(term.location)
+            mechanics = term.law.modify(mechanics, body, term.parameters, term.variant)
+    structure = Structure.nominal(mechanics, sensors)
+    stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
+    mass = structure.mass.copy()
+    for parameter, log_ratio in zip(system.parameters, theta, strict=True):
+        ratio = np.exp(log_ratio)
+        if parameter.quantity == "mass":
+            mass[structure.body_of_dof == system.bodies.index(parameter.element)] *= ratio
+        else:
+            values = stiffness if parameter.quantity == "stiffness" else damping
+            values[system.elements.index(parameter.element)] *= ratio
+    return replace(structure, stiffness=stiffness, damping=damping, mass=mass)
+
+
+@dataclass(frozen=True)
+class Forward:
+    """One model on one part of the recording."""
+
+    system: System
+    part: Part
+    sensors: np.ndarray  # indices of the present sensors, (S,)
+    theta: FloatArray  # (P,)
+    terms: tuple[Term, ...] = ()
+    start_force: tuple[FloatArray, ...] = ()  # forces of a nearby solution, to start the iteration from
+
+    @cached_property
+    def plant(self) -> Plant:
+        structure = structure_of(self.system, self.sensors, self.theta, self.terms)
+        waveform, linear, _, _ = split(self.terms)
+        stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
+        for term in waveform:
+            if "|" not in term.location:
+                e = self.system.elements.index(term.location)
+                stiffness[e] += term.preload[0]
+                damping[e] += term.preload[1]
+        extra = None
+        if linear:
+            extra = np.zeros((len(self.part.grid.omega), len(structure.stiffness)), dtype=complex)
+            for term in linear:
+                e = self.system.elements.index(term.location)
+                extra[:, e] += impedance(term, self.part.grid.omega, structure.damping[e])
+        return Plant(replace(structure, stiffness=stiffness, damping=damping), self.part.grid, extra)
+
+    def element_of(self, term: Term) -> SpringDamper:
+        """Spring and damper that a law belongs to, at the present parameters."""
+        structure = structure_of(self.system, self.sensors, self.theta)
+        e = self.system.elements.index(term.location.split("|")[0])
+        return SpringDamper(structure.stiffness[e], structure.damping[e])
+
+    @property
+    def elements(self) -> int:
+        return len(self.system.elements)
+
+    @cached_property
+    def polynomial(self) -> tuple[FloatArray, FloatArray]:
+        """Polynomial motion (DEGREE + 1, n) and deflections (DEGREE + 1, E) under the polynomial inputs."""
+        plant, s = self.plant, self.plant.structure
+        support = self.part.support_polynomial
+        moved = support @ s.G.T
+        load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
+        load = load + self.part.force_polynomial @ s.F.T[: self.part.force_polynomial.shape[1]]
+        q = plant.polynomial_response(load)
+        return q, q @ s.H.T + moved
+
+    @cached_property
+    def linear_sensors(self) -> ComplexArray:
+        """True signals without laws' forces and free motion, (F, S)."""
+        plant, part = self.plant, self.part
+        result = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support)
+        if part.force.shape[1]:
+            F = plant.structure.F[:, : part.force.shape[1]]
+            result += np.einsum("fsi,fi->fs", plant.sensor_of_load @ F, part.force)
+        return result
+
+    def shown(self, periodic: ComplexArray, polynomial: FloatArray) -> ComplexArray:
+        """What the sensors show of true signals (F, S) + polynomial (DEGREE + 1, S), faults in place."""
+        grid = self.part.grid
+        gain, lag, offset = self.faults
+        shown = periodic * self.sensor_factor + grid.monomial_spectra @ (_later(polynomial, lag / grid.length) * gain)
+        shown[0] += offset * np.sqrt(grid.samples)
+        return shown
+
+    @cached_property
+    def faults(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Gain, lag (s) and offset of every present sensor, each (S,)."""
+        gain, lag, offset = (np.full(len(self.sensors), value) for value in (1.0, 0.0, 0.0))
+        names = [self.system.sensors[i] for i in self.sensors]
+        for term in self.terms:
+            if not isinstance(term.law, SensorLaw) or term.location not in names:
+                continue
+            i = names.index(term.location)
+            if term.law.name == "sensor_gain":
+                gain[i] *= term.parameters[0]
+            elif term.law.name == "sensor_lag":
+                lag[i] += term.parameters[0]
+            elif term.law.name == "sensor_bias":
+                offset[i] += term.parameters[0]
+        return gain, lag, offset
+
+    @cached_property
+    def sensor_factor(self) -> ComplexArray:
+        """Shown over true signal of every sensor, (F, S)."""
+        gain, lag, _ = self.faults
+        return gain * np.exp(-1j * self.part.grid.omega[:, None] * lag)
+
+    @cached_property
+    def linear_deflection(self) -> ComplexArray:
+        """Periodic part of the deflections without laws' forces and free motion, (F, E)."""
+        plant, part = self.plant, self.part
+        result = np.einsum("fei,fi->fe", plant.deflection_of_support, part.support)
+        if part.force.shape[1]:
+            F = plant.structure.F[:, : part.force.shape[1]]
+            result += np.einsum("fei,fi->fe", plant.deflection_of_load @ F, part.force)
+        return result
+
+    def free_rows(self) -> FloatArray:
+        """Sensors over the free state at the first sample, (N, S, 2n)."""
+        grid = self.part.grid
+        rows = self.plant.structure.sensor_rows()
+        gain, lag, _ = self.faults
+        for i in np.flatnonzero(lag):
+            rows[i] = rows[i] @ expm(-self.plant.structure.state_matrix() * lag[i])
+        return self.plant.free_motion(rows * gain[:, None], grid.step, grid.samples)
+
+    def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deflection and rate along ports (m, E) on the oversampled axis, laws' forces left out: 2 x (4N, m)."""
+        plant, grid = self.plant, self.part.grid
+        H = plant.structure.H
+        ports = np.pad(ports, ((0, 0), (0, len(H) - ports.shape[1])))
+        spectrum = self.linear_deflection @ ports.T
+        d = grid.fine(spectrum)
+        v = grid.fine(1j * grid.omega[:, None] * spectrum)
+        polynomial = self.polynomial[1] @ ports.T
+        powers = np.vander(grid.fine_time / grid.length, DEGREE + 1, increasing=True)
+        d += powers @ polynomial
+        v += powers @ plant.derivative(polynomial)
+        rows = ports @ H
+        both = np.vstack([np.hstack([rows, np.zeros_like(rows)]), np.hstack([np.zeros_like(rows), rows])])
+        A = plant.structure.state_matrix()
+        free = _propagate(A, both, state, grid.step / OVERSAMPLING, len(d))
+        return d + free[:, : len(ports)], v + free[:, len(ports) :]
+
+    def law_forces(self, state: FloatArray) -> LawForces | None:
+        """Forces of the laws along their own trajectory; None when no law needs it."""
+        waveform, *_ = split(self.terms)
+        if not waveform:
+            return None
+        return _solve(self, waveform, state)
+
+
+@dataclass(frozen=True)
+class LawForces:
+    """Solution of the loop for m laws; forces without the preload that the plant carries."""
+
+    terms: list[Term]
+    ports: FloatArray  # (m, E)
+    deflection: FloatArray  # (4N, m)
+    rate: FloatArray  # (4N, m)
+    force: FloatArray  # (4N, m)
+    converged: bool
+    sensors: ComplexArray  # what the forces add to the true signals, periodic part, (F, S)
+    deflections: ComplexArray  # what they add to the deflections, periodic part, (F, E)
+    q: ComplexArray  # what they add to the degrees of freedom, periodic part, (F, n)
+    motion: FloatArray  # polynomial motion that they add, (DEGREE + 1, n)
+
+
+def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
+    """Coefficients of p(t - delay) from those of p(t), one delay per column."""
+    if not np.any(delay):
+        return polynomial
+    result = np.zeros_like(polynomial)
+    for k in range(len(polynomial)):
+        for j in range(k + 1):
+            result[j] += polynomial[k] * comb(k, j) * (-delay) ** (k - j)
+    return result
+
+
+def _propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, count: int) -> FloatArray:
+    """rows e^{A t} state at t = 0, step, ...: (count, len(rows)), states by doubling."""
+    power = expm(A * step)
+    states = np.empty((count, len(state)))
+    states[0] = state
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        states[done : done + more] = states[:more] @ power.T
+        power = power @ power
+        done += more
+    return states @ rows.T
+
+
+def _solve(forward: Forward, terms: list[Term], state: FloatArray) -> LawForces:
+    plant, grid = forward.plant, forward.part.grid
+    structure = plant.structure
+    ports = np.array([t.port(forward.system) for t in terms])
+    wide = np.pad(ports, ((0, 0), (0, len(structure.H) - ports.shape[1])))
+    loop = _Loop(plant, wide, *forward.fine_motion(ports, state))
+    time = grid.start + grid.fine_time
+    elements = [forward.element_of(term) for term in terms]
+
+    def law(d: FloatArray, v: FloatArray) -> FloatArray:
+        columns = [
+            force_along(t.law, t.parameters, d[:, i], v[:, i], time, elements[i])
+            - t.preload[0] * d[:, i]
+            - t.preload[1] * v[:, i]
+            for i, t in enumerate(terms)
+        ]
+        return np.column_stack(columns)
+
+    start = np.column_stack(forward.start_force) if forward.start_force else law(loop.d0, loop.v0)
+    force, converged = _fixed_point(lambda f: law(*loop.motion(f)), start)
+    d, v = loop.motion(force)
+    spectrum, line = loop.decompose(force)
+    motion = np.einsum("bkpn,kb->pn", loop.lines, line[:2])
+    sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ wide.T, spectrum)
+    q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (wide @ structure.H))
+    return LawForces(terms, ports, d, v, force, converged, sensors, q @ structure.H.T, q, motion)
+
+
+class _Loop:
+    """Motion along the ports under forces along the ports, on the oversampled axis."""
+
+    def __init__(self, plant: Plant, ports: FloatArray, d0: FloatArray, v0: FloatArray) -> None:
+        self.plant, self.grid, self.d0, self.v0 = plant, plant.grid, d0, v0
+        self.compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
+        self.lines = np.array([self._line_motion(port) for port in ports])  # (m, 2, DEGREE + 1, n)
+        self.line_d = np.einsum("bkpn,an->kpab", self.lines, ports @ plant.structure.H)
+        self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+
+    def _line_motion(self, port: FloatArray) -> FloatArray:
+        """Polynomial motions under a constant unit force and under one that rises to 1, (2, DEGREE + 1, n)."""
+        load = np.zeros((2, DEGREE + 1, self.plant.structure.H.shape[1]))
+        for k in range(2):
+            load[k, k] = -port @ self.plant.structure.H
+        return np.array([self.plant.polynomial_response(one) for one in load])
+
+    def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Periodic spectrum (F, m) and polynomial (DEGREE + 1, m): a line that joins the ends, and the mean."""
+        line = np.zeros((DEGREE + 1, force.shape[1]))
+        line[1] = force[-1] - force[0]
+        rest = force - self.powers[:, 1:2] * line[1]
+        line[0] = rest.mean(axis=0)
+        return self.grid.coarse_spectrum(rest - line[0]), line
+
+    def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deflection and rate, 2 x (4N, m)."""
+        spectrum, line = self.decompose(force)
+        answer = np.einsum("fab,fb->fa", self.compliance, spectrum)
+        polynomial = np.einsum("kpab,kb->pa", self.line_d, line[:2])
+        d = self.d0 + self.grid.fine(answer) + self.powers @ polynomial
+        v = self.v0 + self.grid.fine(1j * self.grid.omega[:, None] * answer)
+        return d, v + self.powers @ self.plant.derivative(polynomial)
+
+
+def _fixed_point(step: Callable[[FloatArray], FloatArray], start: FloatArray) -> tuple[FloatArray, bool]:
+    """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
+    shape = start.shape
+    x = start.ravel()
+    image = step(start).ravel()
+    past_x: list[FloatArray] = []
+    past_r: list[FloatArray] = []
+    best, best_size = image, np.inf
+    for _ in range(_ITERATIONS):
+        residual = image - x
+        size = float(np.linalg.norm(residual))
+        if size < best_size:
+            best, best_size = image, size
+        if size <= _TOLERANCE * max(float(np.linalg.norm(image)), 1e-300):
+            return image.reshape(shape), True
+        past_x.append(x)
+        past_r.append(residual)
+        past_x, past_r = past_x[-_HISTORY:], past_r[-_HISTORY:]
+        if len(past_r) > 1:
+            dr = np.diff(np.array(past_r), axis=0)
+            dx = np.diff(np.array(past_x), axis=0)
+            gram = dr @ dr.T
+            gram[np.diag_indices_from(gram)] *= 1 + 1e-10
+            weights = np.linalg.lstsq(gram, dr @ residual, rcond=1e-14)[0]
+            x = x + residual - weights @ (dx + dr)
+        else:
+            x = image
+        image = step(x.reshape(shape)).ravel()
+    return best.reshape(shape), False

@@ -1,0 +1,147 @@
+"""The measured signals of a recording, sorted by role, and their spectra over one part of it.
+
+Displacement and velocity of the same support tell the same motion twice.  Both are used: the fused displacement
+
+    D = (D_d / s_d^2 + (V / j w) w^2 / s_v^2) / (1 / s_d^2 + w^2 / s_v^2),   var = 1 / (1 / s_d^2 + w^2 / s_v^2)
+
+drives the model, and the difference V / j w - D_d, which is noise alone and independent of D, tells the noise levels
+and the faults of the input channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.diagnosis.spectra import ComplexArray, Grid, detrend_ends
+from model.schema import SupportInput
+from model.signals import FloatArray
+from model.system import System
+
+
+@dataclass(frozen=True)
+class Signals:
+    """A gap-free recording by role.  Sensors that are absent are left out, not NaN."""
+
+    sample_rate: float
+    displacement: FloatArray  # of the supports, m, shape (T, supports)
+    velocity: FloatArray  # m/s, NaN column where it is not measured, shape (T, supports)
+    force: FloatArray  # measured forces, N, shape (T, forces)
+    sensors: FloatArray  # shape (T, S)
+    sensor_index: np.ndarray  # of the present sensors in the system's order, shape (S,)
+    sensor_names: tuple[str, ...]
+    support_names: tuple[str, ...]
+    force_names: tuple[str, ...]
+
+    @property
+    def samples(self) -> int:
+        return len(self.sensors)
+
+    def part(self, start: int, stop: int) -> Signals:
+        """A stretch of samples."""
+        return replace(
+            self,
+            displacement=self.displacement[start:stop],
+            velocity=self.velocity[start:stop],
+            force=self.force[start:stop],
+            sensors=self.sensors[start:stop],
+        )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of one sample of every measured signal."""
+
+    displacement: FloatArray  # m, shape (supports,)
+    velocity: FloatArray  # m/s, infinite where not measured, shape (supports,)
+    force: FloatArray  # N, shape (forces,)
+    sensors: FloatArray  # shape (S,)
+
+    def support_variance(self, omega: FloatArray) -> FloatArray:
+        """Variance of the fused displacement per bin, shape (F, supports)."""
+        return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Signals of one part of the recording on its grid: polynomial ends and periodic spectra."""
+
+    grid: Grid
+    support: ComplexArray  # fused displacement without polynomial, (F, supports)
+    support_polynomial: FloatArray  # (DEGREE + 1, supports)
+    force: ComplexArray  # (F, forces)
+    force_polynomial: FloatArray
+    sensors: ComplexArray  # (F, S), whole signal
+    series: FloatArray  # (N, S)
+    redundancy: ComplexArray  # V / j w - D_d of the supports with both, zero at zero frequency, (F, pairs)
+    pairs: np.ndarray  # which supports, shape (pairs,)
+    displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
+    velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
+
+
+def declared_noise(system: System, signals: Signals) -> Noise:
+    """Noise as the system file states it; where it states none, a thousandth of the signal."""
+    displacement, velocity, force = [], [], []
+    at_support = at_force = 0
+    for source in system.file.inputs.values():
+        if isinstance(source, SupportInput):
+            level = source.displacement.noise or 1e-3 * _size(signals.displacement[:, at_support])
+            displacement.append(level)
+            measured = source.velocity is not None and np.isfinite(signals.velocity[0, at_support])
+            stated = source.velocity.noise if source.velocity is not None else 0.0
+            level = stated or 1e-3 * _size(signals.velocity[:, at_support])
+            velocity.append(level if measured else np.inf)
+            at_support += 1
+        else:
+            force.append(source.noise or 1e-3 * _size(signals.force[:, at_force]))
+            at_force += 1
+    listed = list(system.file.sensors.values())
+    sensors = [
+        listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
+    ]
+    return Noise(np.array(displacement), np.array(velocity), np.array(force), np.array(sensors))
+
+
+def _size(series: FloatArray) -> float:
+    return float(np.std(series)) or 1.0
+
+
+def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
+    """Spectra of a part; `start` is its first sample's time since the start of the recording, s."""
+    grid = Grid(signals.samples, 1 / signals.sample_rate, start)
+    omega = grid.omega[:, None]
+    has_rate = np.isfinite(noise.velocity)
+    d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
+    polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
+    if d.shape[1]:
+        polynomial = detrend_ends(d, None, grid)
+        with_rate = detrend_ends(d, (v[0], v[-1]), grid)
+        polynomial[:, has_rate] = with_rate[:, has_rate]
+    slope = np.zeros_like(polynomial)
+    slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
+    D = grid.forward(d - grid.monomials @ polynomial)
+    V = grid.forward(v - grid.monomials @ slope)
+    integrated = np.zeros_like(V)
+    integrated[1:] = V[1:] / (1j * omega[1:])
+    integrated[0] = D[0]
+    precision_d, precision_v = 1 / noise.displacement**2, (omega / noise.velocity) ** 2
+    fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
+    pairs = np.flatnonzero(has_rate & np.isfinite(noise.displacement))
+    redundancy = (integrated - D)[:, pairs]
+    force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
+    if signals.force.shape[1]:
+        force_polynomial = detrend_ends(signals.force, None, grid)
+    return Part(
+        grid=grid,
+        support=fused,
+        support_polynomial=polynomial,
+        force=grid.forward(signals.force - grid.monomials @ force_polynomial),
+        force_polynomial=force_polynomial,
+        sensors=grid.forward(signals.sensors),
+        series=signals.sensors,
+        redundancy=redundancy,
+        pairs=pairs,
+        displacement=D,
+        velocity=integrated,
+    )

@@ -1,0 +1,247 @@
+"""The linear system as frequency responses on the bins of one record part.
+
+    (-w^2 M + H^T (k + j w c) H) q = -H^T ((k + j w c) G s + f) + F p + l
+
+q degrees of freedom, s moving supports, p measured forces, f forces of laws along the elements, l loads on degrees of
+freedom.  Letters: F bins, S sensors, E elements, n degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from model.diagnosis.spectra import DEGREE, ComplexArray, Grid
+from model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, Mechanics
+from model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Matrices and values of a system, possibly with elastic modes appended as further degrees of freedom."""
+
+    mass: FloatArray  # (n,)
+    stiffness: FloatArray  # (E,)
+    damping: FloatArray  # (E,)
+    own_stiffness: FloatArray  # of elastic modes against their body, (n,)
+    own_damping: FloatArray  # (n,)
+    H: FloatArray  # (E, n)
+    G: FloatArray  # (E, supports)
+    F: FloatArray  # (n, forces)
+    S: FloatArray  # (S, n)
+    L: FloatArray  # (S, E)
+    sensor_kind: np.ndarray  # (S,)
+    body_of_dof: np.ndarray  # (n,), -1 for an elastic mode
+
+    @classmethod
+    def nominal(cls, mechanics: Mechanics, sensors: np.ndarray) -> Structure:
+        """The structure of the system file, seen by the sensors of the given indices."""
+        n = mechanics.n
+        return cls(
+            mass=mechanics.mass,
+            stiffness=mechanics.stiffness,
+            damping=mechanics.damping,
+            own_stiffness=np.zeros(n),
+            own_damping=np.zeros(n),
+            H=mechanics.H,
+            G=mechanics.G,
+            F=mechanics.F,
+            S=mechanics.S[sensors],
+            L=mechanics.L[sensors],
+            sensor_kind=mechanics.sensor_kind[sensors],
+            body_of_dof=mechanics.body_of_dof,
+        )
+
+    def with_mode(
+        self, mass: float, omega: float, ratio: float, at_elements: FloatArray, at_sensors: FloatArray
+    ) -> Structure:
+        """One elastic mode more: its coordinate moves the element ends and sensors by the given shape."""
+        return replace(
+            self,
+            mass=np.append(self.mass, mass),
+            own_stiffness=np.append(self.own_stiffness, mass * omega**2),
+            own_damping=np.append(self.own_damping, 2 * ratio * omega * mass),
+            H=np.hstack([self.H, at_elements[:, None]]),
+            F=np.vstack([self.F, np.zeros((1, self.F.shape[1]))]),
+            S=np.hstack([self.S, at_sensors[:, None]]),
+            body_of_dof=np.append(self.body_of_dof, -1),
+        )
+
+    @property
+    def K(self) -> FloatArray:
+        return (self.H.T * self.stiffness) @ self.H + np.diag(self.own_stiffness)
+
+    @property
+    def C(self) -> FloatArray:
+        return (self.H.T * self.damping) @ self.H + np.diag(self.own_damping)
+
+    def state_matrix(self) -> FloatArray:
+        """A of x = [q, q'], shape (2n, 2n)."""
+        n = len(self.mass)
+        A = np.zeros((2 * n, 2 * n))
+        A[:n, n:] = np.eye(n)
+        A[n:, :n] = -self.K / self.mass[:, None]
+        A[n:, n:] = -self.C / self.mass[:, None]
+        return A
+
+    def sensor_rows(self) -> FloatArray:
+        """Sensors over the state of free motion, shape (S, 2n)."""
+        n = len(self.mass)
+        kind = self.sensor_kind[:, None]
+        A = self.state_matrix()
+        rows = np.where(kind == ACCELERATION, self.S @ A[n:], 0.0)
+        rows[:, n:] += np.where(kind == VELOCITY, self.S, 0.0)
+        rows[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0.0)
+        of_d = np.where(kind == FORCE, self.L * self.stiffness, np.where(kind == DEFLECTION, self.L, 0.0))
+        of_v = np.where(kind == FORCE, self.L * self.damping, 0.0)
+        rows[:, :n] += of_d @ self.H
+        rows[:, n:] += of_v @ self.H
+        return rows
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A structure on a grid.  `extra` is a complex impedance added to k + j w c of each element, (F, E) or None."""
+
+    structure: Structure
+    grid: Grid
+    extra: ComplexArray | None = None
+
+    @cached_property
+    def impedance(self) -> ComplexArray:
+        """k + j w c of each element, N/m, shape (F, E)."""
+        s = self.structure
+        plain = s.stiffness + 1j * self.grid.omega[:, None] * s.damping
+        return plain if self.extra is None else plain + self.extra
+
+    @cached_property
+    def receptance(self) -> ComplexArray:
+        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system floats."""
+        s, w = self.structure, self.grid.omega
+        n = len(s.mass)
+        outer = (s.H[:, :, None] * s.H[:, None, :]).reshape(len(s.H), n * n)
+        Z = (self.impedance @ outer).reshape(len(w), n, n)
+        index = np.arange(n)
+        Z[:, index, index] += s.own_stiffness + 1j * w[:, None] * s.own_damping - w[:, None] ** 2 * s.mass
+        if np.linalg.cond(Z[0].real) > 1e12:
+            result = np.zeros_like(Z)
+            result[1:] = np.linalg.inv(Z[1:])
+            return result
+        return np.linalg.inv(Z)
+
+    @cached_property
+    def sensor_of_dof(self) -> ComplexArray:
+        """Sensor signal per degree of freedom, shape (F, S, n); moving supports left out."""
+        s, w = self.structure, self.grid.omega[:, None, None]
+        kind = s.sensor_kind[:, None]
+        result = np.where(kind == ACCELERATION, -(w**2), np.where(kind == VELOCITY, 1j * w, 1.0)) * s.S
+        if np.any(s.L):
+            result = result + self._of_deflection @ s.H
+        return result
+
+    @cached_property
+    def _of_deflection(self) -> ComplexArray:
+        """Sensor signal per deflection of an element, shape (F, S, E)."""
+        s = self.structure
+        kind = s.sensor_kind[:, None]
+        return np.where(kind == FORCE, s.L * self.impedance[:, None, :], np.where(kind == DEFLECTION, s.L, 0.0))
+
+    @cached_property
+    def sensor_of_load(self) -> ComplexArray:
+        """Sensor signal per load on a degree of freedom, shape (F, S, n)."""
+        return self.sensor_of_dof @ self.receptance
+
+    @cached_property
+    def sensor_of_force(self) -> ComplexArray:
+        """Sensor signal per law force along an element, shape (F, S, E)."""
+        s = self.structure
+        result = -(self.sensor_of_load @ s.H.T)
+        if np.any(s.L):
+            result = result + np.where(s.sensor_kind[:, None] == FORCE, s.L, 0.0)
+        return result
+
+    @cached_property
+    def deflection_of_load(self) -> ComplexArray:
+        """Deflection of each element per load on a degree of freedom, shape (F, E, n)."""
+        return self.structure.H @ self.receptance
+
+    @cached_property
+    def deflection_of_force(self) -> ComplexArray:
+        """Deflection of each element per law force along each element, shape (F, E, E)."""
+        return -(self.deflection_of_load @ self.structure.H.T)
+
+    @cached_property
+    def sensor_of_support(self) -> ComplexArray:
+        """Sensor signal per support displacement, shape (F, S, supports)."""
+        s = self.structure
+        load = -(self.impedance[:, None, :] * s.H.T) @ s.G
+        result = self.sensor_of_load @ load
+        if np.any(s.L):
+            result = result + self._of_deflection @ s.G
+        return result
+
+    @cached_property
+    def deflection_of_support(self) -> ComplexArray:
+        """Deflection of each element per support displacement, shape (F, E, supports)."""
+        s = self.structure
+        return self.deflection_of_load @ (-(self.impedance[:, None, :] * s.H.T) @ s.G) + s.G
+
+    @cached_property
+    def sensor_of_measured_force(self) -> ComplexArray:
+        return self.sensor_of_load @ self.structure.F
+
+    @cached_property
+    def deflection_of_measured_force(self) -> ComplexArray:
+        return self.deflection_of_load @ self.structure.F
+
+    def polynomial_response(self, load: FloatArray) -> FloatArray:
+        """Polynomial motion q under polynomial loads on the degrees of freedom.
+
+        Coefficients over t / length: load (DEGREE + 1, n) -> q (DEGREE + 1, n), by matching powers of t.
+        """
+        s, T = self.structure, self.grid.length
+        n, p = len(s.mass), DEGREE + 1
+        first = np.diag(np.arange(1, p), 1) / T  # coefficients of the derivative
+        system = np.kron(np.eye(p), s.K) + np.kron(first, s.C) + np.kron(first @ first, np.diag(s.mass))
+        scale = np.abs(system).max(axis=1)
+        scale[scale == 0] = 1.0
+        columns = np.tile(1 / np.sqrt(np.maximum(np.abs(np.diag(s.K)), s.mass / T**2)), p)
+        solution = np.linalg.lstsq(
+            system * columns / scale[:, None], load.reshape(-1) / scale, rcond=1e-13
+        )[0]
+        return (solution * columns).reshape(p, n)
+
+    def polynomial_sensors(self, q: FloatArray, support: FloatArray) -> FloatArray:
+        """Sensor polynomials from motion (DEGREE + 1, n) and supports (DEGREE + 1, supports): (DEGREE + 1, S)."""
+        s = self.structure
+        q1, d = self.derivative(q), q @ s.H.T + support @ s.G.T
+        kind = s.sensor_kind
+        result = np.where(kind == ACCELERATION, self.derivative(q1) @ s.S.T, 0.0)
+        result += np.where(kind == VELOCITY, q1 @ s.S.T, 0.0) + np.where(kind == DISPLACEMENT, q @ s.S.T, 0.0)
+        force = d * s.stiffness + self.derivative(d) * s.damping
+        result += np.where(kind == DEFLECTION, d @ s.L.T, 0.0) + np.where(kind == FORCE, force @ s.L.T, 0.0)
+        return result
+
+    def derivative(self, polynomial: FloatArray) -> FloatArray:
+        """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
+        result = np.zeros_like(polynomial)
+        orders = np.arange(1, len(polynomial)).reshape((-1,) + (1,) * (polynomial.ndim - 1))
+        result[:-1] = polynomial[1:] * orders / self.grid.length
+        return result
+
+    def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
+        """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""
+        from scipy.linalg import expm
+
+        power = expm(self.structure.state_matrix() * step)
+        result = np.empty((count, *rows.shape))
+        result[0] = rows
+        done = 1
+        while done < count:
+            more = min(done, count - done)
+            result[done : done + more] = result[:more] @ power
+            power = power @ power
+            done += more
+        return result

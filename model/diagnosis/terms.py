@@ -1,0 +1,94 @@
+"""A law at a place with values: what is added to the nominal structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.diagnosis.catalogue import BodyLaw, ElementLaw, Law, SensorLaw
+from model.signals import FloatArray
+from model.system import System
+
+
+@dataclass(frozen=True)
+class Term:
+    """One law at one place.  Parameters in the law's order."""
+
+    law: Law
+    location: str  # element, "left|right" of a pair, body, sensor or input channel
+    parameters: tuple[float, ...]
+    variant: str = ""  # of body laws: the mode's shape, the direction of a force
+    preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
+
+    def at(self, parameters: FloatArray) -> Term:
+        return replace(self, parameters=tuple(float(v) for v in parameters))
+
+    scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
+
+    def moved(self, index: int, step: float) -> Term:
+        """One internal parameter moved: the logarithm of those of unknown order, else the value."""
+        values = list(self.parameters)
+        values[index] = values[index] * np.exp(step) if self.law.parameters[index].log else values[index] + step
+        return replace(self, parameters=tuple(values))
+
+    def advanced(self, step: FloatArray) -> Term:
+        """All internal parameters moved, steps limited, values kept within the law's bounds."""
+        values = []
+        for spec, value, change in zip(self.law.parameters, self.parameters, step, strict=True):
+            new = value * np.exp(np.clip(change, -1.0, 1.0)) if spec.log else value + change
+            values.append(float(min(max(new, spec.low), spec.high)))
+        return replace(self, parameters=tuple(values))
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Derivative of each parameter with respect to its internal form."""
+        pairs = zip(self.law.parameters, self.parameters, strict=True)
+        return np.array([value if spec.log else 1.0 for spec, value in pairs])
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a parameter has stopped at a bound."""
+        pairs = zip(self.law.parameters, self.parameters, strict=True)
+        return any(value <= spec.low or value >= spec.high for spec, value in pairs)
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return (self.location, self.law.name, self.variant)
+
+    def port(self, system: System) -> FloatArray:
+        """Weights over elements: the law sees port @ deflections and pulls the elements by port * force."""
+        weights = np.zeros(len(system.elements))
+        names = self.location.split("|")
+        weights[system.elements.index(names[0])] = 1.0
+        if len(names) == 2:
+            weights[system.elements.index(names[1])] = -1.0
+        return weights
+
+
+def impedance(term: Term, omega: FloatArray, damping: float) -> FloatArray | None:
+    """Extra impedance of laws that are linear with memory, N/m, complex (F,); None: the law is not linear.
+
+    Maxwell branch: c j w / (1 + j w c / ks) instead of c j w.  Air spring: k j w tau / (1 + j w tau).
+    """
+    s = 1j * omega
+    if term.law.name == "series_stiffness":
+        return damping * s / (1 + s * damping / term.parameters[0]) - damping * s
+    if term.law.name == "air_spring":
+        stiffness, tau = term.parameters
+        return stiffness * s * tau / (1 + s * tau)
+    return None
+
+
+def is_waveform(term: Term) -> bool:
+    """Whether the law's force is found along the trajectory, in the loop."""
+    return isinstance(term.law, ElementLaw) and term.law.name not in ("series_stiffness", "air_spring")
+
+
+def split(terms: tuple[Term, ...]) -> tuple[list[Term], list[Term], list[Term], list[Term]]:
+    """Terms by how they act: along the trajectory, as impedance, on a body, on a measurement."""
+    waveform = [t for t in terms if is_waveform(t)]
+    linear = [t for t in terms if isinstance(t.law, ElementLaw) and not is_waveform(t)]
+    body = [t for t in terms if isinstance(t.law, BodyLaw)]
+    sensor = [t for t in terms if isinstance(t.law, SensorLaw)]
+    return waveform, linear, body, sensor
