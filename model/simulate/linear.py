@@ -20,6 +20,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from model.fusion import fuse
 from model.signals import FloatArray
 from model.system import System
 
@@ -71,12 +72,12 @@ class LinearSimulator:
         self.W = 2 * (len(self.supports) + len(self.forces))
         index = {name: i for i, name in enumerate(system.elements)}
         quantity = [p.quantity for p in system.parameters]
-        self._k_of = _scatter(system, "stiffness", index, len(index), constant)
-        self._c_of = _scatter(system, "damping", index, len(index), constant)
+        self.k_of = _scatter(system, "stiffness", index, len(index), constant)
+        self.c_of = _scatter(system, "damping", index, len(index), constant)
         bodies = {name: i for i, name in enumerate(system.bodies)}
         per_body = _scatter(system, "mass", bodies, len(bodies), constant)
-        self._m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
-        self._estimates_mass = "mass" in quantity
+        self.m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
+        self.estimates_mass = "mass" in quantity
         omega = math.sqrt(float(torch.linalg.eigvalsh(self._normalised_stiffness()).max().clamp_min(1e-12)))
         root = self.nominal_m.rsqrt()
         # Mass-normalised states with rates in units of the fastest mode: the norm of A h is then about omega h.
@@ -88,11 +89,11 @@ class LinearSimulator:
 
     def element_values(self, log_ratio: Tensor) -> ElementValues:
         """theta = nominal exp(log_ratio) put in place; log_ratio (B, P)."""
-        k = self.nominal_k * torch.exp(log_ratio @ self._k_of)
-        c = self.nominal_c * torch.exp(log_ratio @ self._c_of)
+        k = self.nominal_k * torch.exp(log_ratio @ self.k_of)
+        c = self.nominal_c * torch.exp(log_ratio @ self.c_of)
         m = self.nominal_m.expand(len(log_ratio), -1)
-        if self._estimates_mass:
-            m = m * torch.exp(log_ratio @ self._m_of)
+        if self.estimates_mass:
+            m = m * torch.exp(log_ratio @ self.m_of)
         return ElementValues(k, c, m)
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:
@@ -236,7 +237,8 @@ def knot_columns(system: System) -> tuple[list[int], list[int | None]]:
 def knots(system: System, windows: FloatArray) -> FloatArray:
     """Values and slopes of all drives at the samples, (B, T, W) = [value, slope, value, slope, ...].
 
-    Slopes that are not measured come from the cubic spline through the samples (not-a-knot ends).
+    Where a support's displacement and velocity are both measured with noise they are fused (`model.fusion`); slopes
+    that are not measured come from the cubic spline through the samples (not-a-knot ends).
     """
     values, slopes = knot_columns(system)
     out = np.empty((*windows.shape[:2], 2 * len(values)))
@@ -245,6 +247,11 @@ def knots(system: System, windows: FloatArray) -> FloatArray:
         out[:, :, 2 * i] = windows[:, :, value]
         if slope is not None:
             out[:, :, 2 * i + 1] = windows[:, :, slope]
+            noise = system.inputs[value].noise, system.inputs[slope].noise
+            if min(noise) > 0:
+                out[:, :, 2 * i], out[:, :, 2 * i + 1] = fuse(
+                    out[:, :, 2 * i], out[:, :, 2 * i + 1], 1 / system.sample_rate, noise
+                )
     if derived:
         samples = out[:, :, [2 * i for i in derived]]
         time = np.arange(windows.shape[1]) / system.sample_rate

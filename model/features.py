@@ -1,0 +1,125 @@
+"""Fourier features of windows.
+
+`magnitudes` is the paper's feature, |DFT| of every signal.  `ForceBalance` keeps the phase between inputs and
+responses: Newton's second law of every degree of freedom, bin by bin,
+
+    sum_e H_e^T (k_e d_e + c_e d_e') + M q'' = F p
+
+is linear in the unknown values.  Body motion comes from the redundant sensors by weighted least squares and is
+integrated (or differentiated) within the window by splines; constant and slope are projected out of every signal,
+which absorbs the unknown initial state exactly; then a Hann window and the DFT.  All of it is one fixed linear map.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
+from model.signals import FloatArray
+from model.simulate.linear import LinearSimulator
+from model.system import System
+
+BAND = (0.015, 0.25)  # share of the sample rate that the force balance uses
+
+
+def magnitudes(signals: Tensor) -> Tensor:
+    """The paper's Fourier feature (section 4): |DFT| over time, (B, T, C) to (B, (T // 2 + 1) C).
+
+    The upper half of the DFT of real signals repeats the lower and is left out.
+    """
+    return torch.fft.rfft(signals, dim=1).abs().flatten(1)
+
+
+class ForceBalance:
+    """Rows of the force balance of windows of one system: regressors times ratios = target.
+
+    Ratios are theta / nominal.  R = n * F * 2 rows: real and imaginary part of every degree of freedom and bin,
+    in newtons (or newton metres) times the window's gain.
+    """
+
+    def __init__(self, system: System, samples: int) -> None:
+        self.system, self.samples = system, samples
+        mechanics = system.mechanics
+        self.kind = motion_kind(system)
+        if self.kind is None:
+            raise ValueError(f"{system.name}: the sensors do not give the motion of every body; no force balance")
+        frequency = np.fft.rfftfreq(samples, 1 / system.sample_rate)
+        low, high = BAND[0] * system.sample_rate, BAND[1] * system.sample_rate
+        self.bins = np.flatnonzero((frequency >= low) & (frequency <= high))
+        self.simulator = LinearSimulator(system)
+        time = np.arange(samples) / system.sample_rate
+        by_order = _time_operators(self.kind, time)
+        spectrum = _spectrum_operator(samples, self.bins)
+        self.operators = torch.as_tensor(np.stack([spectrum @ operator for operator in by_order]))  # (3, 2F, T)
+        self.plain = torch.as_tensor(spectrum)
+        self.use = mechanics.sensor_kind == self.kind
+        self.noise = np.array([c.noise for c in system.channels])[len(system.inputs) :]
+
+    @property
+    def rows(self) -> int:
+        return self.system.mechanics.n * 2 * len(self.bins)
+
+    def __call__(self, windows: FloatArray) -> tuple[Tensor, Tensor]:
+        """target (B, R) and regressors (B, R, P) of windows (B, T, C)."""
+        s, mechanics = self.simulator, self.system.mechanics
+        knots = torch.as_tensor(s.knots(windows[:, :, : len(self.system.inputs)]))
+        motion = self._motion(windows[:, :, len(self.system.inputs) :])  # (B, T, n)
+        q, v, a = (operator @ motion for operator in self.operators)  # each (B, 2F, n)
+        drive = self.plain @ knots  # (B, 2F, W)
+        d = q @ s.H.T + drive[:, :, s.supports] @ s.G.T  # (B, 2F, E)
+        r = v @ s.H.T + drive[:, :, s.supports + 1] @ s.G.T
+        k_terms = (d * s.nominal_k).unsqueeze(1) * s.H.T[:, None, :]  # (B, n, 2F, E)
+        c_terms = (r * s.nominal_c).unsqueeze(1) * s.H.T[:, None, :]
+        inertia = (a * s.nominal_m).mT.unsqueeze(3) * torch.eye(mechanics.n, dtype=a.dtype)[:, None, :]
+        regressors = k_terms @ s.k_of.T + c_terms @ s.c_of.T + inertia @ s.m_of.T
+        everything = k_terms.sum(dim=3) + c_terms.sum(dim=3) + inertia.sum(dim=3)
+        known = everything - regressors.sum(dim=3)  # terms whose values are not estimated
+        load = (drive[:, :, s.forces] @ s.F.T).mT if len(s.forces) else torch.zeros_like(known)
+        return (load - known).flatten(1), regressors.flatten(1, 2)
+
+    def _motion(self, sensors: FloatArray) -> Tensor:
+        """Motion of the degrees of freedom, weighted least squares over the sensors that are present."""
+        S = self.system.mechanics.S
+        present = ~np.isnan(sensors).any(axis=1) & self.use
+        weight = np.where(self.noise > 0, 1 / np.maximum(self.noise, 1e-300), 1.0)
+        out = np.zeros((len(sensors), sensors.shape[1], S.shape[1]))
+        patterns, which = np.unique(present, axis=0, return_inverse=True)
+        for i, pattern in enumerate(patterns):
+            chosen = np.flatnonzero(pattern)
+            inverse = np.linalg.pinv(S[chosen] * weight[chosen, None]) * weight[chosen]
+            at = which.reshape(-1) == i
+            out[at] = sensors[at][:, :, chosen] @ inverse.T
+        return torch.as_tensor(out)
+
+
+def motion_kind(system: System) -> int | None:
+    """The kind of sensor that alone gives the motion of every degree of freedom, or None."""
+    mechanics = system.mechanics
+    for kind in (ACCELERATION, DISPLACEMENT, VELOCITY):
+        S = mechanics.S[mechanics.sensor_kind == kind]
+        if len(S) and np.linalg.matrix_rank(S) == mechanics.n:
+            return kind
+    return None
+
+
+def _time_operators(kind: int, time: FloatArray) -> list[FloatArray]:
+    """Matrices (T, T) from the measured motion to displacement, velocity and acceleration, by cubic splines."""
+    eye = np.eye(len(time))
+    spline = CubicSpline(time, eye)
+    if kind == ACCELERATION:
+        return [spline.antiderivative(2)(time), spline.antiderivative(1)(time), eye]
+    if kind == VELOCITY:
+        return [spline.antiderivative(1)(time), eye, spline(time, 1)]
+    return [eye, spline(time, 1), CubicSpline(time, spline(time, 1))(time, 1)]
+
+
+def _spectrum_operator(samples: int, bins: FloatArray) -> FloatArray:
+    """Hann window and DFT after removal of constant and slope; real parts then imaginary parts, (2F, T)."""
+    line = np.vander(np.linspace(-1, 1, samples), 2)
+    projection = np.eye(samples) - line @ np.linalg.pinv(line)
+    hann = np.sin(np.pi * (np.arange(samples) + 0.5) / samples) ** 2
+    phase = 2 * np.pi * np.outer(bins, np.arange(samples)) / samples
+    return np.concatenate([np.cos(phase), -np.sin(phase)]) * hann @ projection
