@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from model.signals import BoolArray, FloatArray, IntArray
 
@@ -24,6 +25,9 @@ SLOWEST = 0.5  # own rate / grid rate below which a channel cannot be interpolat
 REACH = 8  # grid periods of context that resampling and repair look at on either side
 KAISER_BETA = 7.0  # stop band -70 dB
 NEIGHBOURS = 3  # valid samples on either side that a repair uses
+FEWEST = 4  # samples below which a channel's clock cannot be told
+EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an even clock; they show it clearly
+MOST_PERIODS = 1200  # tried in the search for a jittered clock
 LONGEST_REPAIR = REACH - NEIGHBOURS  # consecutive samples
 
 
@@ -37,9 +41,9 @@ class Placed:
     phase: FloatArray  # (R, 2) sum of cos, sin of 2 pi offset: the common phase of the samples near a row
 
 
-def place(offset: FloatArray, channel: IntArray, value: FloatArray, rows: int, channels: int) -> Placed:
+def place(offset: FloatArray, channel: NDArray[np.int32], value: FloatArray, rows: int, channels: int) -> Placed:
     """Put samples on their nearest rows; `offset` counts grid periods from row 0, shape (n,)."""
-    row = np.rint(offset).astype(np.int64)
+    row: IntArray = np.rint(offset).astype(np.int64)
     inside = (row >= 0) & (row < rows)
     if not inside.all():
         row, offset, channel, value = row[inside], offset[inside], channel[inside], value[inside]
@@ -53,56 +57,95 @@ def place(offset: FloatArray, channel: IntArray, value: FloatArray, rows: int, c
     off_grid = np.zeros(rows * channels, dtype=bool)
     off_grid[cell[np.abs(fraction) > TOLERANCE]] = True
     angle = 2.0 * np.pi * fraction
-    phase = np.stack([np.bincount(row, np.cos(angle), rows), np.bincount(row, np.sin(angle), rows)], axis=1)
+    phase = np.stack(
+        [np.bincount(row, part, rows) for part in (np.cos(angle), np.sin(angle))], axis=1, dtype=np.float64
+    )
     shape = (rows, channels)
     return Placed(grid.reshape(shape), off_grid.reshape(shape), conflict.reshape(shape), phase)
 
 
-def resample(offset: FloatArray, value: FloatArray, rows: FloatArray) -> tuple[FloatArray, float]:
-    """One channel at the grid positions `rows`, and its own rate relative to the grid's.
+@dataclass(frozen=True, slots=True)
+class Resampled:
+    """One channel on grid rows."""
 
-    `offset` (grid periods, any order) and `value` are its samples, NaN where invalid; the result is NaN where the
-    channel has a gap.  Needs REACH periods of samples beyond the outer rows; where they are missing at the
-    beginning or end of a recording the nearest values are continued.
+    value: FloatArray  # (R,); NaN where the channel has a gap
+    bridged: BoolArray  # (R,) the nearest sample was missing and has been interpolated
+    rate: float  # own rate / grid rate; 0 when the channel has too few samples to tell
+    even: bool  # False: the time stamps fit no even clock, every value is NaN
+
+
+def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled:
+    """One channel at the grid positions `rows`.
+
+    `offset` (grid periods, any order) and `value` are its samples, NaN where invalid.  Gaps of up to `longest`
+    grid periods are bridged.  Needs REACH periods of samples beyond the outer rows; where they are missing (at
+    the beginning and the end of a recording) the signal is continued by odd reflection.
     """
+    nothing = np.full(len(rows), np.nan)
     order = np.argsort(offset, kind="stable")
     offset, value = offset[order], value[order]
     first = np.r_[True, np.diff(offset) > 1e-6]  # duplicates: the first one stays
     offset, value = offset[first], value[first]
-    if len(offset) < 4:
-        return np.full(len(rows), np.nan), 0.0
-    period = float(np.median(np.diff(offset)))
-    even, start, period = _even(offset, value, period)
+    if len(offset) < FEWEST:
+        return Resampled(nothing, np.zeros(len(rows), dtype=bool), 0.0, True)
+    period, coherence = _period(offset)
     rate = 1.0 / period
+    even, start = _lattice(offset, value, period)
+    if coherence < EVEN or np.isfinite(even).sum() < 0.9 * np.isfinite(value).sum():
+        return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, False)
     if rate < SLOWEST * (1.0 - 1e-3):
-        return np.full(len(rows), np.nan), rate
+        return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, True)
     missing = np.isnan(even)
-    even = fill(even[:, None], LONGEST_REPAIR)[:, 0]
-    result = _sinc(even, (rows - start) / period, min(1.0, period))
-    blocked = np.isnan(even) | _long_runs(missing)
-    nearest = np.clip(np.rint((rows - start) / period).astype(np.int64), 0, len(even) - 1)
-    outside = np.abs((rows - start) / period - nearest) > 1.0
-    result[blocked[nearest] | outside] = np.nan
-    return result, rate
+    limit = int(np.clip(longest * rate, 1, LONGEST_REPAIR))
+    even = fill(even[:, None], limit)[:, 0]
+    blocked = np.isnan(even)
+    if blocked.all():
+        return Resampled(nothing, blocked[: len(rows)], rate, True)
+    steps = np.arange(len(even))
+    even[blocked] = np.interp(steps[blocked], steps[~blocked], even[~blocked])  # what surrounds a gap stays sound
+    position = (rows - start) / period
+    result = _sinc(even, position, min(1.0, period))
+    nearest = np.clip(np.rint(position).astype(np.int64), 0, len(even) - 1)
+    result[blocked[nearest] | (np.abs(position - nearest) > 1.0)] = np.nan
+    return Resampled(result, missing[nearest] & ~np.isnan(result), rate, True)
 
 
-def _even(offset: FloatArray, value: FloatArray, period: float) -> tuple[FloatArray, float, float]:
-    """Samples as an even series (value per step, start, period): the lattice that fits the time stamps best."""
-    step = np.cumsum(np.r_[0, np.maximum(np.rint(np.diff(offset) / period), 0.0)])
-    slope = np.polyfit(step, offset, 1)[0] if step[-1] > 0 else period
-    if abs(slope / period - 1.0) < 0.2:
-        period = float(slope)
-    start = offset[0] + float(np.median(_wrap((offset - offset[0]) / period))) * period
+def _period(offset: FloatArray) -> tuple[float, float]:
+    """The period of the even clock behind sorted time stamps, and how well they fit it (1: exactly).
+
+    The fit is the resultant length of the stamps' phases: 0.64 for jitter of +-1/4 period, about 0.1 for stamps
+    without a clock.
+    """
+    typical = float(np.median(np.diff(offset)))
+    step = np.cumsum(np.rint(np.diff(offset) / typical))
+    span = offset[-1] - offset[0]
+    guesses = [1.0, span / (len(offset) - 1)]
+    if step[-1] > 0:
+        guesses.append(float(np.polyfit(np.r_[0.0, step], offset, 1)[0]))
+    near = np.array([guess for guess in guesses if abs(guess / typical - 1.0) < 0.2] or [typical])
+    fit = _coherence(offset, near)
+    if fit.max() < WELL_EVEN:  # jitter: search all periods near the typical one, finely enough not to slip
+        count = int(min(1.6 * span / typical + 8, MOST_PERIODS))
+        near = np.r_[near, 1.0 / np.linspace(0.8 / typical, 1.2 / typical, count)]
+        fit = _coherence(offset, near)
+    best = int(np.argmax(fit))
+    return float(near[best]), float(fit[best])
+
+
+def _coherence(offset: FloatArray, period: FloatArray) -> FloatArray:
+    return np.abs(np.exp(2j * np.pi * (offset - offset[0])[:, None] / period).mean(axis=0))
+
+
+def _lattice(offset: FloatArray, value: FloatArray, period: float) -> tuple[FloatArray, float]:
+    """Values per step of the even clock (NaN where none came), and the position of the first step."""
+    phase = np.angle(np.exp(2j * np.pi * (offset - offset[0]) / period).mean()) / (2.0 * np.pi)
+    start = float(offset[0] + phase * period)
     index = np.rint((offset - start) / period).astype(np.int64)
+    start += float(index.min()) * period
     index -= index.min()
-    start += float(np.median(offset - start - index * period))
     even = np.full(int(index.max()) + 1, np.nan)
     even[index[::-1]] = value[::-1]
-    return even, start, period
-
-
-def _wrap(turns: FloatArray) -> FloatArray:
-    return turns - np.rint(turns)
+    return even, start
 
 
 def _sinc(even: FloatArray, position: FloatArray, cutoff: float) -> FloatArray:
@@ -115,17 +158,10 @@ def _sinc(even: FloatArray, position: FloatArray, cutoff: float) -> FloatArray:
     window = np.i0(KAISER_BETA * np.sqrt(np.maximum(1.0 - (distance / half) ** 2, 0.0)))
     weight = np.sinc(band * distance) * window
     weight /= weight.sum(axis=1, keepdims=True)
-    padded = even[np.clip(centre[:, None] + taps, 0, len(even) - 1)]
-    return np.einsum("ij,ij->i", weight, np.nan_to_num(padded))
-
-
-def _long_runs(missing: BoolArray) -> BoolArray:
-    """Missing samples that are part of a run longer than a repair may bridge."""
-    edges = np.flatnonzero(np.diff(np.r_[False, missing, False].astype(np.int8)))
-    long = np.zeros(len(missing), dtype=bool)
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        long[begin:end] = end - begin > LONGEST_REPAIR
-    return long
+    margin = min(2 * half, len(even) - 1)
+    padded = np.pad(even, margin, mode="reflect", reflect_type="odd")
+    index = np.clip(centre[:, None] + taps + margin, 0, len(padded) - 1)
+    return np.einsum("ij,ij->i", weight, padded[index])
 
 
 def fill(grid: FloatArray, longest: int) -> FloatArray:

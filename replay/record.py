@@ -14,7 +14,7 @@ from replay.grid import REACH, place, resample
 from replay.recording import Recording, open_recording
 from replay.stream import Jump, Order
 
-ROWS_AT_ONCE = 4096  # rows that are resampled together, so that memory stays small
+ROWS_AT_ONCE = 512  # rows that are resampled together, so that memory stays small
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,8 +94,7 @@ def _stretches(recording: Recording, order: Order) -> list[SampleBlock]:
 def _grid(block: SampleBlock, channels: int, sample_rate: float) -> tuple[int, FloatArray]:
     """Start time and values (T, C): copied where the samples lie on the grid, else resampled."""
     start = int(block.time.min())
-    offset = (block.time - start) * (sample_rate / 1e9)
-    # The clock of the samples may run a little faster or slower than the nominal rate: follow it.
+    offset: FloatArray = np.asarray((block.time - start) * (sample_rate / 1e9), dtype=np.float64)
     rows = int(np.rint(offset.max())) + 1
     placed = place(offset, block.channel, block.value, rows, channels)
     values = placed.value
@@ -112,5 +111,7 @@ def _resample_long(offset: FloatArray, value: FloatArray, rows: int) -> FloatArr
     for first in range(0, rows, ROWS_AT_ONCE):
         last = min(first + ROWS_AT_ONCE, rows)
         near = slice(*np.searchsorted(offset, [first - 4 * REACH, last + 4 * REACH]))
-        column[first:last] = resample(offset[near], value[near], np.arange(first, last, dtype=np.float64))[0]
+        result = resample(offset[near], value[near], np.arange(first, last, dtype=np.float64))
+        result.value[result.bridged] = np.nan
+        column[first:last] = result.value
     return column

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
-from replay.grid import REACH, SLOWEST, Placed, fill, place, resample
+from replay.grid import REACH, SLOWEST, Placed, Resampled, fill, place, resample
 from replay.stream import Jump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
+MOSTLY_THERE = 0.2  # share of missing samples above which a channel is looked at as one of a lower rate
 COHERENT = 0.5  # mean resultant length of the phases above which they have a common phase
 
 
@@ -102,7 +104,8 @@ class Windower:
         out: list[Window] = []
         while (count := (rows - self.window) // self.hop + 1) > 0 and self._origin is not None:
             samples = self._gather()
-            batch = _Batch(self, samples, count, after=0 if ended else REACH)
+            beyond = rows - (count - 1) * self.hop - self.window
+            batch = _Batch(self, samples, count, after=min(beyond, REACH) if ended else REACH)
             moved = batch.first_out_of_phase()
             for index in range(count if moved is None else moved):
                 out.append(batch.window(index))
@@ -133,7 +136,7 @@ class Windower:
         return self._pending[0]
 
     def _forget(self, samples: SampleBlock) -> None:
-        keep = samples.time >= (self._origin or 0.0) - (REACH + 1) * self._period
+        keep = samples.time >= (self._origin or 0.0) - (REACH + 2) * self._period
         self._pending = [SampleBlock(samples.time[keep], samples.channel[keep], samples.value[keep])]
 
 
@@ -147,7 +150,9 @@ class _Batch:
         self.rows = self.before + (count - 1) * owner.hop + owner.window + after
         self.origin = owner._origin or 0.0
         base = int(self.origin)  # differences of int64, so that no nanosecond is lost
-        self.offset = ((samples.time - base) - (self.origin - base)) / owner._period + self.before
+        self.offset: FloatArray = np.asarray(
+            ((samples.time - base) - (self.origin - base)) / owner._period + self.before, dtype=np.float64
+        )
         self.samples = samples
         channels = len(owner.channels)
         self.placed: Placed = place(self.offset, samples.channel, samples.value, self.rows, channels)
@@ -190,19 +195,21 @@ class _Batch:
         conflict = self.conflict[index].copy()
         gone = np.isnan(self.placed.value[rows])
         notes: list[str] = []
-        for channel in np.flatnonzero(self.off_grid[index]):
-            column, note = self._resampled(int(channel), rows)
-            values[:, channel] = column
-            gone[:, channel] = np.isnan(column)
-            missing[channel] = unfilled[channel] = int(gone[:, channel].sum())
+        sparse = (missing > MOSTLY_THERE * owner.window) & (missing < owner.window)  # gaps, or a slower channel
+        for channel in np.flatnonzero((self.off_grid[index] > 0) | sparse):
+            resampled, note = self._resampled(int(channel), rows)
+            values[:, channel] = resampled.value
+            unfilled[channel] = int(np.isnan(resampled.value).sum())
+            gone[:, channel] = resampled.bridged | np.isnan(resampled.value)
+            missing[channel] = int(gone[:, channel].sum())
             conflict[channel] = 0
             if note:
                 notes.append(note)
-        absent = missing == owner.window
+        absent = (missing == owner.window) & (unfilled == owner.window)
         values[:, absent] = np.nan
         owner._count(gone)
         start = round(self.origin + index * owner.hop * owner._period)
-        reason = self._reason(absent, missing, unfilled, conflict)
+        reason = self._reason(absent, missing, unfilled, conflict, notes)
         if reason:
             owner.reasons[reason] += 1
             return Window(start, owner.sample_rate, values, "dropped", reason)
@@ -214,7 +221,9 @@ class _Batch:
             return Window(start, owner.sample_rate, values, "repaired", "; ".join(notes[:4]), repaired)
         return Window(start, owner.sample_rate, values)
 
-    def _reason(self, absent: BoolArray, missing: IntArray, unfilled: IntArray, conflict: IntArray) -> str | None:
+    def _reason(
+        self, absent: BoolArray, missing: IntArray, unfilled: IntArray, conflict: IntArray, notes: list[str]
+    ) -> str | None:
         """Why the window must be dropped, or None."""
         owner = self.owner
         if absent.all():
@@ -222,7 +231,8 @@ class _Batch:
         names = [channel.name for channel in owner.channels]
         lacking = np.flatnonzero(absent & owner.is_input)
         if len(lacking):
-            return f"missing input {names[lacking[0]]}"
+            name = names[lacking[0]]
+            return next((note for note in notes if note.startswith(f"{name} ")), f"missing input {name}")
         present = ~absent
         cells = owner.window * int(present.sum())
         if conflict[present].sum() > owner.largest_share * cells:
@@ -234,24 +244,26 @@ class _Batch:
             return f"gap in {names[broken[0]]}"
         return None
 
-    def _resampled(self, channel: int, rows: slice) -> tuple[FloatArray, str | None]:
+    def _resampled(self, channel: int, rows: slice) -> tuple[Resampled, str | None]:
+        """One channel that does not lie on the grid, and what the user must know about it."""
         offset, value = self._samples_of(channel)
         near = slice(*np.searchsorted(offset, [rows.start - REACH - 1, rows.stop + REACH + 1]))
         grid = np.arange(rows.start, rows.stop, dtype=np.float64)
-        column, rate = resample(offset[near], value[near], grid)
-        name, own = self.owner.channels[channel].name, rate * self.owner.sample_rate
-        if 0.0 < rate < SLOWEST * (1.0 - 1e-3):
-            return column, f"{name} too slow ({own:.3g} Hz)"
-        if 0.0 < rate < 0.98:
-            return column, f"{name} interpolated from {own:.3g} Hz"
-        return column, None
+        result = resample(offset[near], value[near], grid, self.owner.longest_gap)
+        name, own = self.owner.channels[channel].name, result.rate * self.owner.sample_rate
+        if not result.even:
+            return result, f"{name} unevenly sampled"
+        if 0.0 < result.rate < SLOWEST * (1.0 - 1e-3):
+            return result, f"{name} too slow ({own:.3g} Hz)"
+        if 0.0 < result.rate < 0.98:
+            return result, f"{name} interpolated from {own:.3g} Hz"
+        return result, None
 
     def _samples_of(self, channel: int) -> tuple[FloatArray, FloatArray]:
         if self.by_channel is None:
             order = np.lexsort((self.offset, self.samples.channel))
             bounds = np.searchsorted(self.samples.channel[order], np.arange(len(self.owner.channels) + 1))
             self.by_channel = [
-                (self.offset[order[a:b]], self.samples.value[order[a:b]])
-                for a, b in zip(bounds[:-1], bounds[1:], strict=True)
+                (self.offset[order[a:b]], self.samples.value[order[a:b]]) for a, b in itertools.pairwise(bounds)
             ]
         return self.by_channel[channel]
