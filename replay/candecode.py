@@ -26,7 +26,7 @@ from replay.frames import EXTENDED, FrameBlock, WordArray, id_text, last_byte, r
 
 INVALID_CHOICE = re.compile(
     r"invalid|not[ _]?(available|avail|valid|supported|defined|used)|unavailable|unknown|undefined|"
-    r"^(sna|na|n/a|nan|init)$|(?<!no )(?<!no_)(?<!no)(fault|error|fail)",
+    r"^(sna|na|n/a|nan|init)$|(?<!no )(?<!no_)(?<!no)(?<!de)(fault|error|fail)",
     re.IGNORECASE,
 )
 ALL_ONES_BITS = 8  # a narrower field of all ones is an ordinary value

@@ -27,7 +27,7 @@ KAISER_BETA = 7.0  # stop band -70 dB
 NEIGHBOURS = 3  # valid samples on either side that a repair uses
 FEWEST = 4  # samples below which a channel's clock cannot be told
 EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an even clock; they show it clearly
-MOST_PERIODS = 1200  # tried in the search for a jittered clock
+FIRST_STAMPS = 64  # of the search for a jittered clock
 LONGEST_REPAIR = REACH - NEIGHBOURS  # consecutive samples
 
 
@@ -124,12 +124,26 @@ def _period(offset: FloatArray) -> tuple[float, float]:
         guesses.append(float(np.polyfit(np.r_[0.0, step], offset, 1)[0]))
     near = np.array([guess for guess in guesses if abs(guess / typical - 1.0) < 0.2] or [typical])
     fit = _coherence(offset, near)
-    if fit.max() < WELL_EVEN:  # jitter: search all periods near the typical one, finely enough not to slip
-        count = int(min(1.6 * span / typical + 8, MOST_PERIODS))
-        near = np.r_[near, 1.0 / np.linspace(0.8 / typical, 1.2 / typical, count)]
+    if fit.max() < WELL_EVEN:
+        near = np.r_[near, _search(offset, typical)]
         fit = _coherence(offset, near)
     best = int(np.argmax(fit))
     return float(near[best]), float(fit[best])
+
+
+def _search(offset: FloatArray, typical: float) -> float:
+    """The period within 20 % of `typical` that jittered stamps fit best: a coarse search over the first stamps, made
+    finer as more of them are taken in, so that it never slips by a period."""
+    count = min(len(offset), FIRST_STAMPS)
+    span = offset[count - 1] - offset[0]
+    frequency = np.linspace(0.8, 1.2, int(1.6 * span / typical) + 8) / typical
+    while True:
+        best = frequency[np.argmax(_coherence(offset[:count], 1.0 / frequency))]
+        if count == len(offset):
+            return float(1.0 / best)
+        count = min(2 * count, len(offset))
+        span = offset[count - 1] - offset[0]
+        frequency = best + np.arange(-6, 7) / (8.0 * span)
 
 
 def _coherence(offset: FloatArray, period: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from replay.grid import REACH, SLOWEST, Placed, Resampled, fill, place, resample
 from replay.stream import Jump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
+MOST_WINDOWS = 64  # that are made together
 MOSTLY_THERE = 0.2  # share of missing samples above which a channel is looked at as one of a lower rate
 COHERENT = 0.5  # mean resultant length of the phases above which they have a common phase
 
@@ -59,7 +60,8 @@ class Windower:
         self.lost = 0  # of these, samples that did not come or were invalid
         self._period = 1e9 / self.sample_rate  # ns
         self._pending: list[SampleBlock] = []
-        self._origin: float | None = None  # ns of row 0 of the next window
+        self._base = 0  # ns since epoch: the grid's first sample.  Floats hold differences to it only, because a
+        self._origin: float | None = None  # float of an absolute time is 256 ns coarse.  ns of the next window's row 0
         self._overlap = (0, 0)  # samples and lost samples of the last window that the next one shares
         self._first_row = True  # the next window is the first of its grid: nothing lies before it
 
@@ -73,9 +75,9 @@ class Windower:
                 continue
             self._pending.append(piece)
             if self._origin is None:
-                self._origin = float(piece.time[0])
+                self._base, self._origin = int(piece.time[0]), 0.0
         if self._origin is not None and self.order.newest is not None:
-            horizon = self.order.newest - self.delay * 1e9
+            horizon = self.order.newest - self._base - self.delay * 1e9
             rows = int(np.floor((horizon - self._origin) / self._period)) - REACH
             out += self._emit(rows, ended=False)
         return out
@@ -90,8 +92,8 @@ class Windower:
     def _finish(self) -> list[Window]:
         """Emit what the current grid still holds and forget it."""
         out: list[Window] = []
-        if self._origin is not None and self._pending:
-            last = max(float(block.time.max()) for block in self._pending)
+        if self._origin is not None and any(len(block.time) for block in self._pending):
+            last = max(int(block.time.max()) for block in self._pending if len(block.time)) - self._base
             rows = int(np.rint((last - self._origin) / self._period)) + 1
             out = self._emit(rows, ended=True)
         self.expected += self._overlap[0]
@@ -103,6 +105,7 @@ class Windower:
         """All windows within the next `rows` rows; the grid follows the samples' phase from window to window."""
         out: list[Window] = []
         while (count := (rows - self.window) // self.hop + 1) > 0 and self._origin is not None:
+            count = min(count, MOST_WINDOWS)
             samples = self._gather()
             beyond = rows - (count - 1) * self.hop - self.window
             batch = _Batch(self, samples, count, after=min(beyond, REACH) if ended else REACH)
@@ -136,7 +139,8 @@ class Windower:
         return self._pending[0]
 
     def _forget(self, samples: SampleBlock) -> None:
-        keep = samples.time >= (self._origin or 0.0) - (REACH + 2) * self._period
+        oldest = (self._origin or 0.0) - (REACH + 2) * self._period
+        keep = samples.time - self._base >= oldest
         self._pending = [SampleBlock(samples.time[keep], samples.channel[keep], samples.value[keep])]
 
 
@@ -149,10 +153,8 @@ class _Batch:
         self.before = 0 if owner._first_row else REACH
         self.rows = self.before + (count - 1) * owner.hop + owner.window + after
         self.origin = owner._origin or 0.0
-        base = int(self.origin)  # differences of int64, so that no nanosecond is lost
-        self.offset: FloatArray = np.asarray(
-            ((samples.time - base) - (self.origin - base)) / owner._period + self.before, dtype=np.float64
-        )
+        elapsed = samples.time - owner._base
+        self.offset: FloatArray = np.asarray((elapsed - self.origin) / owner._period + self.before, dtype=np.float64)
         self.samples = samples
         channels = len(owner.channels)
         self.placed: Placed = place(self.offset, samples.channel, samples.value, self.rows, channels)
@@ -208,7 +210,7 @@ class _Batch:
         absent = (missing == owner.window) & (unfilled == owner.window)
         values[:, absent] = np.nan
         owner._count(gone)
-        start = round(self.origin + index * owner.hop * owner._period)
+        start = owner._base + round(self.origin + index * owner.hop * owner._period)
         reason = self._reason(absent, missing, unfilled, conflict, notes)
         if reason:
             owner.reasons[reason] += 1
@@ -227,7 +229,7 @@ class _Batch:
         """Why the window must be dropped, or None."""
         owner = self.owner
         if absent.all():
-            return "no samples"
+            return notes[0] if notes else "no samples"
         names = [channel.name for channel in owner.channels]
         lacking = np.flatnonzero(absent & owner.is_input)
         if len(lacking):

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from model.signals import Channel, SampleBlock
 from replay.windowing import Windower
 
 RATE = 100.0
-START = 1_790_000_000_000_000_000
+START = 1_790_000_000_123_456_789
 NAMES = ("road", "roof", "axle")
 CHANNELS = [Channel(name, "m", 1e-3) for name in NAMES]
 
@@ -55,10 +56,7 @@ def same(a, b):
 
 def cut(block, ends):
     edges = [0, *ends, len(block.time)]
-    return [
-        SampleBlock(block.time[a:b], block.channel[a:b], block.value[a:b])
-        for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
+    return [SampleBlock(block.time[a:b], block.channel[a:b], block.value[a:b]) for a, b in pairwise(edges)]
 
 
 def without(block, mask):
