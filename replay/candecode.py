@@ -67,7 +67,8 @@ class SignalPlan:
     def values(self, data: NDArray[np.uint8]) -> tuple[FloatArray, BoolArray, BoolArray]:
         """Physical values (NaN where missing), which were marked invalid, which were out of range: (n,) each."""
         raw = self.bits.raw(data)
-        physical = self._number(raw) * self.scale + self.offset
+        with np.errstate(invalid="ignore", over="ignore"):  # a float signal may carry any bits
+            physical = self._number(raw) * self.scale + self.offset
         invalid = ~np.isfinite(physical)
         for code in self.invalid_raw:
             invalid |= raw == np.uint64(code)
