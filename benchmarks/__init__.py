@@ -1,0 +1,34 @@
+"""What `sprung bench NAME` runs.
+
+A benchmark is a module with `run(...)`, which yields figures as dicts that JSON can hold; its keyword arguments are
+the options of the command.  One line in the table makes it known; it is imported when it runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from typing import Any
+
+BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
+    "identify": ("benchmarks.identify", "accuracy and speed of window estimates, against the Cramer-Rao bound"),
+    "estimator": ("benchmarks.estimator", "iterations saved by the trained start, against the paper's feature"),
+    "simulate": ("benchmarks.simulate", "windows simulated per second, against torchdiffeq and scipy"),
+    "decode": ("benchmarks.decode", "frames and messages per second, against cantools and mcap"),
+    "replay": ("benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
+    "serve": ("benchmarks.serve", "latency of POST /identify, against a bare echo"),
+    "drift": ("benchmarks.drift", "delay of alarms and false alarms of the tracker"),
+    "concealed": ("benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
+    "silverbox": ("benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
+    "emps": ("benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
+    "paper": ("benchmarks.paper", "the paper's systems, baselines and ablations"),
+    "physics-overhead": ("benchmarks.physics_overhead", "what physics in the loop costs a training update"),
+}
+
+Figures = Iterator[dict[str, Any]]
+
+
+def load(name: str) -> Callable[..., Figures]:
+    """The `run` of a benchmark in the table."""
+    run: Callable[..., Figures] = import_module(BENCHMARKS[name][0]).run
+    return run

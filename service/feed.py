@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import queue
+import re
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, Protocol, TypeVar
 
 from model.signals import SampleBlock, Tally, Window
@@ -21,6 +22,7 @@ from service.pipeline import Batch, Pipeline
 from service.times import NANOSECONDS
 
 T = TypeVar("T")
+NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
 READ_AHEAD = 2  # batches; with them memory stays flat however long the file is
 
 OnBatch = Callable[[Batch], None]
@@ -74,9 +76,13 @@ class Fed:
         }
 
 
-def vehicle_of(path: Path, named: str | None, recorded: str | None) -> str:
-    """Whose windows these are: as the user says, else as the recording says, else the file's name."""
-    return named or recorded or path.stem
+def vehicle_of(named: str | None, recorded: str | None, file_name: str) -> str:
+    """Whose windows these are: as the user says, else as the recording says, else the file's name.
+
+    Made fit for a URL, as `service.api.bodies.VehicleId` has it.
+    """
+    name = NOT_IN_IDS.sub("_", named or recorded or PurePath(file_name).stem)[:128]
+    return name if name[:1].isalnum() else f"v{name}"[:128]
 
 
 def feed_file(
@@ -84,6 +90,7 @@ def feed_file(
     path: Path,
     *,
     vehicle: str | None = None,
+    file_name: str | None = None,
     recording_id: str | None = None,
     batch_windows: int = 128,
     speed: float = 0.0,
@@ -92,6 +99,7 @@ def feed_file(
 ) -> Fed:
     """Read a recording to its end, through the pipeline.
 
+    file_name: what the user calls the file, where `path` is a name of the service's own.
     speed: times real time; 0: as fast as possible.
     Stops with whatever `on_batch` raises; batches before are stored.  Raises UnreadableRecording.
     """
@@ -103,13 +111,13 @@ def feed_file(
     priority = Priority.LIVE if speed else Priority.BATCH
     try:
         for batch in batches:
-            fed.vehicle = fed.vehicle or vehicle_of(path, vehicle, recording.vehicle)
+            fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
             on_tally(recording.tally)
             on_batch(_process(pipeline, fed, batch, recording_id, priority))
     finally:
         batches.close()
     on_tally(recording.tally)
-    fed.vehicle = fed.vehicle or vehicle_of(path, vehicle, recording.vehicle)
+    fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
     fed.state = fed.state or pipeline.state(fed.vehicle)
     fed.tally = recording.tally
     fed.problems = list(recording.problems)

@@ -32,7 +32,6 @@ class RecordingJobs:
     def run(self, job: JobRow, progress: Progress) -> dict[str, Any]:
         """Returns the summary of what was read."""
         path, row = stored_file(self._settings, self._pipeline.store, job)
-        vehicle = job.vehicle_id or None
 
         def on_batch(_batch: Batch) -> None:
             progress.step(0.0)  # the length of a recording is known only at its end
@@ -41,7 +40,8 @@ class RecordingJobs:
             fed = feed_file(
                 self._pipeline,
                 path,
-                vehicle=vehicle,
+                vehicle=job.vehicle_id,
+                file_name=row.name,
                 recording_id=row.id,
                 batch_windows=self._settings.batch_windows,
                 on_batch=on_batch,
@@ -49,13 +49,7 @@ class RecordingJobs:
             )
         except UnreadableRecording as error:
             raise UserError(str(error).replace(str(path), row.name)) from error
-        return self._finish(row, fed)
-
-    def _finish(self, row: work.RecordingRow, fed: Fed) -> dict[str, Any]:
-        now = now_ns()
-        with self._pipeline.store.write() as connection:
-            fleet.ensure_vehicle(connection, fed.vehicle, now)
-            work.finish_recording(connection, row.id, fed.vehicle, fed.summary(), now)
+        finish_row(self._pipeline.store, row, fed)
         return {"recording": row.id} | fed.summary()
 
 
@@ -67,3 +61,17 @@ def stored_file(settings: Settings, store: Store, job: JobRow) -> tuple[Path, wo
     if row is None or path is None or not path.is_file():
         raise UserError("the recording's file is no longer kept; upload it again")
     return path, row
+
+
+def file_row(path: Path) -> work.RecordingRow:
+    """The store's row of a file on this machine."""
+    return work.RecordingRow(
+        work.new_id(), None, path.name[:255], "file", None, path.stat().st_size, None, now_ns(), None
+    )
+
+
+def finish_row(store: Store, row: work.RecordingRow, fed: Fed) -> None:
+    """Write down what reading the file came to."""
+    with store.write() as connection:
+        fleet.ensure_vehicle(connection, fed.vehicle, now_ns())
+        work.finish_recording(connection, row.id, fed.vehicle, fed.summary(), now_ns())

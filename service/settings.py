@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
-from pydantic import Field
+from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from service.errors import UserError
 
 
 def default_data_dir() -> Path:
@@ -72,3 +76,16 @@ class Settings(BaseSettings):
     def reports(self) -> Path:
         """Where the pages and pictures of mismatch reports lie, a folder each."""
         return self.data_dir / "reports"
+
+
+def settings_with(options: Mapping[str, Any]) -> Settings:
+    """Settings of the environment, overridden by the options that were given (not None).
+
+    Raises UserError that names a variable or option which cannot be used.
+    """
+    try:
+        return Settings(**{name: value for name, value in options.items() if value is not None})
+    except ValidationError as error:
+        first = error.errors()[0]
+        name = ".".join(map(str, first["loc"]))
+        raise UserError(f"setting {name} (SPRUNG_{name.upper()}): {first['msg']}") from error

@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from model.signals import FloatArray, Window
+from model.signals import FloatArray
 from service.api.problems import Problem
 from service.engine import Engine
-from service.times import NANOSECONDS
+from service.times import from_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
@@ -26,14 +26,13 @@ class Strict(BaseModel):
 class WindowBody(Strict):
     """One window: the same number of samples of every channel, SI units."""
 
-    vehicle: VehicleId
+    vehicle: VehicleId | None = None
     sample_rate: Annotated[Number, Field(gt=0, description="Hz; the system file's")]
     channels: dict[str, list[Number]] = Field(
         description="samples by channel; a sensor may be missing, an input may not"
     )
-    start: Annotated[int, Field(ge=0, lt=2**63)] | None = Field(
-        default=None,
-        description="time of the first sample, ns since the Unix epoch; needed with ?track=true",
+    start: str | None = Field(
+        default=None, max_length=40, description="time of the first sample, RFC 3339; used with ?track=true"
     )
 
 
@@ -77,10 +76,17 @@ def window_values(body: WindowBody, engine: Engine) -> FloatArray:
     return values
 
 
-def as_window(body: WindowBody, values: FloatArray, start: int) -> Window:
-    """The window that the tracker and the store know, its start rounded to the sample grid."""
-    step = NANOSECONDS / body.sample_rate
-    return Window(round(round(start / step) * step), body.sample_rate, values)
+def start_of(body: WindowBody) -> int | None:
+    """The window's start, ns since epoch, or None where the body has none; a 422 Problem when it is no time."""
+    if body.start is None:
+        return None
+    try:
+        start = from_iso(body.start)
+    except ValueError:
+        start = -1
+    if not 0 <= start < 2**63:
+        raise Problem(422, "start is no RFC 3339 time", [_wrong("start", "is no RFC 3339 time")])
+    return start
 
 
 def _wrong(field: str, detail: str) -> dict[str, str]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from sqlalchemy import Connection, select
+from sqlalchemy import Column, Connection, Table, func, select
 
 from model.signals import FloatArray
 from service.store.engine import upsert
@@ -15,6 +16,7 @@ from service.store.windows import WindowRecord, pack, unpack
 from service.times import NANOSECONDS
 
 LEVELS = (60, 3600)  # s
+NICE = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 900.0, 3600.0, 6 * 3600.0, 86400.0)  # s per point
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,3 +149,22 @@ def _stored(connection: Connection, vehicle: str, model_id: int, level: int, buc
         .where(table.c.bucket_ns.in_(buckets))
     )
     return [Point(row[0], row[1], *map(unpack, row[2:])) for row in connection.execute(query)]
+
+
+def fitting_resolution(
+    connection: Connection, vehicle: str, model_id: int, since: int, until: int, points: int
+) -> float:
+    """Seconds per point that show the whole range in about `points`; 0 where every window fits."""
+
+    def spans(table: Table, time: Column[int]) -> Any:
+        inside = (table.c.vehicle_id == vehicle, table.c.model_id == model_id, time >= since, time < until)
+        return connection.execute(select(func.count(), func.min(time), func.max(time)).where(*inside)).one()
+
+    count, first, last = spans(windows, windows.c.start_ns)
+    buckets, oldest, newest = spans(rollups, rollups.c.bucket_ns)
+    if buckets and (not count or oldest < first - LEVELS[-1] * NANOSECONDS):
+        seconds = (newest - oldest) / NANOSECONDS  # windows of the older part are forgotten: roll-ups have it
+        return next((s for s in NICE if s >= LEVELS[0] and seconds / s <= points), NICE[-1])
+    if count <= points:
+        return 0.0
+    return next((s for s in NICE if (last - first) / NANOSECONDS / s <= points), NICE[-1])

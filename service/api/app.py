@@ -1,0 +1,56 @@
+"""The FastAPI application: every route in one list, limits before them, problems after them."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+
+from fastapi import FastAPI
+from fastapi.concurrency import run_in_threadpool
+
+from service.api import diagnose, docs, fleet, health, identify, problems, recordings
+from service.api.limits import BodyLimit
+from service.core import Core
+from service.pages import routes as pages
+
+DESCRIPTION = (
+    "Springs and dampers of rail vehicles, identified from running recordings. "
+    "Times are RFC 3339 in UTC, values SI; every error is `application/problem+json` (RFC 9457)."
+)
+
+
+def create_app(
+    core: Core, on_start: Callable[[], None] = lambda: None, on_stop: Callable[[], None] | None = None
+) -> FastAPI:
+    """The application around a core.
+
+    on_start: called once the core runs; on_stop: called when the last request was answered, closes the core.
+    """
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        core.start()
+        on_start()
+        yield
+        await run_in_threadpool(on_stop or core.close)
+
+    app = FastAPI(
+        title="Sprung",
+        version=version("sprung"),
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        docs_url=None,  # both load scripts from other hosts; `docs` draws a page of its own
+        redoc_url=None,
+    )
+    app.state.core = core
+    problems.install(app)
+    for part in (identify, fleet, recordings, diagnose, health, docs, pages):
+        app.include_router(part.router)
+    uploads = core.settings.max_upload_bytes
+    app.add_middleware(
+        BodyLimit,
+        limit=core.settings.max_body_bytes,
+        paths={"/recordings": uploads, "/diagnose": uploads},
+    )
+    return app

@@ -1,0 +1,125 @@
+"""`POST /diagnose` and `GET /reports/{id}`: what a recording shows that the model leaves out."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import FileResponse, RedirectResponse, Response
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy import Connection
+from starlette.datastructures import UploadFile
+
+from service.api.access import CoreOf, json_response, known_vehicle, read
+from service.api.bodies import DiagnoseBody, VehicleId
+from service.api.problems import Problem, from_validation
+from service.api.recordings import job_dict, keep_upload
+from service.core import Core
+from service.errors import NotFound
+from service.store import fleet, work
+from service.store.work import JobRow, RecordingRow, ReportRow
+
+router = APIRouter(tags=["diagnosis"])
+PAGE = "report.html"
+_VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
+
+BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            "application/json": {"schema": DiagnoseBody.model_json_schema()},
+            "multipart/form-data": {
+                "schema": {
+                    "type": "object",
+                    "required": ["file"],
+                    "properties": {
+                        "file": {"type": "string", "format": "binary"},
+                        "vehicle": {"type": "string"},
+                    },
+                }
+            },
+        },
+    }
+}
+
+
+@router.post("/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics")
+async def diagnose(request: Request, core: CoreOf) -> Response:
+    """Accepts a job: of an uploaded file (multipart, as in `POST /recordings`), of a recording that was uploaded
+    before (`{"recording": id}`), or of the last minute of a vehicle (`{"vehicle": id}`).  The job's result names
+    the report."""
+    core.jobs.reserve()
+    kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
+    if kind == "multipart/form-data":
+        job = await _of_upload(request, core)
+    elif kind == "application/json":
+        job = await _of_reference(request, core)
+    else:
+        raise Problem(415, "send multipart/form-data with a file, or application/json")
+    return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+
+
+@router.get("/reports/{id}", summary="A mismatch report")
+async def report(request: Request, core: CoreOf, id: str) -> Response:
+    """The report as JSON, or its page where the client prefers `text/html`."""
+    row = await _report(core, id)
+    accepted = request.headers.get("accept", "")
+    if "text/html" in accepted and "application/json" not in accepted:
+        return RedirectResponse(f"/reports/{row.id}/page", 303)
+    return json_response(row.report | {"id": row.id})
+
+
+@router.get("/reports/{id}/page", summary="A mismatch report as a page", response_class=FileResponse)
+async def report_page(core: CoreOf, id: str) -> Response:
+    """A self-contained page with the pictures."""
+    row = await _report(core, id)
+    path = core.settings.reports / row.id / PAGE  # the id is the store's, not the client's
+    if not path.is_file():
+        raise NotFound(f"the page of report {row.id} is no longer kept")
+    return FileResponse(path, media_type="text/html")
+
+
+async def _of_upload(request: Request, core: Core) -> JobRow:
+    async with request.form(max_files=1, max_fields=4) as form:
+        file, vehicle = form.get("file"), form.get("vehicle")
+        if not isinstance(file, UploadFile):
+            raise Problem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
+        if vehicle is not None:
+            try:
+                vehicle = _VEHICLE.validate_python(vehicle)
+            except ValidationError as error:
+                raise from_validation(error, "vehicle.") from None
+        row = await run_in_threadpool(keep_upload, core.settings, file.filename or "", file.file)
+    return await run_in_threadpool(core.diagnoses.from_recording, row, vehicle)
+
+
+async def _of_reference(request: Request, core: Core) -> JobRow:
+    try:
+        body = DiagnoseBody.model_validate_json(await request.body())
+    except ValidationError as error:
+        raise from_validation(error) from None
+    if (body.recording is None) == (body.vehicle is None):
+        detail = "give either recording or vehicle"
+        raise Problem(422, detail, [{"field": "recording", "detail": detail}])
+    if body.recording is None:
+        vehicle = str(body.vehicle)
+        known_vehicle(await read(core, lambda c: fleet.vehicle_exists(c, vehicle)), vehicle)
+        return await run_in_threadpool(core.diagnoses.from_excerpt, vehicle)
+    recording = body.recording
+
+    def query(connection: Connection) -> RecordingRow:
+        row = work.get_recording(connection, recording)
+        if row is None:
+            raise NotFound(f"no recording {recording!r}")
+        return row
+
+    return await run_in_threadpool(core.diagnoses.from_recording, await read(core, query), None)
+
+
+async def _report(core: Core, report_id: str) -> ReportRow:
+    def query(connection: Connection) -> ReportRow:
+        row = work.get_report(connection, report_id)
+        if row is None:
+            raise NotFound(f"no report {report_id[:36]!r}")
+        return row
+
+    return await read(core, query)

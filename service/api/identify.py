@@ -1,0 +1,109 @@
+"""`POST /identify`: one window in, its parameters out."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+from pydantic import ValidationError
+
+from model.identify import UnusableWindow
+from model.signals import Estimate, FloatArray, Window
+from service.api.access import CoreOf, json_response
+from service.api.bodies import WindowBody, start_of, window_values
+from service.api.problems import Problem, from_validation
+from service.compute import Priority
+from service.engine import Engine
+from service.store.windows import Solved
+from service.times import NANOSECONDS, now_ns
+from service.views import fit_dict, physical, sensor_dict
+
+router = APIRouter(tags=["identify"])
+
+# the body is parsed by hand, strictly and once; this is how clients see it
+BODY = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/json": {"schema": WindowBody.model_json_schema()}},
+    }
+}
+
+
+@router.post("/identify", openapi_extra=BODY, summary="Identify one window")
+async def identify(request: Request, core: CoreOf, states: bool = False, track: bool = False) -> Response:
+    """Parameters of one window, with standard deviations and how well the model fits.
+
+    `states=true` adds the simulated states.  `track=true` stores the window and feeds the vehicle's tracker; the
+    answer then also has the tracked `posterior`, and `start` in the body says when the window began (the window
+    is taken to end now where it does not).
+    """
+    try:
+        body = WindowBody.model_validate_json(await request.body())
+    except ValidationError as error:
+        raise from_validation(error) from None
+    engine = core.engine
+    values = window_values(body, engine)
+    if track and body.vehicle is None:
+        detail = "is needed to track"
+        raise Problem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
+    work = core.compute.submit(lambda: engine.identify(values[None], states=states), Priority.REQUEST)
+    try:
+        estimates, seconds = await asyncio.wrap_future(work)
+    except UnusableWindow as error:
+        raise Problem(422, str(error)) from error
+    core.metrics.observe(seconds)
+    answer = _answer(engine, body.vehicle, estimates[0])
+    if track and body.vehicle is not None:
+        length = round(engine.system.window / engine.system.sample_rate * NANOSECONDS)
+        start = start_of(body)
+        window = Window(now_ns() - length if start is None else start, engine.system.sample_rate, values)
+        batch = await run_in_threadpool(core.pipeline.track, body.vehicle, window, estimates[0])
+        posterior = batch.records[0].posterior
+        answer["tracked"] = posterior is not None
+        if posterior is not None:
+            answer["posterior"] = _parameters(engine, posterior.log_ratio, posterior.std, None)
+    return json_response(answer)
+
+
+def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str, Any]:
+    solved = Solved.of(estimate)
+    answer: dict[str, Any] = {
+        "vehicle": vehicle,
+        "model": engine.digest,
+        "parameters": _parameters(engine, solved.log_ratio, solved.std, estimate.identifiable.tolist()),
+        "fit": fit_dict(solved.nrmse, sensor_dict(engine, solved.per_sensor))
+        | {"adequate": solved.adequate, "converged": solved.converged},
+    }
+    if estimate.states is not None:
+        answer["states"] = dict(zip(state_names(engine), estimate.states.T.tolist(), strict=True))
+    return answer
+
+
+def _parameters(
+    engine: Engine, log_ratio: FloatArray, std: FloatArray, identifiable: list[bool] | None
+) -> list[dict[str, Any]]:
+    told = identifiable or [True] * len(log_ratio)
+    pairs = physical(engine, log_ratio, std)
+    ratios = np.exp(log_ratio).tolist()
+    return [
+        {
+            "name": p.name,
+            "value": value,
+            "std": spread,
+            "unit": p.unit,
+            "nominal": p.nominal,
+            "ratio": ratio,
+        }
+        | ({} if identifiable is None else {"identifiable": ok})
+        for p, (value, spread), ratio, ok in zip(engine.system.parameters, pairs, ratios, told, strict=True)
+    ]
+
+
+def state_names(engine: Engine) -> list[str]:
+    """`car.z`, `car.roll`, ... then their rates `car.z_rate`, ..."""
+    dofs = engine.system.mechanics.dofs
+    return [*dofs, *(f"{dof}_rate" for dof in dofs)]

@@ -1,0 +1,49 @@
+"""The command `sprung`.  Errors are one line on stderr; exit status 0, 1 or 2, and 130 after Ctrl-C."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+USAGE = 2
+INTERRUPTED = 130
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status; never a traceback, unless SPRUNG_DEBUG is set."""
+    from service.cli.app import app
+
+    try:
+        status = app(arguments, prog_name="sprung", standalone_mode=False)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("sprung: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        if type(error).__name__ == "Abort":  # typer's word for Ctrl-C at a prompt
+            return INTERRUPTED
+        if os.environ.get("SPRUNG_DEBUG"):
+            raise
+        print(f"sprung: {describe(error)}", file=sys.stderr)
+        return USAGE
+    return status if isinstance(status, int) else 0
+
+
+def describe(error: Exception) -> str:
+    """One line: what, where, what to do."""
+    usage = getattr(error, "format_message", None)  # typer's and click's errors of usage have it
+    if callable(usage):
+        return f"{_one_line(usage())}; see sprung --help"
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    if isinstance(error, ValueError):  # what every folder raises for input that cannot be used
+        return _one_line(str(error))
+    return f"unexpected {type(error).__name__}: {_one_line(str(error))}; SPRUNG_DEBUG=1 shows where"
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,169 @@
+"""The commands and their options; each imports what it needs when it runs, so that `--help` is quick."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(
+    name="sprung",
+    help="Springs and dampers of rail vehicles, identified from running recordings.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Files = Annotated[list[Path], typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4 or CSV.", metavar="FILE...")]
+File = Annotated[Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4 or CSV.", metavar="FILE")]
+System = Annotated[Path | None, typer.Option("--system", help="System file; default: the Manchester vehicle.")]
+Dbc = Annotated[Path | None, typer.Option("--dbc", help="CAN database; default: the bundled system's.")]
+Weights = Annotated[
+    Path | None, typer.Option("--weights", help="Trained estimator (a folder); default: the bundled one.")
+]
+StoreUrl = Annotated[
+    str | None,
+    typer.Option("--store", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
+]
+Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
+Vehicle = Annotated[
+    str | None, typer.Option("--vehicle", help="Whose it is; default: as recorded, else the file's name.")
+]
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sprung {version('sprung')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    """Springs and dampers of rail vehicles, identified from running recordings."""
+
+
+@app.command()
+def replay(
+    files: Files,
+    system: System = None,
+    dbc: Dbc = None,
+    store: StoreUrl = None,
+    weights: Weights = None,
+    vehicle: Vehicle = None,
+    speed: Annotated[float, typer.Option("--speed", min=0, help="Times real time; 0: as fast as possible.")] = 0.0,
+    json_lines: Json = False,
+) -> int:
+    """Recordings -> windows -> estimates -> drift.
+
+    Without --store nothing is kept: every run then depends on its files alone.
+    """
+    from service.cli.replay import run
+
+    return run(
+        files,
+        system=system,
+        dbc=dbc,
+        store=store,
+        weights=weights,
+        vehicle=vehicle,
+        speed=speed,
+        json_lines=json_lines,
+    )
+
+
+@app.command()
+def serve(
+    system: System = None,
+    dbc: Dbc = None,
+    store: StoreUrl = None,
+    weights: Weights = None,
+    data_dir: Annotated[
+        Path | None, typer.Option("--data-dir", help="Uploads, reports and the embedded store.")
+    ] = None,
+    host: Annotated[str | None, typer.Option("--host", help="Address to listen on; default 127.0.0.1.")] = None,
+    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="Default 8000; 0: any free one.")] = None,
+    replay_files: Annotated[
+        list[Path] | None, typer.Option("--replay", help="Recording to replay into the service; repeatable.")
+    ] = None,
+    speed: Annotated[
+        float, typer.Option("--speed", min=0, help="Of --replay: times real time; 0: as fast as possible.")
+    ] = 0.0,
+    can: Annotated[
+        list[str] | None,
+        typer.Option("--can", help="Live bus, as socketcan:can0 or udp_multicast:239.0.0.1; repeatable."),
+    ] = None,
+    vehicle: Vehicle = None,
+) -> int:
+    """REST, metrics and pages, on an embedded store unless --store says otherwise."""
+    from service.cli.serve import run
+
+    options = {
+        "system": system,
+        "dbc": dbc,
+        "store": store,
+        "weights": weights,
+        "data_dir": data_dir,
+        "host": host,
+        "port": port,
+    }
+    return run(options, replay_files or [], speed, can or [], vehicle)
+
+
+@app.command()
+def train(
+    system: System = None,
+    recordings: Annotated[
+        list[Path] | None, typer.Option("--recordings", help="Train on from these, without labels; repeatable.")
+    ] = None,
+    dbc: Dbc = None,
+    out: Annotated[Path, typer.Option("--out", help="Folder for the weights.")] = Path("weights"),
+    seed: Annotated[int | None, typer.Option("--seed", help="Same seed, same weights.")] = None,
+    records: Annotated[int | None, typer.Option("--records", min=1, help="Simulated records.")] = None,
+    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps.")] = None,
+) -> int:
+    """Train the estimator for a system; goes on after an interrupt when called again."""
+    from service.cli.train import run
+
+    return run(system, recordings or [], dbc, out, {"seed": seed, "records": records, "steps": steps})
+
+
+@app.command()
+def diagnose(
+    file: File,
+    system: System = None,
+    dbc: Dbc = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the pictures.")] = None,
+    json_lines: Json = False,
+) -> int:
+    """What the model leaves out: where, which law, how much better the simulation fits with it."""
+    from service.cli.diagnose import run
+
+    return run(file, system, dbc, out, json_lines)
+
+
+@app.command()
+def system(
+    file: Annotated[Path | None, typer.Argument(help="System file; default: the Manchester vehicle.")] = None,
+    json_lines: Json = False,
+) -> int:
+    """Check a system file; print bodies, elements, modes, and what the sensors can identify."""
+    from service.cli.system import run
+
+    return run(file, json_lines)
+
+
+@app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
+def bench(
+    context: typer.Context,
+    name: Annotated[str | None, typer.Argument(help="Without it, the names are listed.")] = None,
+) -> int:
+    """A benchmark, one JSON line per figure; further arguments go to it (--budget full, --data DIR)."""
+    from service.cli.bench import run
+
+    return run(name, context.args)

@@ -1,0 +1,119 @@
+"""What people see: progress on a terminal, plain lines in a pipe, the table of parameters."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from service.feed import OnBatch
+from service.pages.render import percent, quantity
+from service.pipeline import Batch
+from service.views import VehicleView
+
+PLAIN_SECONDS = 2.0  # between lines where there is no terminal
+HEALTH_STYLE = {"ok": "green", "maintenance_required": "yellow"}
+
+
+def errors() -> Console:
+    """The console on stderr."""
+    return Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class Shown:
+    """Progress of one recording."""
+
+    def __init__(self, name: str, seconds_per_window: float) -> None:
+        self._name = name
+        self._hop = seconds_per_window
+        self._windows = 0
+        self._started = time.monotonic()
+
+    def on_batch(self, batch: Batch) -> str:
+        """The line after a further batch."""
+        self._windows += len(batch.records)
+        recorded = self._windows * self._hop
+        pace = recorded / max(time.monotonic() - self._started, 1e-6)
+        return f"{self._name}: {self._windows} windows, {recorded:.0f} s recorded, {pace:.0f} x real time"
+
+
+@contextmanager
+def progress(name: str, hop_seconds: float, quiet: bool = False) -> Iterator[OnBatch]:
+    """A callback for batches that shows how far a recording is: a bar on a terminal, else a line now and then."""
+    console = errors()
+    if quiet or not console.is_terminal:
+        yield _silent if quiet else plain_progress(name, hop_seconds)
+        return
+    shown = Shown(name, hop_seconds)
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task(f"{name}: reading", total=None)
+        yield lambda batch: bar.update(task, description=shown.on_batch(batch))
+
+
+def plain_progress(name: str, hop_seconds: float) -> OnBatch:
+    """A callback for batches that prints a line on stderr every few seconds."""
+    shown = Shown(name, hop_seconds)
+    last = time.monotonic()
+
+    def on_batch(batch: Batch) -> None:
+        nonlocal last
+        line = shown.on_batch(batch)
+        if time.monotonic() - last >= PLAIN_SECONDS:
+            last = time.monotonic()
+            print(line, file=sys.stderr, flush=True)
+
+    return on_batch
+
+
+def _silent(_batch: Batch) -> None:
+    """Shows nothing."""
+
+
+def parameter_table(view: VehicleView) -> Table:
+    """Every tracked parameter, the ones with alarms marked."""
+    style = HEALTH_STYLE.get(view.health, "red")
+    table = Table(
+        title=f"{view.vehicle}: [{style}]{view.health.replace('_', ' ')}[/{style}]",
+        title_justify="left",
+        title_style="bold",
+    )
+    table.add_column("element")
+    table.add_column("quantity")
+    for column in ("value", "± std", "nominal", "ratio", "drift"):
+        table.add_column(column, justify="right")
+    table.add_column("state")
+    for p in view.parameters:
+        table.add_row(
+            p.element,
+            p.quantity,
+            quantity(p.value, p.unit),
+            quantity(p.std, p.unit),
+            quantity(p.nominal, p.unit),
+            f"{p.value / p.nominal:.3f}",
+            percent(p.drift),
+            _state(p.alarm, p.identifiable, p.drift),
+            style={"alarm": "red", "warning": "yellow"}.get(p.alarm or ""),
+        )
+    return table
+
+
+def print_table(table: Table) -> None:
+    """On stdout; in a pipe as wide as it needs to be, without colours."""
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=120, no_color=True)
+    console.print(table)
+
+
+def _state(alarm: str | None, identifiable: bool, drift: float | None) -> str:
+    if alarm is not None:
+        return alarm
+    if not identifiable:
+        return "not identifiable"
+    return "learning" if drift is None else "ok"

@@ -1,0 +1,155 @@
+"""`sprung replay`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from service.cli.console import parameter_table, print_table, progress
+from service.compute import Compute
+from service.engine import load_engine
+from service.feed import Fed, feed_file
+from service.pipeline import Batch, Pipeline
+from service.recordings import file_row, finish_row
+from service.settings import settings_with
+from service.store import Store, open_store, work
+from service.times import to_iso
+from service.views import VehicleView, alarm_dict, vehicle_view, window_dict
+
+
+def run(
+    files: list[Path],
+    *,
+    system: Path | None,
+    dbc: Path | None,
+    store: str | None,
+    weights: Path | None,
+    vehicle: str | None,
+    speed: float,
+    json_lines: bool,
+) -> int:
+    """Replay each file; 1 when a vehicle has alarms or a recording was incomplete."""
+    settings = settings_with({"system": system, "dbc": dbc, "store": store, "weights": weights})
+    for path in files:
+        readable(path)
+    status = 0
+    with ExitStack() as stack:
+        engine = load_engine(settings)
+        if settings.store is None:  # nothing is kept: a run depends on its files alone
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sprung-"))
+            opened = open_store(f"sqlite:///{folder}/replay.db")
+        else:
+            opened = open_store(settings.store_url)
+        stack.callback(opened.close)
+        compute = Compute(settings.compute_queue)
+        stack.callback(compute.close)
+        pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
+        for path in files:
+            fed = _replay(pipeline, opened, path, vehicle, speed, settings.batch_windows, json_lines)
+            status = max(status, _report(pipeline, path, fed, json_lines))
+    return status
+
+
+def readable(path: Path) -> None:
+    """Raise OSError now rather than after the files before it."""
+    with open(path, "rb"):
+        pass
+
+
+def _replay(
+    pipeline: Pipeline,
+    store: Store,
+    path: Path,
+    vehicle: str | None,
+    speed: float,
+    batch_windows: int,
+    json_lines: bool,
+) -> Fed:
+    system = pipeline.engine.system
+    row = file_row(path)
+    with store.write() as connection:
+        work.add_recording(connection, row)
+    with progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show:
+
+        def on_batch(batch: Batch) -> None:
+            if json_lines:
+                lines = (json.dumps(window_dict(pipeline.engine, record)) for record in batch.records)
+                sys.stdout.write("\n".join(lines) + "\n")
+            show(batch)
+
+        fed = feed_file(
+            pipeline,
+            path,
+            vehicle=vehicle,
+            recording_id=row.id,
+            batch_windows=batch_windows,
+            speed=speed,
+            on_batch=on_batch,
+        )
+    finish_row(store, row, fed)
+    return fed
+
+
+def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
+    """Print the outcome; the exit status of this file."""
+    assert fed.state is not None
+    view = vehicle_view(pipeline.engine, fed.vehicle, fed.state, None)
+    if json_lines:
+        print(json.dumps({"summary": summary(pipeline, view, fed)}), flush=True)
+    else:
+        print_table(parameter_table(view))
+        print(closing_line(pipeline, view, fed))
+    complaint = incomplete_line(path, fed)
+    if complaint:
+        print(f"sprung: {complaint}", file=sys.stderr)
+    return int(bool(complaint) or bool(view.active))
+
+
+def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
+    """The last line of `replay --json`."""
+    return {
+        "vehicle": fed.vehicle,
+        "health": view.health,
+        "windows": dict(fed.windows),
+        "frames": fed.tally.as_dict(),
+        "samples": {"expected": fed.expected, "lost": fed.lost},
+        "parameters": [p.as_dict() for p in view.parameters],
+        "alarms": [alarm_dict(alarm) for alarm in view.alarms],
+        "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
+        "wall_seconds": round(fed.wall_seconds, 3),
+    }
+
+
+def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
+    """What was read, how fast, and what is alarmed."""
+    recorded = fed.recorded_seconds(pipeline.engine.system.sample_rate)
+    counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
+    pace = recorded / max(fed.wall_seconds, 1e-9)
+    lines = [f"{recorded:.1f} s recorded in {fed.wall_seconds:.1f} s ({pace:.0f} x real time); windows: {counts}"]
+    if fed.late:
+        lines.append(f"{fed.late} windows are older than what the vehicle's tracker had seen: stored, not tracked")
+    for alarm in view.active:
+        change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
+        std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f} %"
+        what = alarm.parameter or "windows no longer fit the model"
+        lines.append(f"{alarm.severity}: {what}{change}{std} since {to_iso(alarm.onset)}")
+    return "\n".join(lines)
+
+
+def incomplete_line(path: Path, fed: Fed) -> str | None:
+    """One line that says how much of a recording was lost; None when nothing was."""
+    parts = []
+    if fed.lost:
+        parts.append(f"{fed.lost} of {fed.expected} samples lost ({100 * fed.lost / max(fed.expected, 1):.2g} %)")
+    bad = {name: count for name in ("dropped", "corrupt") if (count := fed.tally.as_dict()[name])}
+    parts += [f"{count} messages {name}" for name, count in bad.items()]
+    parts += [f"{fed.windows[name]} windows {name}" for name in ("repaired", "dropped") if fed.windows[name]]
+    parts += fed.problems[:3] if fed.incomplete else []
+    if not parts:
+        return None
+    total = sum(fed.windows.values())
+    return f"{path}: incomplete: {', '.join(parts)}; {total} windows in all"

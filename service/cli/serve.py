@@ -1,0 +1,54 @@
+"""`sprung serve`."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from service.cli.console import parameter_table, plain_progress, print_table
+from service.cli.replay import closing_line, incomplete_line, readable
+from service.core import Core
+from service.feed import Fed, OnBatch
+from service.main import Feeds, serve
+from service.settings import settings_with
+from service.views import vehicle_view
+
+
+def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:
+    """Serve until told to stop."""
+    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="sprung: %(levelname)s: %(message)s")
+    for path in files:
+        readable(path)
+    settings = settings_with(options)
+
+    def announce(address: str) -> None:
+        print(
+            f"Sprung serves on {address} (pages), {address}/docs (API), {address}/metrics; "
+            f"store {settings.store_url}; Ctrl-C stops",
+            flush=True,
+        )
+
+    try:
+        serve(settings, Feeds(tuple(files), speed, tuple(buses), vehicle), watch, announce)
+    except KeyboardInterrupt:
+        pass  # the usual way to stop
+    return 0
+
+
+def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[Fed], None]]:
+    """Show a recording that is replayed into the service, then its table."""
+    system = core.engine.system
+
+    def on_end(fed: Fed) -> None:
+        assert fed.state is not None
+        view = vehicle_view(core.engine, fed.vehicle, fed.state, None)
+        print_table(parameter_table(view))
+        print(closing_line(core.pipeline, view, fed), flush=True)
+        complaint = incomplete_line(path, fed)
+        if complaint:
+            print(f"sprung: {complaint}", file=sys.stderr, flush=True)
+
+    return plain_progress(path.name, system.hop / system.sample_rate), on_end

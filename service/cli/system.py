@@ -1,0 +1,112 @@
+"""`sprung system`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from model.identify import identifiability
+from model.refine import PRIOR_STD
+from model.system import MANCHESTER, System, load_system
+from service.pages.render import quantity
+
+KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
+
+
+def run(file: Path | None, json_lines: bool) -> int:
+    """Check the file and print what it says."""
+    system = load_system(file or MANCHESTER)
+    told = identifiability(system)
+    if json_lines:
+        print(json.dumps(_as_dict(system, told), indent=None))
+        return 0
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=110, no_color=True)
+    console.print(
+        f"[bold]{system.name}[/bold]: {len(system.bodies)} bodies, {len(system.mechanics.dofs)} degrees of freedom, "
+        f"{len(system.inputs)} input signals, {len(system.elements)} elements, {len(system.sensors)} sensors; "
+        f"{system.window} samples at {system.sample_rate:g} Hz; digest {system.digest}"
+    )
+    console.print(_bodies(system))
+    console.print(_elements(system))
+    console.print(_modes(system))
+    if system.parameters:
+        console.print(_parameters(system, told))
+    return 0
+
+
+def _bodies(system: System) -> Table:
+    table = Table("body", "mass", "roll inertia", "pitch inertia", title="Bodies", title_justify="left")
+    for name, body in system.file.bodies.items():
+        table.add_row(name, f"{body.mass.value:g} kg", *(_inertia(i) for i in (body.roll_inertia, body.pitch_inertia)))
+    return table
+
+
+def _inertia(value: Any) -> str:
+    return "–" if value is None else f"{getattr(value, 'value', value):g} kg m²"
+
+
+def _elements(system: System) -> Table:
+    columns = ("element", "upper", "lower", "stiffness", "damping")
+    table = Table(*columns, title="Elements (nominal)", title_justify="left")
+    for name, element in system.file.elements.items():
+        values = [
+            quantity(v.value, unit) + (" fixed" if v.fixed else "")
+            for v, unit in ((element.stiffness, "N/m"), (element.damping, "N s/m"))
+        ]
+        table.add_row(name, element.upper, element.lower, *values)
+    return table
+
+
+def _modes(system: System) -> Table:
+    table = Table("frequency", "damping ratio", "moves most", title="Modes (nominal)", title_justify="left")
+    for mode in system.mechanics.modes(system.bodies):
+        table.add_row(f"{mode.frequency:.3g} Hz", f"{100 * mode.damping_ratio:.1f} %", mode.body)
+    return table
+
+
+def _parameters(system: System, told: Any) -> Table:
+    title = f"What one window of {system.window / system.sample_rate:g} s on an average track tells"
+    table = Table("parameter", "nominal", "standard deviation", "", title=title, title_justify="left")
+    for parameter, std in zip(system.parameters, np.asarray(told), strict=True):
+        known = std < KNOWN_SHARE * PRIOR_STD
+        table.add_row(
+            parameter.name,
+            quantity(parameter.nominal, parameter.unit),
+            f"{100 * std:.2g} %" if known else "–",
+            "identifiable" if known else "not identifiable by these sensors",
+        )
+    return table
+
+
+def _as_dict(system: System, told: Any) -> dict[str, Any]:
+    return {
+        "name": system.name,
+        "digest": system.digest,
+        "sample_rate": system.sample_rate,
+        "window": system.window,
+        "bodies": list(system.bodies),
+        "elements": list(system.elements),
+        "sensors": list(system.sensors),
+        "inputs": [channel.name for channel in system.inputs],
+        "modes": [
+            {"frequency": m.frequency, "damping_ratio": m.damping_ratio, "body": m.body}
+            for m in system.mechanics.modes(system.bodies)
+        ],
+        "parameters": [
+            {
+                "name": p.name,
+                "unit": p.unit,
+                "nominal": p.nominal,
+                "window_std": float(std),
+                "identifiable": bool(std < KNOWN_SHARE * PRIOR_STD),
+            }
+            for p, std in zip(system.parameters, np.asarray(told), strict=True)
+        ],
+    }

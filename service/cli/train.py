@@ -1,0 +1,82 @@
+"""`sprung train`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from model.signals import FloatArray
+from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from replay import open_recording
+from replay.windowing import Windower
+from service.cli.console import errors
+from service.errors import UserError
+
+
+def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
+    """Train, and print what was reached."""
+    from model.training import TrainingSettings, train
+
+    system = load_system(system_file or MANCHESTER)
+    database = dbc or (MANCHESTER_DBC if system_file is None else None)
+    windows = whole_windows(system, recordings, database) if recordings else None
+    given = {name: value for name, value in changes.items() if value is not None}
+    settings = replace(TrainingSettings(), **given)
+    with Shown() as shown:
+        train(system, out, recordings=windows, settings=settings, progress=shown.show)
+    print(json.dumps({"out": str(out), "system": system.digest, "settings": given}))
+    return 0
+
+
+def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatArray:
+    """Windows of all recordings that were not dropped, shape (B, T, C)."""
+    found = []
+    for path in paths:
+        windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
+        for block in open_recording(path, system.channels, dbc=dbc).blocks():
+            found += [w.values for w in windower.push(block) if w.outcome != "dropped"]
+        found += [w.values for w in windower.flush() if w.outcome != "dropped"]
+    if not found:
+        raise UserError(f"{paths[0]}: no whole window to train from")
+    return np.stack(found)
+
+
+class Shown:
+    """Progress by stage: bars on a terminal, else a line for every tenth of a stage."""
+
+    def __init__(self) -> None:
+        console = errors()
+        self._bars: Progress | None = None
+        if console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+            self._bars = Progress(*columns, console=console)
+        self._tasks: dict[str, TaskID] = {}
+        self._tenth: tuple[str, int] = ("", -1)
+
+    def __enter__(self) -> Shown:
+        if self._bars is not None:
+            self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bars is not None:
+            self._bars.stop()
+
+    def show(self, stage: str, done: int, total: int, loss: float) -> None:
+        """Called by the training."""
+        if self._bars is not None:
+            task = self._tasks.get(stage)
+            if task is None:
+                task = self._tasks[stage] = self._bars.add_task(stage, total=total)
+            self._bars.update(task, completed=done, description=f"{stage} (loss {loss:.4g})")
+            return
+        tenth = (stage, 10 * done // max(total, 1))
+        if tenth != self._tenth:
+            self._tenth = tenth
+            print(f"{stage}: {done} of {total}, loss {loss:.4g}", file=sys.stderr, flush=True)

@@ -1,0 +1,166 @@
+"""The service: core, application, feeds and server, wired and run."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import NoReturn
+
+import uvicorn
+
+from replay.live import LiveBus
+from service.api.app import create_app
+from service.core import Core, build_core
+from service.engine import load_engine
+from service.errors import UserError
+from service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
+from service.pipeline import Batch
+from service.recordings import file_row, finish_row
+from service.settings import Settings
+from service.store import work
+
+log = logging.getLogger("sprung")
+
+Watch = Callable[[Path, Core], "tuple[OnBatch, Callable[[Fed], None]]"]
+
+
+@dataclass(frozen=True, slots=True)
+class Feeds:
+    """What is fed into the service beside its API."""
+
+    files: tuple[Path, ...] = ()
+    speed: float = 0.0  # times real time; 0: as fast as possible
+    buses: tuple[str, ...] = ()  # INTERFACE:CHANNEL
+    vehicle: str | None = None
+
+
+class Interrupted(Exception):
+    """The service stops while a recording is fed."""
+
+
+def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[str], None]) -> None:
+    """Run until SIGINT or SIGTERM; what was accepted is stored before this returns.
+
+    watch: callbacks that show a recording's progress and outcome; announce: told the address once it is open.
+    Raises UserError for settings, files and buses that cannot be used.
+    """
+    engine = load_engine(settings)
+    listening = _listen(settings)
+    core = build_core(settings, engine)
+    try:
+        buses = [_bus(core, name) for name in feeds.buses]
+    except BaseException:
+        core.close()
+        raise
+    threads = [
+        threading.Thread(target=_feed_files, args=(core, feeds, watch), name="sprung-replay", daemon=True),
+        *(
+            threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), name=f"sprung-{bus.name}", daemon=True)
+            for bus in buses
+        ),
+    ]
+
+    def start_feeds() -> None:
+        for thread in threads:
+            thread.start()
+
+    def stop() -> None:
+        core.stopping.set()
+        for thread in threads:
+            thread.join()
+        core.close()
+
+    host, port = listening.getsockname()[:2]
+    announce(f"http://{f'[{host}]' if ':' in host else host}:{port}")
+    config = uvicorn.Config(
+        create_app(core, start_feeds, stop),
+        log_level="warning",
+        access_log=False,
+        timeout_graceful_shutdown=settings.shutdown_seconds,
+        timeout_keep_alive=30,
+        lifespan="on",
+    )
+    # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
+    previous = signal.signal(signal.SIGTERM, _exit)
+    try:
+        uvicorn.Server(config).run(sockets=[listening])
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+        listening.close()
+
+
+def _exit(_number: int, _frame: FrameType | None) -> NoReturn:
+    sys.exit(0)
+
+
+def _listen(settings: Settings) -> socket.socket:
+    """The socket, before anything else is started, so that a port in use is a plain error."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        listening = socket.socket(family, kind, protocol)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(address)
+    except OSError as error:
+        detail = error.strerror or error
+        raise UserError(f"cannot listen on {settings.host}:{settings.port}: {detail}; choose another --port") from error
+    listening.listen(1024)
+    return listening
+
+
+def _bus(core: Core, name: str) -> LiveBus:
+    interface, separator, channel = name.partition(":")
+    if not separator or not interface or not channel:
+        raise UserError(f"--can {name}: give INTERFACE:CHANNEL, as in socketcan:can0")
+    if core.engine.dbc is None:
+        raise UserError(f"--can {name}: a CAN bus needs a CAN database; name it with --dbc")
+    return LiveBus(interface, channel, core.engine.system.channels, core.engine.dbc, stop=core.stopping)
+
+
+def _feed_bus(core: Core, bus: LiveBus, vehicle: str | None) -> None:
+    name = vehicle_of(vehicle, None, bus.name.replace("/", "_"))
+    try:
+        feed_live(core.pipeline, bus, name, core.stopping, core.tally_counter(bus.name))
+    except Exception:
+        log.exception("the feed of %s ended", bus.name)
+
+
+def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
+    for path in feeds.files:
+        on_batch, on_end = watch(path, core)
+
+        def watched(batch: Batch, on_batch: OnBatch = on_batch) -> None:
+            on_batch(batch)
+            if core.stopping.is_set():
+                raise Interrupted
+
+        try:
+            row = file_row(path)
+            with core.store.write() as connection:
+                work.add_recording(connection, row)
+            fed = feed_file(
+                core.pipeline,
+                path,
+                vehicle=feeds.vehicle,
+                recording_id=row.id,
+                batch_windows=core.settings.batch_windows,
+                speed=feeds.speed,
+                on_batch=watched,
+                on_tally=core.tally_counter("file"),
+            )
+            finish_row(core.store, row, fed)
+            on_end(fed)
+        except Interrupted:
+            return
+        except (ValueError, OSError) as error:
+            log.error("%s", error)
+        except Exception:
+            log.exception("replay of %s failed", path)

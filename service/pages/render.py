@@ -1,0 +1,45 @@
+"""Templates, and how numbers are written in them."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("service.pages"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"quantity": quantity, "percent": percent}
+    return environment
+
+
+def render(template: str, **values: Any) -> str:
+    """A page from a template of this package."""
+    return _environment().get_template(template).render(**values)
+
+
+def quantity(value: float, unit: str) -> str:
+    """`1.201 MN/m`: four digits and the prefix that fits; kilograms keep theirs."""
+    if unit != "kg":
+        for factor, prefix in PREFIXES:
+            if abs(value) >= factor:
+                return f"{value / factor:.4g} {prefix}{unit}"
+    return f"{value:.4g} {unit}"
+
+
+def percent(share: float | None, digits: int = 1) -> str:
+    """`+2.3 %`; a dash where there is nothing to say."""
+    if share is None or not math.isfinite(share):
+        return "–"
+    return f"{100 * share:+.{digits}f} %"

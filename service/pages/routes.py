@@ -1,0 +1,92 @@
+"""`GET /` and the pages behind it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from fastapi import APIRouter
+from fastapi.responses import HTMLResponse
+from sqlalchemy import Connection
+
+from service.api.access import CoreOf, known_vehicle, read
+from service.api.fleet import load_view
+from service.core import Core
+from service.pages.plot import Trace, drift_svg
+from service.pages.render import render
+from service.store import fleet, history, work
+from service.times import to_iso
+from service.views import VehicleView, alarm_dict
+
+router = APIRouter(include_in_schema=False)
+
+SHOWN_VEHICLES = 200
+SHOWN_ALARMS = 50
+PLOT_POINTS = 180
+FOREVER = 2**63 - 1
+HEALTH = {  # NAMUR NE 107
+    "ok": "good",
+    "maintenance_required": "maintenance required",
+    "out_of_specification": "out of specification",
+    "check_function": "check function",
+    "failure": "failure",
+}
+
+
+@router.get("/")
+async def fleet_page(core: CoreOf) -> HTMLResponse:
+    """Every vehicle with its health."""
+
+    def query(connection: Connection) -> list[tuple[fleet.VehicleRow, VehicleView]]:
+        rows = fleet.list_vehicles(connection, SHOWN_VEHICLES)
+        return [(row, load_view(core, connection, row.id)) for row in rows]
+
+    rows = await read(core, query)
+    order = list(HEALTH)
+    rows.sort(key=lambda pair: -order.index(pair[1].health))
+    return HTMLResponse(render("fleet.html", rows=rows, health=HEALTH, system=core.engine.system.name, to_iso=to_iso))
+
+
+@router.get("/pages/vehicles/{id}")
+async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
+    """One vehicle: parameters, drift, alarms, reports."""
+
+    def query(connection: Connection) -> dict[str, Any]:
+        known_vehicle(fleet.vehicle_exists(connection, id), id)
+        view = load_view(core, connection, id)
+        return {
+            "view": view,
+            "plots": _plots(core, connection, view),
+            "alarms": [
+                alarm_dict(row) for row in fleet.list_alarms(connection, id, core.pipeline.model_id, SHOWN_ALARMS)
+            ],
+            "reports": work.list_reports(connection, id, SHOWN_ALARMS),
+            "windows": fleet.window_counts(connection, id, core.pipeline.model_id),
+        }
+
+    values = await read(core, query)
+    return HTMLResponse(render("vehicle.html", **values, health=HEALTH, to_iso=to_iso))
+
+
+def _plots(core: Core, connection: Connection, view: VehicleView) -> list[str]:
+    key = (view.vehicle, core.pipeline.model_id)
+    resolution = history.fitting_resolution(connection, *key, 0, FOREVER, PLOT_POINTS)
+    points = history.history(connection, *key, 0, FOREVER, resolution, 2 * PLOT_POINTS)
+    if not points:
+        return []
+    ratio = np.exp(np.stack([p.mean for p in points]))  # shape (n, P)
+    std = ratio * np.stack([p.std for p in points])
+    times = [p.time for p in points]
+    return [
+        drift_svg(
+            Trace(
+                p.name,
+                times,
+                ratio[:, i],
+                std[:, i],
+                None if p.baseline is None else p.baseline / p.nominal,
+                p.alarm,
+            )
+        )
+        for i, p in enumerate(view.parameters)
+    ]
