@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from model.diagnosis.catalogue import ElementLaw
-from model.diagnosis.forward import Forward, LawForces
+from model.diagnosis.forward import Forward, LawForces, propagate
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.measured import Noise, Part
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
@@ -81,7 +81,7 @@ class Linearisation:
     spectrum: ComplexArray  # the residual itself, (F, S)
     forward: Forward
     forces: LawForces | None
-    deflections: ComplexArray  # of the elements, whole, (F, E)
+    motions: Motions
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ class Fit:
     spectrum: ComplexArray  # unwhitened residual, (F, S)
     forward: Forward
     forces: LawForces | None
-    deflections: ComplexArray
+    motions: Motions
     converged: bool
     iterations: int
     bounded: bool = False  # a law's parameter stopped at its bound
@@ -151,69 +151,78 @@ class Problem:
         spectrum = self.part.sensors - shown - free @ point.state
         if self.whitener is None:
             self.whitener = Whitener.of(forward, self.noise)
-        deflections, motion = _motions(forward, forces, point.state)
-        columns = [self._theta_columns(forward, deflections, motion)]
-        for index, term in enumerate(point.terms):
-            columns.append(self._term_columns(point, index, term, forward, forces, shown))
-        columns.append(free)
-        jacobian = self.whitener(np.concatenate(columns, axis=2), self.part)
-        residual = self.whitener(spectrum, self.part)
-        return Linearisation(residual, jacobian, spectrum, forward, forces, deflections)
-
-    def _theta_columns(
-        self, forward: Forward, deflections: ComplexArray, motion: ComplexArray
-    ) -> ComplexArray:
-        """Sensitivity to log k (log c) of an element: a force along it equal to -k d (-c v) of its own; (F, S, P)."""
-        system, plant = self.system, forward.plant
-        structure = plant.structure
-        columns = np.empty((len(deflections), len(self.sensors), len(system.parameters)), dtype=complex)
-        for i, parameter in enumerate(system.parameters):
-            value = parameter.nominal * np.exp(forward.theta[i])
+        motions = _motions(forward, forces, point.state)
+        P = len(point.theta)
+        count = P + sum(len(t.parameters) for t in point.terms)
+        columns = np.zeros((len(grid.omega), len(self.sensors), count + free.shape[2]), dtype=complex)
+        columns[:, :, count:] = free
+        theta_forces, theta_loads = self._theta_forces(forward, motions)
+        plant = forward.plant
+        elements = [p.element for p in self.system.parameters]
+        for i, parameter in enumerate(self.system.parameters):
             if parameter.quantity == "mass":
-                dofs = structure.body_of_dof == system.bodies.index(parameter.element)
-                inertia = -(plant.grid.omega[:, None] ** 2) * motion[:, dofs] * structure.mass[dofs]
-                columns[:, :, i] = -np.einsum("fsn,fn->fs", plant.sensor_of_load[:, :, dofs], inertia)
-                continue
-            e = system.elements.index(parameter.element)
-            force = value * deflections[:, e]
-            if parameter.quantity == "damping":
-                force = force * 1j * plant.grid.omega
-            columns[:, :, i] = plant.sensor_of_force[:, :, e] * force[:, None]
-        return columns * forward.sensor_factor[:, :, None]
+                columns[:, :, i] = np.einsum("fsn,fn->fs", plant.sensor_of_load, theta_loads[i])
+            else:
+                e = self.system.elements.index(elements[i])
+                np.multiply(plant.sensor_of_force[:, :, e], theta_forces[:, i, None], out=columns[:, :, i])
+        law_forces = np.zeros((len(grid.omega), count - P, 0 if forces is None else len(forces.terms)), dtype=complex)
+        at = P
+        for index, term in enumerate(point.terms):
+            for j in range(len(term.parameters)):
+                if is_waveform(term):
+                    assert forces is not None
+                    port, change = _law_change(forward, forces, term, j)
+                    law_forces[:, at - P, port] = change
+                    columns[:, :, at] = (plant.sensor_of_force @ _wide(forward, forces.ports[port])) * change[:, None]
+                else:
+                    columns[:, :, at] = self._difference(point, index, j, forward, forces, shown)
+                at += 1
+        columns[:, :, :P] *= forward.sensor_factor[:, :, None]
+        waveform = [P + i for i in range(count - P) if np.any(law_forces[0 if len(law_forces) < 2 else 1, i])]
+        columns[:, :, waveform] *= forward.sensor_factor[:, :, None]
+        if forces is not None:
+            along = _port_motions(forward, forces, theta_forces, theta_loads, law_forces, free.shape[2])
+            extra = _tangent(forward, forces, along)
+            through = np.stack([plant.sensor_of_force @ _wide(forward, w) for w in forces.ports], axis=2)
+            columns += (through @ extra) * forward.sensor_factor[:, :, None]
+        jacobian = self.whitener(columns, self.part)
+        residual = self.whitener(spectrum, self.part)
+        return Linearisation(residual, jacobian, spectrum, forward, forces, motions)
 
-    def _term_columns(
+    def _theta_forces(
+        self, forward: Forward, motions: Motions
+    ) -> tuple[ComplexArray, dict[int, ComplexArray]]:
+        """Forces along the own element that act like a rise of log k (log c): (F, P); loads (F, n) of log masses."""
+        omega, structure = forward.plant.grid.omega, forward.plant.structure
+        forces = np.zeros((len(omega), len(self.system.parameters)), dtype=complex)
+        loads = {}
+        for i, parameter in enumerate(self.system.parameters):
+            if parameter.quantity == "mass":
+                dofs = structure.body_of_dof == self.system.bodies.index(parameter.element)
+                loads[i] = np.where(dofs, -structure.mass * motions.acceleration, 0.0)
+                continue
+            value = parameter.nominal * np.exp(forward.theta[i])
+            along = motions.rate if parameter.quantity == "damping" else motions.deflection
+            forces[:, i] = value * along[:, self.system.elements.index(parameter.element)]
+        return forces, loads
+
+    def _difference(
         self,
         point: Point,
         index: int,
-        term: Term,
+        parameter: int,
         forward: Forward,
         forces: LawForces | None,
         shown: ComplexArray,
     ) -> ComplexArray:
-        """Sensitivity to the internal parameters of one term, (F, S, p)."""
-        columns = []
-        values = np.array(term.parameters)
-        for j in range(len(values)):
-            step = _RELATIVE_STEP * (1.0 if term.law.parameters[j].log else max(abs(values[j]), term.scales[j]))
-            moved = term.moved(j, step)
-            if is_waveform(term):
-                assert forces is not None
-                change = (_force(forward, moved, forces) - _force(forward, term, forces)) / step
-                spectrum = forward.part.grid.coarse_spectrum(change)
-                port = np.pad(term.port(self.system), (0, forward.plant.structure.H.shape[0] - forward.elements))
-                column = (forward.plant.sensor_of_force @ port) * spectrum[:, None] * forward.sensor_factor
-            else:
-                terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
-                other, other_forward, _ = self.predict(replace(point, terms=terms), _start(forces))
-                column = (other - shown) / step
-                if other_forward.plant.structure.mass.shape == forward.plant.structure.mass.shape:
-                    grid = self.part.grid
-                    free = other_forward.free_rows() - forward.free_rows()
-                    column = column + grid.forward(free @ point.state) / step
-            columns.append(column)
-        if not columns:
-            return np.zeros((*shown.shape, 0), dtype=complex)
-        return np.stack(columns, axis=2)
+        """Sensitivity to one parameter of a term by a finite difference of the whole model, (F, S)."""
+        term = point.terms[index]
+        step = _step_of(term, parameter)
+        moved = term.moved(parameter, step)
+        terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
+        other, other_forward, _ = self.predict(replace(point, terms=terms), _start(forces))
+        free = other_forward.free_rows() - forward.free_rows()
+        return (other - shown + self.part.grid.forward(free @ point.state)) / step
 
     def smooth(self, spectrum: ComplexArray, residual: FloatArray) -> None:
         """Update the smoothed inputs from a residual; where the model misfits, the noise keeps its prior size."""
@@ -271,6 +280,103 @@ def _loads(forward: Forward, term: Term) -> ComplexArray | float:
     return forward.plant.sensor_of_load[:, :, dof] * spectrum[:, None] * forward.sensor_factor
 
 
+def _step_of(term: Term, parameter: int) -> float:
+    """Step of a finite difference in a term's internal parameter."""
+    if term.law.parameters[parameter].log:
+        return _RELATIVE_STEP
+    return _RELATIVE_STEP * max(abs(term.parameters[parameter]), term.scales[parameter])
+
+
+def _law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) -> tuple[int, ComplexArray]:
+    """Port of a law and the spectrum of its force's derivative along the present trajectory, (F,)."""
+    step = _step_of(term, parameter)
+    change = (_force(forward, term.moved(parameter, step), forces) - _force(forward, term, forces)) / step
+    port = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    return port, forward.part.grid.coarse_spectrum(change)
+
+
+def _wide(forward: Forward, port: FloatArray) -> FloatArray:
+    """A port's weights over the plant's elements, which may be more than the system's."""
+    return np.pad(port, (0, len(forward.plant.structure.H) - len(port)))
+
+
+def _port_motions(
+    forward: Forward,
+    forces: LawForces,
+    theta_forces: ComplexArray,
+    theta_loads: dict[int, ComplexArray],
+    law_forces: ComplexArray,
+    states: int,
+) -> FloatArray:
+    """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns)."""
+    plant, grid = forward.plant, forward.part.grid
+    structure = plant.structure
+    ports = np.array([_wide(forward, w) for w in forces.ports])
+    P, p = theta_forces.shape[1], law_forces.shape[1]
+    spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
+    of_force = ports @ plant.deflection_of_force  # (F, m, E)
+    for i, parameter in enumerate(forward.system.parameters):
+        if i in theta_loads:
+            spectra[:, :, i] = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, theta_loads[i])
+        else:
+            e = forward.system.elements.index(parameter.element)
+            spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
+    spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
+    rows = ports @ structure.H
+    both = np.vstack([np.hstack([rows, np.zeros_like(rows)]), np.hstack([np.zeros_like(rows), rows])])
+    free = plant.free_motion(both, grid.step, grid.samples).reshape(grid.samples, 2, len(ports), states)
+    result = np.empty((2, grid.samples, len(ports), P + p + states))
+    result[0, :, :, : P + p] = grid.inverse(spectra)
+    result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
+    result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
+    return result
+
+
+def _tangent(forward: Forward, forces: LawForces, motions: FloatArray, rounds: int = 6) -> ComplexArray:
+    """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
+
+    The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant by
+    Neumann's series.  Laws with memory have no tangent in one instant; for them the preload stands.
+    """
+    plant, grid = forward.plant, forward.part.grid
+    slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
+    ports = np.array([_wide(forward, w) for w in forces.ports])
+    compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
+    answer = np.zeros((len(grid.omega), *motions.shape[2:]), dtype=complex)
+    d, v = motions
+    last = np.inf
+    for _ in range(rounds):
+        force = slopes[0, :, :, None] * d + slopes[1, :, :, None] * v
+        proposal = grid.forward(force)
+        change = float(np.linalg.norm(proposal - answer))
+        if change > 2 * last:
+            break
+        answer, last = proposal, change
+        moved = compliance @ answer
+        d = motions[0] + grid.inverse(moved)
+        v = motions[1] + grid.inverse(1j * grid.omega[:, None, None] * moved)
+    return answer
+
+
+def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
+    """Derivatives of a law's force by deflection and rate along the trajectory, less the preload, (2, N)."""
+    term = forces.terms[i]
+    grid = forward.part.grid
+    if term.law.memory:
+        return np.zeros((2, grid.samples))
+    d, v = forces.deflection[:, i], forces.rate[:, i]
+    time = grid.start + grid.fine_time
+    element = forward.element_of(term)
+    result = np.empty((2, grid.samples))
+    for k, (signal, load) in enumerate(((d, term.preload[0]), (v, term.preload[1]))):
+        step = 1e-3 * float(np.std(signal)) + 1e-300
+        moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
+        up, down = (force_along(term.law, term.parameters, d + a, v + b, time, element) for a, b in moves)
+        slope = ((up - down) / (2 * step)).reshape(-1, OVERSAMPLING).mean(axis=1)
+        result[k] = slope - load
+    return result
+
+
 def _force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
     i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
     grid = forward.part.grid
@@ -284,35 +390,42 @@ def _force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
     )
 
 
-def _motions(
-    forward: Forward, forces: LawForces | None, state: FloatArray
-) -> tuple[ComplexArray, ComplexArray]:
-    """Whole spectra of deflections (F, elements) and of the degrees of freedom (F, n)."""
+@dataclass(frozen=True)
+class Motions:
+    """Whole motion of a part as spectra: rates are transformed on their own, since a record's ends do not meet."""
+
+    deflection: ComplexArray  # (F, elements)
+    rate: ComplexArray  # (F, elements)
+    acceleration: ComplexArray  # of the degrees of freedom, (F, n); empty when no mass is estimated
+
+
+def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> Motions:
     plant, grid, part = forward.plant, forward.part.grid, forward.part
     s = plant.structure
     n = len(s.mass)
+    jw = 1j * grid.omega[:, None]
     q_poly, d_poly = forward.polynomial
-    deflections = forward.linear_deflection + grid.monomial_spectra @ d_poly
-    needs_motion = any(p.quantity == "mass" for p in forward.system.parameters)
-    from model.diagnosis.forward import _propagate
-
-    free = _propagate(s.state_matrix(), np.eye(n, 2 * n), state, grid.step, grid.samples)
-    free_spectrum = grid.forward(free)
-    deflections = deflections + free_spectrum @ s.H.T
-    motion = np.zeros((0, 0), dtype=complex)
+    periodic = forward.linear_deflection
     if forces is not None:
-        deflections = deflections + forces.deflections + grid.monomial_spectra @ (forces.motion @ s.H.T)
-    if needs_motion:
-        loads = -(plant.impedance[:, None, :] * s.H.T) @ s.G if part.support.shape[1] else None
-        motion = grid.monomial_spectra @ q_poly + free_spectrum
-        if loads is not None:
-            motion = motion + np.einsum("fnm,fmi,fi->fn", plant.receptance, loads, part.support, optimize=True)
+        periodic = periodic + forces.deflections
+        q_poly, d_poly = q_poly + forces.motion, d_poly + forces.motion @ s.H.T
+    A = s.state_matrix()
+    free = propagate(A, np.eye(2 * n), state, grid.step, grid.samples)
+    d = periodic + grid.monomial_spectra @ d_poly + grid.forward(free[:, :n] @ s.H.T)
+    v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n:] @ s.H.T)
+    acceleration = np.zeros((len(grid.omega), 0), dtype=complex)
+    if any(p.quantity == "mass" for p in forward.system.parameters):
+        q = np.zeros((len(grid.omega), n), dtype=complex)
+        if part.support.shape[1]:
+            loads = -(plant.impedance[:, None, :] * s.H.T) @ s.G
+            q += np.einsum("fnm,fmi,fi->fn", plant.receptance, loads, part.support, optimize=True)
         if part.force.shape[1]:
-            F = s.F[:, : part.force.shape[1]]
-            motion = motion + np.einsum("fnm,fm->fn", plant.receptance, part.force @ F.T)
+            q += np.einsum("fnm,fm->fn", plant.receptance, part.force @ s.F[:, : part.force.shape[1]].T)
         if forces is not None:
-            motion = motion + forces.q + grid.monomial_spectra @ forces.motion
-    return deflections[:, : forward.elements], motion
+            q += forces.q
+        bend = plant.derivative(plant.derivative(q_poly))
+        acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
+    return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
 
 
 def _preloaded(problem: Problem, point: Point) -> Point:
@@ -396,7 +509,7 @@ def _finish(problem: Problem, point: Point, lin: Linearisation, converged: bool,
         spectrum=lin.spectrum,
         forward=lin.forward,
         forces=lin.forces,
-        deflections=lin.deflections,
+        motions=lin.motions,
         converged=converged,
         iterations=count,
         bounded=any(t.bounded for t in point.terms),

@@ -179,7 +179,7 @@ class Forward:
         rows = ports @ H
         both = np.vstack([np.hstack([rows, np.zeros_like(rows)]), np.hstack([np.zeros_like(rows), rows])])
         A = plant.structure.state_matrix()
-        free = _propagate(A, both, state, grid.step / OVERSAMPLING, len(d))
+        free = propagate(A, both, state, grid.step / OVERSAMPLING, len(d))
         return d + free[:, : len(ports)], v + free[:, len(ports) :]
 
     def law_forces(self, state: FloatArray) -> LawForces | None:
@@ -217,7 +217,7 @@ def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
     return result
 
 
-def _propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, count: int) -> FloatArray:
+def propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, count: int) -> FloatArray:
     """rows e^{A t} state at t = 0, step, ...: (count, len(rows)), states by doubling."""
     power = expm(A * step)
     states = np.empty((count, len(state)))
