@@ -1,0 +1,344 @@
+"""One recording, written by other people's writers in every format, reads the same through every reader."""
+
+import json
+from collections import defaultdict
+
+import can
+import numpy as np
+import pytest
+from cantools.database.can import Database, Message, Signal
+from cantools.database.conversion import BaseConversion
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.writer import Writer as ProtobufWriter
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from model.signals import Channel
+from replay import UnreadableRecording, open_recording
+
+START = 1_790_000_000_000_000_000
+STEP = 10_000_000
+ROWS = 300
+CHANNELS = [
+    Channel("left", "m/s^2", 0.01, mcap="/body/acceleration.left", can="Body.Left", csv="left"),
+    Channel("right", "m/s^2", 0.01, mcap="/body/acceleration.axes[1].right", can="Body.Right", csv="right"),
+]
+NUMBERS = np.arange(ROWS)
+LEFT, RIGHT = np.round(np.sin(NUMBERS / 7.0), 3), np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
+VALUES = np.stack([LEFT, RIGHT], axis=1)
+TIMES = START + NUMBERS * STEP
+
+
+def document(row):
+    return {"left": LEFT[row], "axes": [{"right": 0.0}, {"right": RIGHT[row]}]}
+
+
+def write_json(path, *, chunk=4096, compression=CompressionType.ZSTD, close=True, chunked=True, crcs=True):
+    with path.open("wb") as file:
+        writer = Writer(
+            file, chunk_size=chunk, compression=compression, use_chunking=chunked, enable_crcs=crcs
+        )
+        writer.start()
+        writer.add_metadata("recording", {"vehicle": "tram-7"})
+        schema = writer.register_schema("Body", "jsonschema", b'{"type": "object"}')
+        body = writer.register_channel("/body/acceleration", "json", schema)
+        other = writer.register_channel("/door/state", "json", schema)
+        for row in range(ROWS):
+            time = int(TIMES[row])
+            writer.add_message(body, time + 3_000_000, json.dumps(document(row)).encode(), time, row)
+            if row % 10 == 0:
+                writer.add_message(other, time, b'{"open": false}', time, row)
+        if close:
+            writer.finish()
+
+
+def protobuf_class():
+    """message Body { Timestamp timestamp; double left; repeated Axis axes; }"""
+    file = descriptor_pb2.FileDescriptorProto(name="body.proto", package="t", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    axis = file.message_type.add(name="Axis")
+    axis.field.add(name="right", number=1, type=1, label=1)
+    body = file.message_type.add(name="Body")
+    body.field.add(name="timestamp", number=1, type=11, label=1, type_name=".google.protobuf.Timestamp")
+    body.field.add(name="left", number=2, type=1, label=1)
+    body.field.add(name="axes", number=3, type=11, label=3, type_name=".t.Axis")
+    pool = descriptor_pool.DescriptorPool()
+    timestamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+    pool.Add(timestamp)
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Body"))
+
+
+def write_protobuf(path):
+    kind = protobuf_class()
+    with path.open("wb") as file, ProtobufWriter(file) as writer:
+        for row in range(ROWS):
+            message = kind(left=LEFT[row], axes=[{"right": 0.0}, {"right": RIGHT[row]}])
+            message.timestamp.FromNanoseconds(int(TIMES[row]))
+            late = int(TIMES[row]) + 7_000_000  # the stamp inside counts, not this
+            writer.write_message("/body/acceleration", message, late, late)
+
+
+ROS_BODY = """std_msgs/Header header
+float64 left
+Axis[] axes
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: test_msgs/Axis
+float32 right
+"""
+
+
+def write_ros2(path, stamped=True):
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        schema = writer.register_msgdef("test_msgs/Body", ROS_BODY)
+        for row in range(ROWS):
+            stamp = int(TIMES[row]) if stamped else 0
+            header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "b"}
+            late = int(TIMES[row]) + (7_000_000 if stamped else 0)
+            writer.write_message("/body/acceleration", schema, {"header": header, **document(row)}, late, late)
+        writer.finish()
+
+
+def database():
+    conversion = BaseConversion.factory(scale=0.001, offset=0)
+    wide = {"is_signed": True, "conversion": conversion, "minimum": -30, "maximum": 30}
+    signals = [Signal("Left", 0, 16, **wide), Signal("Right", 23, 16, byte_order="big_endian", **wide)]
+    return Database([Message(0x310, "Body", 8, signals)])
+
+
+def frame(row, frame_id=0x310, **options):
+    data = database_message.encode({"Left": LEFT[row], "Right": RIGHT[row]})
+    return can.Message(
+        timestamp=int(TIMES[row]) / 1e9, arbitration_id=frame_id, is_extended_id=False, data=data, **options
+    )
+
+
+database_message = database().messages[0]
+
+
+def write_can(path):
+    """Every tenth cycle brings a frame of another id, an extended one, a remote frame and an error frame."""
+    with can.Logger(str(path)) as logger:
+        for row in range(ROWS):
+            logger.on_message_received(frame(row, channel=0))
+            if row % 10 == 0:
+                stamp = int(TIMES[row]) / 1e9
+                extra = {"timestamp": stamp, "channel": 0}
+                logger.on_message_received(can.Message(arbitration_id=0x311, is_extended_id=False, data=b"1", **extra))
+                logger.on_message_received(can.Message(arbitration_id=0x310, data=b"12345678", **extra))
+                remote = can.Message(arbitration_id=0x310, is_extended_id=False, is_remote_frame=True, dlc=8, **extra)
+                logger.on_message_received(remote)
+
+
+def write_csv(path):
+    rows = [f"{NUMBERS[i] / 100:.2f},{RIGHT[i]},{LEFT[i]},x" for i in range(ROWS)]
+    path.write_text("\n".join(["time,right,left,note", *rows]) + "\n")
+
+
+@pytest.fixture
+def dbc(tmp_path):
+    path = tmp_path / "body.dbc"
+    path.write_text(database().as_dbc_string())
+    return path
+
+
+def read(path, dbc=None, channels=CHANNELS, **options):
+    """(recording, {channel: (times, values)})."""
+    recording = open_recording(path, channels, dbc=dbc, **options)
+    parts = defaultdict(list)
+    for block in recording.blocks():
+        for index in range(len(channels)):
+            own = block.channel == index
+            parts[index].append((block.time[own], block.value[own]))
+    return recording, {
+        index: (np.concatenate([t for t, _ in found]), np.concatenate([v for _, v in found]))
+        for index, found in parts.items()
+    }
+
+
+WRITERS = {
+    "json.mcap": write_json,
+    "protobuf.mcap": write_protobuf,
+    "ros2.mcap": write_ros2,
+    "can.blf": write_can,
+    "can.asc": write_can,
+    "can.log": write_can,
+    "can.mf4": write_can,
+    "table.csv": write_csv,
+}
+FOREIGN = {"json.mcap": 30, "can.blf": 90, "can.asc": 90, "can.log": 90, "can.mf4": 60}  # MF4 holds no remote frames
+
+
+@pytest.mark.parametrize("name", WRITERS)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_every_reader_gives_every_sample_and_counts_every_message(name, tmp_path, dbc):
+    if name.endswith("mf4"):
+        pytest.importorskip("asammdf")
+    path = tmp_path / name
+    WRITERS[name](path)
+    recording, samples = read(path, dbc)
+    start = 0 if name.endswith("csv") else START
+    for index in range(2):
+        times, values = samples[index]
+        tolerance = 2_000 if "can" in name else 0  # python-can writes float seconds
+        assert np.abs(times - (start + NUMBERS * STEP)).max() <= tolerance
+        assert np.abs(values - VALUES[:, index]).max() < (1e-6 if name == "ros2.mcap" else 1e-12)
+    tally = recording.tally
+    assert tally.as_dict() == {
+        "used": ROWS,
+        "repaired": 0,
+        "dropped": 0,
+        "corrupt": 0,
+        "foreign": FOREIGN.get(name, 0),
+    }
+    assert sum(tally.reasons.values()) == tally.foreign
+    assert recording.problems == []
+    assert not recording.incomplete
+    assert recording.vehicle == ("tram-7" if name == "json.mcap" else None)
+
+
+@pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
+@pytest.mark.parametrize("chunked", [True, False])
+def test_mcap_of_every_compression_reads_the_same(compression, chunked, tmp_path):
+    path = tmp_path / "a.mcap"
+    write_json(path, compression=compression, chunked=chunked)
+    recording, samples = read(path)
+    assert np.array_equal(samples[0][1], LEFT)
+    assert (recording.tally.used, recording.tally.foreign) == (ROWS, 30)
+
+
+def test_the_time_of_mcap_messages_can_be_chosen_by_channel(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_ros2(path)
+    assert np.array_equal(read(path)[1][0][0], TIMES)
+    assert np.array_equal(read(path, time_source="log")[1][0][0], TIMES + 7_000_000)
+    _, samples = read(path, time_source={"right": "publish"})
+    assert np.array_equal(samples[0][0], TIMES)
+    assert np.array_equal(samples[1][0], TIMES + 7_000_000)
+    write_json(path)
+    assert np.array_equal(read(path)[1][0][0], TIMES)
+    assert np.array_equal(read(path, time_source="log")[1][0][0], TIMES + 3_000_000)
+    with pytest.raises(UnreadableRecording, match="time source 'clock' is not known"):
+        read(path, time_source="clock")
+
+
+def test_an_empty_header_stamp_gives_way_to_the_publish_time(tmp_path):
+    path = tmp_path / "a.mcap"
+    write_ros2(path, stamped=False)
+    assert np.array_equal(read(path)[1][0][0], TIMES)
+
+
+def test_json_values_that_are_no_numbers_are_missing(tmp_path):
+    path = tmp_path / "a.mcap"
+    odd = ['{"left": null}', '{"left": "1.5"}', '{"left": true}', "{}", '{"left": NaN}', "[1]", '{"left": 2}', "{broken"]
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        body = writer.register_channel("/body/acceleration", "json", 0)
+        for row, text in enumerate(odd):
+            writer.add_message(body, int(TIMES[row]), text.encode(), int(TIMES[row]), row)
+        writer.finish()
+    recording, samples = read(path, channels=CHANNELS[:1])
+    assert np.isnan(samples[0][1]).tolist() == [True] * 6 + [False]
+    assert recording.tally.as_dict() == {"used": 1, "repaired": 0, "dropped": 6, "corrupt": 1, "foreign": 0}
+    assert recording.incomplete
+
+
+def test_csv_cells_that_are_empty_are_missing_and_rows_that_are_broken_are_corrupt(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time;left;right\n0.00;1;\n0.01;;\n0.02;NaN;4\nx;1;2\n0.03;1\n0.04;5;6\n;7;8\n")
+    recording, samples = read(path)
+    assert samples[0][0].tolist() == [0, 10_000_000, 20_000_000, 40_000_000]
+    assert np.array_equal(samples[0][1], [1, np.nan, np.nan, 5], equal_nan=True)
+    assert recording.tally.as_dict() == {"used": 3, "repaired": 0, "dropped": 1, "corrupt": 3, "foreign": 0}
+
+
+def test_asc_in_decimal_with_relative_stamps_and_fd_frames(tmp_path):
+    path = tmp_path / "a.asc"
+    message = Message(784, "Body", 16, [Signal("Left", 64, 8, minimum=0, maximum=255)], is_fd=True)
+    dbc = tmp_path / "fd.dbc"
+    dbc.write_text(Database([message]).as_dbc_string())
+    data = " ".join(str(i) for i in range(16))
+    path.write_text(
+        "date Mon Sep 21 02:13:20.500 pm 2026\nbase dec  timestamps relative\ninternal events logged\n"
+        f"   0.100000 CANFD   1 Rx        784  Body   1 0 10 16 {data} 0 0\n"
+        f"   0.100000 CANFD   1 Rx        784   1 0 10 16 {data} 0 0\n"
+        "   0.050000 1  784             Rx   d 2 1 2\n"
+        "   0.050000 1  Statistic: D 0 R 0\n"
+        "   0.050000 1  ErrorFrame\n"
+    )
+    recording, samples = read(path, dbc, CHANNELS[:1])
+    times, values = samples[0]
+    assert values.tolist() == [8.0, 8.0]
+    assert np.diff(times).tolist() == [100_000_000]
+    assert recording.tally.as_dict() == {"used": 2, "repaired": 0, "dropped": 0, "corrupt": 1, "foreign": 1}
+
+
+def test_candump_fd_and_extended_frames(tmp_path, dbc):
+    path = tmp_path / "a.log"
+    path.write_text(
+        "(1790000000.000001) vcan0 310#0100000200000000\n(1790000000.010001) vcan0 00000310#0100000200000000 R\n"
+        "(1790000000.020001) vcan0 310##1" + "01" * 12 + "\n(1790000000.030001) vcan0 310#R8\n"
+        "(1790000000.040001) vcan0 20000004#0000\n"
+    )
+    recording, samples = read(path, dbc)
+    assert samples[0][0].tolist() == [START + 1_000, START + 20_001_000]
+    assert samples[0][1].tolist() == [0.001, 0.257]
+    assert recording.tally.as_dict() == {"used": 2, "repaired": 0, "dropped": 0, "corrupt": 0, "foreign": 3}
+
+
+def test_wrong_use_is_one_clear_line(tmp_path, dbc):
+    def complaint(path, database=None, channels=CHANNELS):
+        with pytest.raises(UnreadableRecording) as error:
+            read(path, database, channels)
+        assert "\n" not in str(error.value)
+        return str(error.value)
+
+    assert "no such file" in complaint(tmp_path / "none.mcap")
+    (tmp_path / "a.xyz").write_bytes(b"1")
+    assert "known are .mcap .blf .asc .log .mf4 .csv" in complaint(tmp_path / "a.xyz")
+    for name in ("a.mcap", "a.blf", "a.asc", "a.log", "a.csv"):
+        (tmp_path / name).write_bytes(b"\x00\xff\x13 some other file \x80\n" * 50)
+        assert complaint(tmp_path / name, dbc).startswith(str(tmp_path / name))
+        (tmp_path / name).write_bytes(b"")
+        assert complaint(tmp_path / name, dbc).startswith(str(tmp_path / name))
+    write_can(tmp_path / "b.blf")
+    assert "needs a CAN database" in complaint(tmp_path / "b.blf")
+    write_csv(tmp_path / "b.csv")
+    typo = [Channel("left", "m", 1.0, csv="lefd")]
+    assert "'lefd' (nearest: left" in complaint(tmp_path / "b.csv", channels=typo)
+    (tmp_path / "c.csv").write_text("Time,left\n0,1\n")
+    assert "no column 'time'" in complaint(tmp_path / "c.csv")
+    for path in (tmp_path / "b.csv", tmp_path / "b.blf"):
+        assert "names no" in complaint(path, dbc, [Channel("x", "m", 1.0, mcap="/a.b")])
+
+
+def test_a_recording_without_any_of_the_channels_says_what_it_holds(tmp_path):
+    write_json(tmp_path / "a.mcap")
+    with pytest.raises(UnreadableRecording, match=r"it holds /body/acceleration \(300\), /door/state \(30\)"):
+        read(tmp_path / "a.mcap", channels=[Channel("x", "m", 1.0, mcap="/car/acceleration.left")])
+    other = tmp_path / "other.dbc"
+    other.write_text(Database([Message(0x99, "Other", 8, [Signal("s", 0, 8)])]).as_dbc_string())
+    write_can(tmp_path / "a.blf")
+    with pytest.raises(UnreadableRecording, match=r"it holds 0x310 \(300\), 0x311 \(30\), 0x00000310 \(30\)"):
+        read(tmp_path / "a.blf", other, [Channel("x", "m", 1.0, can="Other.s")])
+
+
+def test_channels_that_never_come_are_named(tmp_path):
+    write_json(tmp_path / "a.mcap")
+    lacking = Channel("roof", "m", 1.0, mcap="/body/acceleration.leftt")
+    recording, _ = read(tmp_path / "a.mcap", channels=[CHANNELS[0], lacking])
+    assert recording.seen.tolist() == [True, False]
+    assert any("no field 'leftt'; nearest: left" in line for line in recording.problems)
+    assert any(line == "no values of roof" for line in recording.problems)
+    assert not recording.incomplete
