@@ -1,0 +1,255 @@
+"""The vehicle, drawn from its system file in oblique projection, with what was located in colour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Polygon
+
+from model.schema import ElementSensor, ForceInput
+from model.system import System
+from service.report import ink
+
+Point = tuple[float, float]
+
+STOREY = 2.3  # drawn height between a body and what carries it
+THICKNESS = 0.75  # drawn height of a body
+BODY = "#dfe6ec"
+LINE = "#52606d"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where everything stands: levels count the storeys from the ground up."""
+
+    system: System
+    level: Mapping[str, int]
+    half_length: Mapping[str, float]  # m, of each body along x
+    slant: float  # sideways shift per metre of y
+    rise: float
+
+    def at(self, x: float, y: float, height: float) -> Point:
+        """Projection: the left side (y > 0) lies behind, up and to the right."""
+        return x + self.slant * y, height + self.rise * y
+
+    def bottom(self, name: str) -> float:
+        """Drawn height of the underside of a body, 0 for the ground and supports."""
+        return STOREY * self.level[name] if name in self.level else 0.0
+
+    def top(self, name: str) -> float:
+        return self.bottom(name) + THICKNESS if name in self.level else 0.0
+
+    def element_position(self, element: str) -> Point:
+        """(x, y) of an element; the body's own position where the file gives none."""
+        item = self.system.file.elements[element]
+        if item.position is not None:
+            return item.position
+        body = item.upper if item.upper in self.level else item.lower
+        position = self.system.file.bodies[body].position
+        return float(position[0]), float(position[1])
+
+
+def lay_out(system: System) -> Layout:
+    """Levels by what carries what; lengths by where elements are attached."""
+    file = system.file
+    level = dict.fromkeys(file.bodies, 1)
+    for _ in file.bodies:
+        for element in file.elements.values():
+            if element.upper in level and element.lower in level and element.upper != element.lower:
+                level[element.upper] = min(max(level[element.upper], level[element.lower] + 1), len(level))
+    reach: dict[str, float] = {}
+    for name, body in file.bodies.items():
+        away = [
+            abs(item.position[0] - body.position[0])
+            for item in file.elements.values()
+            if item.position is not None and name in (item.upper, item.lower)
+        ]
+        reach[name] = 1.25 * max(away, default=0.0) + 0.35
+    single = all(item.position is None for item in file.elements.values())
+    return Layout(system, level, reach, 0.0 if single else 0.62, 0.0 if single else 0.34)
+
+
+def _body(axes: Axes, layout: Layout, name: str, colour: str, edge: str) -> None:
+    body = layout.system.file.bodies[name]
+    x, y = body.position
+    half, side = layout.half_length[name], 1.0 if layout.slant else 0.0
+    low, high = layout.bottom(name), layout.top(name)
+    corners = [(x - half, -side), (x + half, -side), (x + half, side), (x - half, side)]
+    lower = [layout.at(px, py + y, low) for px, py in corners]
+    upper = [layout.at(px, py + y, high) for px, py in corners]
+    order = 10 * layout.level[name]
+    front = [lower[0], lower[1], upper[1], upper[0]]
+    right = [lower[1], lower[2], upper[2], upper[1]]
+    for face, shade in ((right, 0.80), (upper, 1.0), (front, 0.9)):
+        axes.add_patch(
+            Polygon(face, closed=True, facecolor=colour, edgecolor=edge, lw=1.1, alpha=shade, zorder=order + 5)
+        )
+    middle = layout.at(x - half + 0.25, -side + y, (low + high) / 2)
+    axes.text(*middle, name, va="center", ha="left", fontsize=8.5, color="#243b53", zorder=order + 6)
+
+
+def _spring(axes: Axes, foot: Point, head: Point, colour: str, width: float, order: float) -> None:
+    """A zigzag spring with a damper to its right."""
+    (x, low), (_, high) = foot, head
+    turns = np.linspace(low, high, 13)
+    swing = np.r_[0, 0, np.tile([0.13, -0.13], 5)[:9], 0, 0] if len(turns) == 13 else np.zeros(len(turns))
+    axes.plot(x - 0.16 + swing, turns, color=colour, lw=width, zorder=order, solid_joinstyle="round")
+    x += 0.2
+    cup, rod = low + 0.35 * (high - low), low + 0.55 * (high - low)
+    wide = 0.11
+    axes.plot([x, x], [low, cup], color=colour, lw=width, zorder=order)
+    axes.plot(
+        [x - wide, x - wide, x + wide, x + wide],
+        [rod + 0.25, cup, cup, rod + 0.25],
+        color=colour,
+        lw=width,
+        zorder=order,
+    )
+    axes.plot([x - wide * 0.7, x + wide * 0.7], [rod, rod], color=colour, lw=width, zorder=order)
+    axes.plot([x, x], [rod, high], color=colour, lw=width, zorder=order)
+
+
+def _element(axes: Axes, layout: Layout, name: str, colour: str, width: float) -> Point:
+    item = layout.system.file.elements[name]
+    x, y = layout.element_position(name)
+    upper, lower = item.upper, item.lower
+    if layout.bottom(lower) > layout.bottom(upper):
+        upper, lower = lower, upper
+    foot, head = layout.at(x, y, layout.top(lower)), layout.at(x, y, layout.bottom(upper))
+    order = 10 * max(layout.level.get(upper, 0), layout.level.get(lower, 0)) + (-3 if y > 0 else 8)
+    _spring(axes, foot, head, colour, width, order)
+    return foot[0], (foot[1] + head[1]) / 2
+
+
+def _support(axes: Axes, layout: Layout, name: str, colour: str) -> Point:
+    """A wheel under the element that stands on the support."""
+    x, y = next(
+        layout.element_position(e) for e, i in layout.system.file.elements.items() if name in (i.upper, i.lower)
+    )
+    centre = layout.at(x, y, -0.42)
+    order = -2 if y > 0 else 9
+    axes.add_patch(Circle(centre, 0.42, facecolor="#f4f6f8", edgecolor=colour, lw=1.5, zorder=order))
+    axes.add_patch(Circle(centre, 0.08, facecolor=colour, edgecolor="none", zorder=order))
+    return centre
+
+
+def _sensor(axes: Axes, layout: Layout, name: str, colour: str, size: float) -> Point:
+    sensor = layout.system.file.sensors[name]
+    if isinstance(sensor, ElementSensor):
+        x, y = layout.element_position(sensor.element)
+        place = layout.at(x + 0.4, y, layout.bottom(layout.system.file.elements[sensor.element].upper) - 0.4)
+    else:
+        body = layout.system.file.bodies[sensor.body]
+        x, y = sensor.position if sensor.position is not None else body.position
+        place = layout.at(x, y, layout.top(sensor.body) + 0.06)
+    order = 10 * 9 if colour == ink.HIGHLIGHT else 10 * 8
+    axes.plot(*place, marker="v", ms=size, color=colour, mec="white", mew=0.6, zorder=order)
+    return place
+
+
+def _force(axes: Axes, layout: Layout, name: str, colour: str) -> Point:
+    source = layout.system.file.inputs[name]
+    assert isinstance(source, ForceInput)
+    body = layout.system.file.bodies[source.body]
+    x, y = source.position if source.position is not None else body.position
+    across, height = layout.at(x, y, layout.top(source.body))
+    tip = (across - 0.18, height)
+    tail = (tip[0], tip[1] + 0.9)
+    axes.annotate("", xy=tip, xytext=tail, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.8})
+    axes.text(tail[0] - 0.1, tail[1] - 0.1, name, fontsize=8.5, color=colour, ha="right")
+    return tail
+
+
+def _shade(score: float, best: float) -> tuple[str, float]:
+    """Grey to red by how much of the best score a place reaches (square root, so that weak ones show)."""
+    part = float(np.sqrt(max(score, 0.0) / best)) if best > 0 else 0.0
+    grey, red = np.array([0x52, 0x60, 0x6D]), np.array([0xC1, 0x12, 0x1F])
+    mixed = np.round(grey + (red - grey) * min(part, 1.0) * 0.6).astype(int)
+    return "#{:02x}{:02x}{:02x}".format(*mixed), 1.3
+
+
+def draw_system(system: System, findings: Mapping[str, str], scores: Mapping[str, float]) -> Figure:
+    """The drawing; `findings` maps a located element, body, sensor or input to the words beside it."""
+    layout = lay_out(system)
+    with rc_context(ink.RC):
+        figure = ink.new_figure(10.5, 4.4)
+        axes = figure.add_subplot()
+        ink.bare(axes)
+        places = _draw_parts(axes, layout, findings, scores)
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        low, high = axes.get_ylim()
+        axes.set_ylim(low - 0.3, high + 0.4 + 1.5 * bool(findings))
+        _call_out(axes, layout, places, findings)
+    return figure
+
+
+def _draw_parts(
+    axes: Axes, layout: Layout, findings: Mapping[str, str], scores: Mapping[str, float]
+) -> dict[str, Point]:
+    file, places = layout.system.file, dict[str, Point]()
+    best = max((scores.get(name, 0.0) for name in file.elements), default=0.0)
+    owners = {place.split(".")[0] for place in findings}
+    for name in sorted(file.bodies, key=lambda n: layout.level[n]):
+        found = name in owners
+        _body(axes, layout, name, "#f6c9cd" if found else BODY, ink.HIGHLIGHT if found else LINE)
+        x, y = file.bodies[name].position
+        places[name] = layout.at(x, y, layout.top(name))
+    for name in file.elements:
+        colour, width = _shade(scores.get(name, 0.0), best) if findings else (LINE, 1.3)
+        if name in owners:
+            colour, width = ink.HIGHLIGHT, 2.8
+        places[name] = _element(axes, layout, name, colour, width)
+    for name, source in file.inputs.items():
+        colour = ink.HIGHLIGHT if name in owners else LINE
+        draw = _force if isinstance(source, ForceInput) else _support
+        places[name] = draw(axes, layout, name, colour)
+    for name in file.sensors:
+        found = name in owners
+        places[name] = _sensor(axes, layout, name, ink.HIGHLIGHT if found else "#3a86c8", 11 if found else 6)
+    _ground(axes, layout)
+    return places
+
+
+def _ground(axes: Axes, layout: Layout) -> None:
+    """Rails under supports, a hatched line under elements that stand on the ground."""
+    file = layout.system.file
+    rails: dict[float, list[float]] = {}
+    for name, item in file.elements.items():
+        x, y = layout.element_position(name)
+        if item.lower not in file.bodies or item.upper not in file.bodies:
+            rails.setdefault(y, []).append(x)
+    on_wheels = any(not isinstance(source, ForceInput) for source in file.inputs.values())
+    for y, along in rails.items():
+        height = -0.84 if on_wheels else 0.0
+        start, end = layout.at(min(along) - 1.2, y, height), layout.at(max(along) + 1.2, y, height)
+        axes.plot([start[0], end[0]], [start[1], end[1]], color="#7b8794", lw=2.0, zorder=-5)
+        if not on_wheels:
+            for x in np.linspace(start[0], end[0], 15)[1:]:
+                axes.plot([x, x - 0.16], [height, height - 0.16], color="#7b8794", lw=1.0, zorder=-5)
+
+
+def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings: Mapping[str, str]) -> None:
+    """Words in a row above the vehicle, in the order of their places so that no arrows cross."""
+    high = axes.get_ylim()[1]
+    left, right = axes.get_xlim()
+    found = {name: places.get(name) or places.get(name.split(".")[0]) for name in findings}
+    known = sorted((place, name) for name, place in found.items() if place is not None)
+    for number, (place, name) in enumerate(known):
+        margin = 0.22 * (right - left)
+        x = float(np.clip(place[0], left + margin, right - margin))
+        if len(known) > 1:
+            x = left + (right - left) * (number + 0.5) / len(known)
+        beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, high - 0.25)
+        axes.annotate(
+            f"{name}\n{findings[name]}", xy=place, xytext=beside, fontsize=10, color=ink.HIGHLIGHT,
+            ha="left" if layout.slant == 0 else "center", va="center" if layout.slant == 0 else "top",
+            fontweight="bold", zorder=200,
+            bbox={"boxstyle": "round,pad=0.35", "fc": "white", "ec": ink.HIGHLIGHT, "lw": 1.2},
+            arrowprops={"arrowstyle": "-|>", "color": ink.HIGHLIGHT, "lw": 1.4, "shrinkB": 6},
+        )

@@ -1,0 +1,72 @@
+"""Colours, figures and small drawing habits shared by the pictures of a report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+MEASURED = "#22303c"
+BEFORE = "#d1495b"  # nominal structure
+AFTER = "#0b7a75"  # with what was left out
+NOISE = "#8d99a6"
+LAW = "#e09f3e"
+HIGHLIGHT = "#c1121f"
+PAPER = "#ffffff"
+QUIET = "#6b7885"
+
+RC: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.edgecolor": "#9aa5b1",
+    "axes.linewidth": 0.8,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e4e8ec",
+    "grid.linewidth": 0.7,
+    "xtick.color": "#3e4c59",
+    "ytick.color": "#3e4c59",
+    "legend.frameon": False,
+    "figure.facecolor": PAPER,
+    "savefig.facecolor": PAPER,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+}
+DOTS_PER_INCH = 120
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of the report's look, in inches; no global state, so workers may draw at once."""
+    with rc_context(RC):
+        figure = Figure(figsize=(width, height), layout="constrained", dpi=DOTS_PER_INCH)
+        FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> Path:
+    """The figure as PNG at `path`."""
+    with rc_context(RC):
+        figure.savefig(path, dpi=DOTS_PER_INCH)
+    return path
+
+
+def bare(axes: Axes) -> None:
+    """Leaves only what is drawn: no frame, no ticks, no grid."""
+    axes.set_axis_off()
+    axes.grid(False)
+
+
+def engineering(value: float, digits: int = 3) -> str:
+    """1.22e6 as "1.22 M", 395 as "395"; for numbers beside a unit."""
+    size = abs(value)
+    for scale, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k"), (1.0, ""), (1e-3, "m"), (1e-6, "µ")):
+        if size >= scale:
+            return f"{value / scale:.{digits}g} {prefix}".rstrip()
+    return f"{value:.{digits}g}"

@@ -1,0 +1,90 @@
+"""The report in an engineer's words."""
+
+from __future__ import annotations
+
+import math
+
+from model.diagnosis.report import Finding, LawParameter, Report
+from service.report.ink import engineering
+from service.report.values import largest_bias
+
+VERDICTS = {
+    "consistent": "Consistent: the nominal structure explains the recording",
+    "missing_physics": "Missing physics found",
+    "sensor_fault": "A sensor or input signal is at fault, not the vehicle",
+    "unknown_physics": "The vehicle does something that no known law explains",
+}
+
+EFFECTS = {
+    "coulomb_friction": "dry friction",
+    "bouc_wen": "hysteresis (Bouc-Wen)",
+    "damper_blowoff": "damper blow-off",
+    "series_stiffness": "soft damper mounting",
+    "unknown": "an unknown law",
+}
+
+
+def effect_words(effect: str) -> str:
+    """An effect's name as words: `bump_stop` as "bump stop"."""
+    return EFFECTS.get(effect, effect.replace("_", " "))
+
+
+# Parameters that shape a law's corner and say nothing about how strong it is
+MINOR = {"smoothing", "n"}
+
+
+def quantity(p: LawParameter) -> str:
+    """ "395 ± 6 N": rounded to the standard deviation; small lengths and speeds in millimetres."""
+    value, std, unit = p.value, p.std, "" if p.unit in {"", "-"} else p.unit
+    if unit in {"m", "m/s"} and max(abs(value), std) < 0.1:
+        value, std, unit = 1e3 * value, 1e3 * std, "m" + unit
+    if not math.isfinite(std) or std <= 0:
+        return f"{value:.4g} {unit}".rstrip()
+    size = max(abs(value), std)
+    power = 0 if 0.01 <= size < 1e5 else 3 * math.floor(math.log10(size) / 3)
+    value, std = value / 10.0**power, std / 10.0**power
+    exponent = math.floor(math.log10(std))
+    digits = min(max(0, -exponent + (std / 10.0**exponent < 3)), 6)
+    text = f"{value:.{digits}f} ± {std:.{digits}f}"
+    return (f"({text})e{power} {unit}" if power else f"{text} {unit}").rstrip()
+
+
+def finding_words(finding: Finding) -> str:
+    """One finding: place, law, numbers."""
+    name = effect_words(finding.family or finding.effect)
+    main = [p for p in finding.parameters if p.name not in MINOR]
+    if len(main) == 1:
+        return f"{name} of {quantity(main[0])}"
+    numbers = ", ".join(f"{p.name} {quantity(p)}" for p in main)
+    return f"{name}, {numbers}" if numbers else name
+
+
+def headline(report: Report) -> str:
+    """One sentence: what is where, how much it explains, and what it had falsified."""
+    if report.summary:
+        return report.summary
+    if not report.findings:
+        fit = report.baseline_validation.nrmse
+        return f"Nothing is missing: the re-identified structure simulates the held-out part to {fit:.1%} of its rms."
+    parts = ["; ".join(f"{f.location}: {finding_words(f)}" for f in report.findings)]
+    if report.explained is not None:
+        parts.append(f"explains {100 * report.explained:.0f} % of the excess error")
+    bias = largest_bias(report)
+    if bias is not None and bias.bias is not None:
+        name, _, kind = bias.name.rpartition(".")
+        whose = f"the {kind}" if len(report.findings) == 1 and name == report.findings[0].location else bias.name
+        direction = "high" if bias.bias > 0 else "low"
+        parts.append(f"without it {whose} was read {abs(bias.bias):.0%} too {direction}".replace("%", " %"))
+    return "; ".join(parts) + "."
+
+
+def probability(value: float | None) -> str:
+    """A p-value for people."""
+    if value is None or not math.isfinite(value):
+        return "-"
+    return "< 1e-99" if value < 1e-99 else f"{value:.2g}"
+
+
+def number(value: float | None, digits: int = 4) -> str:
+    """A number for a table, a dash for none."""
+    return "-" if value is None or not math.isfinite(value) else engineering(value, digits)

@@ -1,0 +1,145 @@
+"""The mismatch report for people: offline, complete, true to the report's numbers."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from model.diagnosis.report import (
+    Candidate,
+    Finding,
+    FitFigures,
+    LawParameter,
+    ParameterValue,
+    RecordingFacts,
+    Report,
+)
+from model.system import System, load_system
+from service.report import words, write_report
+from service.report.drawing import draw_system, lay_out
+from service.report.values import largest_bias
+
+SYSTEM = load_system()
+
+
+def fit(system: System, value: float) -> FitFigures:
+    return FitFigures(value, dict.fromkeys(system.sensors, value))
+
+
+def friction_report(system: System = SYSTEM) -> Report:
+    """Friction of 395 N that had raised one damping by 148 %, with arrays that show it."""
+    rng = np.random.default_rng(1)
+    sensors = len(system.sensors)
+    measured = rng.normal(size=(600, sensors))
+    d, v = 2e-3 * rng.normal(size=400), 0.02 * rng.normal(size=400)
+    x = np.linspace(-0.06, 0.06, 41)
+    law = 395 * np.tanh(x / 2e-3)
+    place = system.elements[-3] if len(system.elements) > 3 else system.elements[0]
+    augmented = tuple(ParameterValue(p.name, p.nominal, 0.01 * p.nominal, p.nominal, p.unit) for p in system.parameters)
+    baseline = tuple(
+        replace(p, value=2.48 * p.value) if p.name == f"{place}.damping" else p for p in augmented
+    )
+    friction = LawParameter("force", 395.2, 6.1, "N"), LawParameter("smoothing", 2.1e-3, 3e-4, "m/s")
+    return Report(
+        system=system.name, recording=RecordingFacts("run.mcap", 60.0, 6000, 3), verdict="missing_physics",
+        baseline=baseline, baseline_validation=fit(system, 0.145),
+        findings=(Finding(place, "coulomb_friction", friction, 0.0, -5100.0, ("damper_blowoff", -4300.0)),),
+        augmented=augmented, augmented_validation=fit(system, 0.031), noise_floor=fit(system, 0.030),
+        localization={place: 5100.0, "car": 30.0}, explained=0.993,
+        candidates=(Candidate(place, "coulomb_friction", 5100.0, 0.0, -5100.0),),
+        evidence={
+            "validation.time": np.arange(600) / system.sample_rate, "validation.measured": measured,
+            "validation.baseline": measured + 0.2 * rng.normal(size=measured.shape),
+            "validation.augmented": measured + 0.03, "validation.noise": np.full(sensors, 0.03),
+            "finding.0.deflection": d, "finding.0.rate": v, "finding.0.force_before": 395 * np.tanh(v / 2e-3),
+            "finding.0.force_after": rng.normal(size=400), "finding.0.curve_axis": np.array("rate"),
+            "finding.0.curve_x": x, "finding.0.curve_mean": law, "finding.0.curve_std": np.full(41, 9.0),
+            "finding.0.curve_law": law,
+        },
+    )
+
+
+def test_the_page_needs_nothing_from_outside_and_holds_every_picture(tmp_path: Path) -> None:
+    files = write_report(friction_report(), SYSTEM, tmp_path / "new" / "folder")
+    page = files.page.read_text(encoding="utf-8")
+    assert not re.findall(r"""(?:src|href)=["'](?!data:)""", page)
+    assert "http" not in page
+    assert page.count("data:image/png;base64,") == len(files.pictures)
+    expected = {"system", "fit", "sensors", "locations", "parameters", "force_0", "residual_0"}
+    assert set(files.pictures) == expected
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in files.pictures.values())
+
+
+def test_the_sentence_says_place_law_share_and_the_bias_it_had_caused() -> None:
+    sentence = words.headline(friction_report())
+    assert sentence == (
+        "secondary_1r: dry friction of 395 ± 6 N; explains 99 % of the excess error; "
+        "without it the damping was read 148 % too high."
+    )
+
+
+def test_the_largest_bias_is_none_where_nothing_moved() -> None:
+    report = friction_report()
+    assert largest_bias(replace(report, baseline=report.augmented)) is None
+
+
+def test_the_json_beside_the_page_is_the_reports_own(tmp_path: Path) -> None:
+    report = friction_report()
+    files = write_report(report, SYSTEM, tmp_path)
+    assert json.loads(files.data.read_text(encoding="utf-8")) == json.loads(json.dumps(report.to_dict()))
+
+
+def test_a_consistent_report_without_arrays_still_makes_a_page(tmp_path: Path) -> None:
+    report = replace(
+        friction_report(), verdict="consistent", findings=(), evidence={}, candidates=(), explained=None,
+        advice=("the record is too short to see <slow> changes",),
+    )
+    files = write_report(report, SYSTEM, tmp_path)
+    page = files.page.read_text(encoding="utf-8")
+    assert "Nothing is missing" in page
+    assert "&lt;slow&gt;" in page
+    assert "fit" not in files.pictures
+
+
+def test_an_unknown_law_is_shown_as_a_force_map(tmp_path: Path) -> None:
+    report = friction_report()
+    d, v = np.linspace(-1e-3, 1e-3, 9), np.linspace(-0.05, 0.05, 7)
+    force = np.outer(v, d**2) * 4e9
+    finding = replace(report.findings[0], effect="unknown", parameters=())
+    evidence = {
+        "finding.0.map_d": d, "finding.0.map_v": v, "finding.0.map_force": force, "finding.0.map_std": 0 * force + 5,
+    }
+    report = replace(report, verdict="unknown_physics", findings=(finding,), evidence=evidence)
+    assert "force_0" in write_report(report, SYSTEM, tmp_path).pictures
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "unit", "text"),
+    [
+        (395.2, 6.1, "N", "395 ± 6 N"),
+        (0.002134, 0.00031, "m/s", "2.1 ± 0.3 mm/s"),
+        (7.7994e9, 2.1e7, "N/m^3", "(7.799 ± 0.021)e9 N/m^3"),
+        (0.8690, 0.0014, "-", "0.8690 ± 0.0014"),
+        (12.0, float("nan"), "Hz", "12 Hz"),
+    ],
+)
+def test_quantities_are_rounded_to_their_uncertainty(value: float, std: float, unit: str, text: str) -> None:
+    assert words.quantity(LawParameter("p", value, std, unit)) == text
+
+
+def test_the_drawing_stacks_the_car_on_the_bogies_on_the_wheels() -> None:
+    level = lay_out(SYSTEM).level
+    assert level["car"] == 2
+    assert level["bogie1"] == level["bogie2"] == 1
+
+
+@pytest.mark.parametrize("place", ["secondary_1r", "car", "bogie1_2r", "wheel_21l.velocity", "nowhere"])
+def test_the_drawing_calls_out_what_was_located_wherever_it_is(place: str) -> None:
+    figure = draw_system(SYSTEM, {place: "some words"}, {})
+    said = any("some words" in text.get_text() for text in figure.axes[0].texts)
+    assert said == (place != "nowhere")
