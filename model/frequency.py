@@ -39,7 +39,7 @@ class FrequencyModel:
         order = {0: 2, 1: 1, 2: 0}
         factors = [self.jw ** order.get(int(kind), 0) for kind in simulator.kind]
         self.motion_sensing = torch.stack(factors, dim=1)[:, :, None] * simulator.S.to(self.jw.dtype)  # (F, S, n)
-        self._element_sensors = bool((simulator.kind >= 3).any())
+        self.element_sensors = bool((simulator.kind >= 3).any())
 
     def stiffness(self, values: ElementValues) -> Tensor:
         """Z, shape (B, F, n, n)."""
@@ -64,8 +64,8 @@ class FrequencyModel:
         motion = compliance @ force[:, None].to(compliance.dtype)
         sensing = self.sensing(values)
         output = sensing @ motion
-        if self._element_sensors and len(s.supports):
-            of_d, of_v = self._element_gain(values)
+        if self.element_sensors and len(s.supports):
+            of_d, of_v = self.element_gain(values)
             output[:, :, :, s.supports] += (of_d @ s.G)[:, None].to(compliance.dtype)
             output[:, :, :, s.supports + 1] += (of_v @ s.G)[:, None].to(compliance.dtype)
         return Response(motion, output, compliance, sensing)
@@ -73,15 +73,15 @@ class FrequencyModel:
     def sensing(self, values: ElementValues) -> Tensor:
         """Sensors per degree of freedom, (B, F, S, n)."""
         motion = self.motion_sensing[None]
-        if not self._element_sensors:
+        if not self.element_sensors:
             return motion.expand(len(values.mass), -1, -1, -1)
-        of_d, of_v = self._element_gain(values)
+        of_d, of_v = self.element_gain(values)
         H = self.simulator.H
         return motion + torch.complex(
             (of_d @ H)[:, None].expand_as(motion.real), self.omega[:, None, None] * (of_v @ H)[:, None]
         )
 
-    def _element_gain(self, values: ElementValues) -> tuple[Tensor, Tensor]:
+    def element_gain(self, values: ElementValues) -> tuple[Tensor, Tensor]:
         """Element sensors per deflection and per rate, each (B, S, E)."""
         s = self.simulator
         kind = s.kind[:, None]
@@ -101,7 +101,7 @@ class FrequencyModel:
         kind = response.compliance.dtype
         per_load = -response.sensing @ response.compliance  # (B, F, S, n)
         per_force = per_load @ s.H.T.to(kind)  # (B, F, S, E)
-        if self._element_sensors:
+        if self.element_sensors:
             per_force = per_force + torch.where(s.kind[:, None] == 4, s.L, torch.zeros_like(s.L))
         by_k = per_force * (values.stiffness.unsqueeze(1) * deflection).unsqueeze(2)
         by_c = per_force * (values.damping.unsqueeze(1) * rate).unsqueeze(2)

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from model.estimator import Estimator, bundled_estimator, load_estimator
-from model.refine import PRIOR_STD, Refined, Refiner
+from model.linearise import PRIOR_STD
+from model.refine import Refined, Refiner
 from model.signals import Estimate, FloatArray
 from model.system import System
 
@@ -58,7 +59,7 @@ class Identifier:
         between = time.perf_counter()
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
-        return _estimates(refined)
+        return _estimates(refined, states)
 
     def _refiner(self, samples: int) -> Refiner:
         if samples not in self._refiners:
@@ -105,7 +106,7 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     return np.minimum(np.median(std, axis=0), PRIOR_STD)
 
 
-def _estimates(refined: Refined) -> list[Estimate]:
+def _estimates(refined: Refined, states: bool) -> list[Estimate]:
     with np.errstate(divide="ignore", invalid="ignore"):
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
     limit = 1 + _FIT_SIGMAS * np.sqrt(2 / np.maximum(refined.freedom, 1))
@@ -120,7 +121,7 @@ def _estimates(refined: Refined) -> list[Estimate]:
             adequate=bool(refined.chi_square[b] < limit[b] and refined.converged[b]),
             converged=bool(refined.converged[b]),
             iterations=int(refined.iterations[b]),
-            states=None if refined.states is None else refined.states[b],
+            states=refined.states[b] if states else None,
         )
         for b in range(len(refined.log_ratio))
     ]

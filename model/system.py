@@ -38,6 +38,9 @@ _UNITS = {
 }
 
 
+_USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0}
+
+
 def _channel(name: str, quantity: str, at: Address) -> Channel:
     return Channel(name, _UNITS[quantity], at.noise, at.mcap, at.can, at.csv)
 
@@ -146,6 +149,12 @@ class System:
     def nominal(self) -> FloatArray:
         """Nominal values of the parameters, shape (P,)."""
         return np.array([p.nominal for p in self.parameters])
+
+    @cached_property
+    def sensor_noise(self) -> FloatArray:
+        """Standard deviation of one sample of every sensor, shape (S,); a usual instrument's where none is stated."""
+        sensors = self.channels[len(self.inputs) :]
+        return np.array([channel.noise or _USUAL_NOISE[channel.unit] for channel in sensors])
 
     @cached_property
     def digest(self) -> str:

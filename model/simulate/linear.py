@@ -78,6 +78,11 @@ class LinearSimulator:
         per_body = _scatter(system, "mass", bodies, len(bodies), constant)
         self.m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
         self.estimates_mass = "mass" in quantity
+        self.estimated_masses = quantity.count("mass")
+        self.estimated_elements = tuple(  # indices of elements, in the order of the parameters
+            torch.as_tensor([index[p.element] for p in system.parameters if p.quantity == q], dtype=torch.long)
+            for q in ("stiffness", "damping")
+        )
         omega = math.sqrt(float(torch.linalg.eigvalsh(self._normalised_stiffness()).max().clamp_min(1e-12)))
         root = self.nominal_m.rsqrt()
         # Mass-normalised states with rates in units of the fastest mode: the norm of A h is then about omega h.

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from model.identify import identifiability
-from model.refine import PRIOR_STD
+from model.linearise import PRIOR_STD
 from model.system import MANCHESTER, System, load_system
 from service.pages.render import quantity
 

@@ -1,0 +1,278 @@
+"""A window's model linearised at given parameters, with everything weighed by the noise of sensors and inputs.
+
+Sensors that measure the same motion redundantly are compressed to independent signals of unit noise first (what is
+lost carries no information on the parameters), which also takes absent sensors out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from model.frequency import FrequencyModel, bin_frequencies
+from model.mechanics import ACCELERATION, DISPLACEMENT, FORCE, VELOCITY
+from model.signals import BoolArray, FloatArray
+from model.simulate.linear import Discrete, ElementValues, LinearSimulator
+from model.system import System
+
+BAND = 0.36  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
+PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
+_RIDGE = 1e-11  # relative, on the normalised free responses
+
+
+@dataclass(frozen=True, slots=True)
+class WindowBatch:
+    """Windows with the same sensors present, as the model needs them."""
+
+    w: Tensor  # knots of the drives, shape (B, T, W)
+    measured: Tensor  # sensors present, shape (B, T, S')
+    present: BoolArray  # which sensors these are, shape (S,)
+
+    def take(self, at: Tensor) -> WindowBatch:
+        return self if len(at) == len(self.w) else WindowBatch(self.w[at], self.measured[at], self.present)
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
+
+    whiten: Tensor  # shape (B, F, R, R), weights of the bins included
+    columns: Tensor  # whitened [free responses, sensitivities], shape (B, N + P, K)
+    column_scale: Tensor  # of the free responses, shape (B, N)
+    factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N, N)
+    across: Tensor  # free responses solved for the sensitivities, shape (B, N, P)
+    covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
+    x: Tensor  # log-ratios of this point, shape (B, P)
+    x0: Tensor  # best initial state here, shape (B, N)
+    cost: Tensor  # weighted squares with that state, shape (B,)
+    gradient: Tensor  # minus half the gradient of the cost, shape (B, P)
+    step: Tensor  # to the minimum of the linearised cost, shape (B, P)
+
+    def state_after(self, step: Tensor) -> Tensor:
+        """Best initial state when the log-ratios move by `step`."""
+        return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.column_scale
+
+
+class WindowModel:
+    """The linear system over windows of a fixed length."""
+
+    def __init__(self, system: System, samples: int) -> None:
+        self.system, self.samples = system, samples
+        self.simulator = LinearSimulator(system)
+        omega = bin_frequencies(samples, system.sample_rate)
+        self.bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right"))
+        self.frequency = FrequencyModel(self.simulator, omega[: self.bins])
+        weight = np.full(self.bins, np.sqrt(2 / samples))
+        weight[0] = np.sqrt(1 / samples)
+        self.weight = torch.as_tensor(weight)
+        self.drive_noise = torch.as_tensor(self.frequency.input_noise())  # (F, W/2)
+        self.sensor_noise = system.sensor_noise
+        self._compressions: dict[bytes, Tensor] = {}
+
+    def batch(self, windows: FloatArray, present: BoolArray) -> WindowBatch:
+        """Windows (B, T, C) in which exactly the sensors `present` are measured."""
+        inputs = len(self.system.inputs)
+        w = torch.as_tensor(self.simulator.knots(windows[:, :, :inputs]))
+        return WindowBatch(w, torch.as_tensor(windows[:, :, inputs:][:, :, present]), present)
+
+    def compression(self, present: BoolArray) -> Tensor:
+        """Matrix (R, S') from the sensors present to independent signals of unit noise."""
+        key = present.tobytes()
+        if key not in self._compressions:
+            mechanics = self.system.mechanics
+            kind, S = mechanics.sensor_kind[present], mechanics.S[present]
+            noise = self.sensor_noise[present]
+            blocks = []
+            for motion in (ACCELERATION, VELOCITY, DISPLACEMENT):
+                at = np.flatnonzero(kind == motion)
+                if len(at):
+                    q, r = np.linalg.qr(S[at] / noise[at, None])
+                    rank = np.linalg.matrix_rank(r)
+                    basis = q[:, :rank] if rank == r.shape[1] else np.linalg.svd(S[at] / noise[at, None])[0][:, :rank]
+                    block = np.zeros((rank, len(kind)))
+                    block[:, at] = basis.T / noise[at]
+                    blocks.append(block)
+            for at in np.flatnonzero(kind > DISPLACEMENT):
+                block = np.zeros((1, len(kind)))
+                block[0, at] = 1 / noise[at]
+                blocks.append(block)
+            self._compressions[key] = torch.as_tensor(np.concatenate(blocks))
+        return self._compressions[key]
+
+    def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
+        """Everything at log-ratios x (B, P)."""
+        s = self.simulator
+        values = s.element_values(x)
+        discrete = self._compressed(s.discretise(values), data)
+        forced = s.states(discrete, data.w, x.new_zeros(len(x), discrete.Ad.shape[1]))
+        residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
+        free = s.free_response(discrete, self.samples)
+        spectra = torch.fft.rfft(torch.cat([residual.unsqueeze(3), free], dim=3), dim=1)[:, : self.bins]
+
+        compliance, per_force, carried = self._transfer(values, data)
+        whiten = self._whitening(carried)
+        white = whiten @ spectra
+        flat = _rows(white)  # (B, 1 + N, K)
+        r, basis = flat[:, :1], flat[:, 1:]
+        column_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
+        basis = basis / column_scale.unsqueeze(2)
+        products = basis @ basis.mT
+        factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(products.shape[1], dtype=x.dtype))
+        along = basis @ r.mT  # (B, N, 1)
+        x0_scaled = torch.cholesky_solve(along, factor).squeeze(2)
+        x0 = x0_scaled / column_scale
+        cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
+
+        left = white[..., :1] - white[..., 1:] @ x0[:, None, :, None].to(white.dtype)  # (B, F, R, 1)
+        noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
+        J = self._sensitivities(values, compliance, whiten @ per_force, forced, x0, discrete, data, noise)
+        if s.estimates_mass:
+            J = torch.cat([J, self._mass_columns(values, compliance, whiten, forced, x0, discrete, data)], dim=3)
+        J = _rows(J)
+        columns = torch.cat([basis, J], dim=1)
+        across_products = basis @ J.mT
+        across = torch.cholesky_solve(across_products, factor)
+        information = J @ J.mT - across_products.mT @ across
+        gradient = (J @ r.mT - across.mT @ along).squeeze(2)
+        prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
+        covariance = torch.linalg.inv(information + prior)
+        step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
+        return Linearisation(whiten, columns, column_scale, factor, across, covariance, x, x0, cost, gradient, step)
+
+    def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """One more step from (x, x0) with the products of `at`: cost there, step (B, P), best state after it."""
+        s = self.simulator
+        discrete = self._compressed(s.discretise(s.element_values(x)), data)
+        states = s.states(discrete, data.w, x0)
+        residual = self._signals(data) - states @ discrete.C.mT - data.w @ discrete.D.mT
+        spectra = torch.fft.rfft(residual, dim=1)[:, : self.bins].unsqueeze(3)
+        r = _rows(at.whiten @ spectra)  # (B, 1, K)
+        N = x0.shape[1]
+        along = at.columns @ r.mT  # (B, N + P, 1)
+        free_part = torch.cholesky_solve(along[:, :N], at.factor)
+        gradient = along[:, N:] - at.across.mT @ along[:, :N]
+        step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
+        cost = r.square().sum(dim=(1, 2)) - (along[:, :N] * free_part).sum(dim=(1, 2))
+        x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.column_scale
+        return cost, step.squeeze(2), x0
+
+    def simulate(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
+        """Sensors present (B, T, S') and states (B, T, N)."""
+        s = self.simulator
+        discrete = s.discretise(s.element_values(x))
+        states = s.states(discrete, data.w, x0)
+        at = torch.as_tensor(data.present)
+        return states @ discrete.C[:, at].mT + data.w @ discrete.D[:, at].mT, states
+
+    def _signals(self, data: WindowBatch) -> Tensor:
+        return data.measured @ self.compression(data.present).mT
+
+    def _compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
+        Q, at = self.compression(data.present), torch.as_tensor(data.present)
+        return Discrete(discrete.Ad, discrete.G0, discrete.G1, Q @ discrete.C[:, at], Q @ discrete.D[:, at])
+
+    def _transfer(self, values: ElementValues, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """Compliance (B, F, n, n); compressed signals per element force (B, F, R, E) and per unit drive noise."""
+        s, f = self.simulator, self.frequency
+        compliance = torch.linalg.inv(f.stiffness(values))
+        kind = compliance.dtype
+        Q = self.compression(data.present).to(kind) @ torch.eye(len(data.present), dtype=kind)[data.present]
+        if f.element_sensors:
+            per_load = Q @ (f.sensing(values) @ compliance)
+        else:
+            per_load = (Q @ f.motion_sensing) @ compliance
+        per_force = -per_load @ s.H.T.to(kind)
+        dynamic = torch.complex(
+            values.stiffness[:, None].expand(-1, self.bins, -1), f.omega[:, None] * values.damping[:, None]
+        )
+        drive = per_load.new_zeros(*per_load.shape[:3], s.W // 2)
+        if len(s.supports):
+            drive[..., s.supports // 2] = (per_force * dynamic.unsqueeze(2)) @ s.G.to(kind)
+        if len(s.forces):
+            drive[..., s.forces // 2] = per_load @ s.F.to(kind)
+        if f.element_sensors:
+            of_d, of_v = f.element_gain(values)
+            through = torch.complex(
+                (of_d @ s.G)[:, None].expand(-1, self.bins, -1, -1), f.omega[:, None, None] * (of_v @ s.G)[:, None]
+            )
+            drive[..., s.supports // 2] += Q @ through
+            forces = torch.where((s.kind == FORCE)[:, None], s.L, torch.zeros_like(s.L))
+            per_force = per_force + Q @ forces.to(kind)
+        return compliance, per_force, drive * self.drive_noise[:, None]
+
+    def _whitening(self, carried: Tensor) -> Tensor:
+        R = carried.shape[2]
+        covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
+        factor = torch.linalg.cholesky(covariance)
+        unit = torch.diag_embed(self.weight[:, None].expand(-1, R)).to(carried.dtype).expand_as(factor)
+        return torch.linalg.solve_triangular(factor, unit, upper=False)
+
+    def _sensitivities(
+        self,
+        values: ElementValues,
+        compliance: Tensor,
+        per_force: Tensor,
+        forced: Tensor,
+        x0: Tensor,
+        discrete: Discrete,
+        data: WindowBatch,
+        noise: Tensor,
+    ) -> Tensor:
+        """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P')."""
+        s = self.simulator
+        n = s.H.shape[1]
+        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
+        d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
+        v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
+        spectra = torch.fft.rfft(torch.cat([d, v], dim=2), dim=1)[:, : self.bins]
+        E = s.H.shape[0]
+        # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
+        kind = compliance.dtype
+        dynamic = torch.complex(
+            values.stiffness[:, None].expand(-1, self.bins, -1), self.frequency.omega[:, None] * values.damping[:, None]
+        )
+        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)  # deflections, (B, F, E)
+        load = -(dynamic * support) @ s.H.to(kind)
+        if len(s.forces):
+            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
+        moved = (compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support
+        deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
+        rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
+        k_at, c_at = s.estimated_elements
+        return torch.cat(
+            [per_force[..., k_at] * deflection[:, :, None, k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3
+        )
+
+    def _mass_columns(
+        self,
+        values: ElementValues,
+        compliance: Tensor,
+        whiten: Tensor,
+        forced: Tensor,
+        x0: Tensor,
+        discrete: Discrete,
+        data: WindowBatch,
+    ) -> Tensor:
+        """Whitened sensitivities to the masses: inertia forces m q'' along the motion, (B, F, R, masses)."""
+        s, f = self.simulator, self.frequency
+        A, b_value, b_rate = s.continuous(values)
+        n = s.H.shape[1]
+        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
+        acceleration = (
+            states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
+        )
+        spectra = torch.fft.rfft(acceleration, dim=1)[:, : self.bins] * values.mass[:, None]
+        kind = compliance.dtype
+        Q = self.compression(data.present).to(kind) @ torch.eye(len(data.present), dtype=kind)[data.present]
+        per_load = -(whiten @ (Q @ (f.sensing(values) @ compliance)))
+        masses = s.m_of[-s.estimated_masses :].T.to(kind)  # (n, masses)
+        return (per_load * spectra[:, :, None]) @ masses
+
+
+def _rows(spectra: Tensor) -> Tensor:
+    """(B, F, R, X) complex to (B, X, 2 F R) real."""
+    B, F, R, X = spectra.shape
+    return torch.view_as_real(spectra).permute(0, 3, 1, 2, 4).reshape(B, X, F * R * 2)
