@@ -26,7 +26,7 @@ def test_posterior_intervals_of_a_healthy_vehicle_cover_the_truth() -> None:
     rng = np.random.default_rng(1)
     tracker = make_tracker()
     scores = []
-    for _ in range(8):
+    for _ in range(5):
         truth = rng.normal(scale=0.2, size=24)
         state = tracker.update_many(tracker.initial_state(), windows(rng, constant(truth), 120, correlated(rng)))
         mean, std = tracker.posterior(state)
@@ -38,13 +38,13 @@ def test_posterior_intervals_of_a_healthy_vehicle_cover_the_truth() -> None:
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.1
 
 
-@pytest.mark.parametrize("per_window", [1, 2, 10])
+@pytest.mark.parametrize("per_window", [1, 2, 5])
 def test_overlap_adds_no_certainty_and_intervals_stay_right(per_window: int) -> None:
     rng = np.random.default_rng(2)
     tracker = make_tracker(8)
     covariance = correlated(rng, np.full(8, 0.02))
     scores, stds = [], []
-    for _ in range(12):
+    for _ in range(10):
         stream = windows(rng, constant(np.zeros(8)), 30, covariance, per_window=per_window)
         mean, std = tracker.posterior(tracker.update_many(tracker.initial_state(), stream))
         scores.append(mean / std)
@@ -126,14 +126,14 @@ def test_an_alarm_closes_after_recovery_and_does_not_flap() -> None:
     assert tracker.health(state) == "ok"
 
 
-@pytest.mark.parametrize("change", [0.015, 0.025, 0.035])
+@pytest.mark.parametrize("change", [0.015, 0.025])
 def test_a_change_near_the_limit_of_detection_opens_at_most_one_alarm(change: float) -> None:
     tracker = make_tracker(4)
     for seed in range(2):
         rng = np.random.default_rng(seed)
         covariance = correlated(rng, np.array([0.003, 0.01, 0.02, 0.03]))
         state = tracker.initial_state()
-        stream = windows(rng, lambda t: np.full(4, change * (t > 60)), 400, covariance)
+        stream = windows(rng, lambda t: np.full(4, change * (t > 60)), 300, covariance)
         state = tracker.update_many(state, stream)
         names = [alarm.parameter for alarm in state.alarms]
         assert len(names) == len(set(names))
@@ -212,8 +212,8 @@ def test_windows_that_scatter_more_than_they_say_widen_the_posterior() -> None:
     rng = np.random.default_rng(11)
     tracker = make_tracker()
     scores = []
-    for _ in range(4):
-        stream = windows(rng, constant(np.zeros(24)), 180, correlated(rng), scatter=2.0)
+    for _ in range(3):
+        stream = windows(rng, constant(np.zeros(24)), 150, correlated(rng), scatter=2.0)
         state = tracker.update_many(tracker.initial_state(), stream)
         mean, std = tracker.posterior(state)
         scores.append(mean / std)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
-from tracker_windows import Parameter, correlated
+from tracker_windows import Parameter, correlated, estimate
 
-from benchmarks.drift import Errors, Fleet, _estimate, step_delays
+from benchmarks.drift import Errors, Fleet, step_delays
 from model.tracker import Tracker, TrackerSettings
 from model.tracking import filter as kalman
 from model.tracking import misfit, scatter, surprise
@@ -118,7 +118,7 @@ def test_batched_change_test_alarms_exactly_when_the_tracker_does() -> None:
         value = errors.draw()[0] + jump * (120 <= k < 200)
         fleet.update(value, covariance)
         for v in range(vehicles):
-            states[v] = tracker.update(states[v], _estimate(value[v], covariance), k * 500_000_000)
+            states[v] = tracker.update(states[v], estimate(value[v], covariance), k * 500_000_000)
         active = np.array([state.changes.active for state in states])
         np.testing.assert_array_equal(active, fleet.changes.active)
     np.testing.assert_allclose([state.changes.up for state in states], fleet.changes.up)

@@ -21,7 +21,7 @@ QUIET = 0.25  # share of the threshold below which a baseline may still be refin
 RECOVERY_SHARE = 1 / 3  # recovery tests 0 against this share of the design change: a dead zone against flapping
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Changes:
     """Sums for the baseline and running statistics of the tests."""
 

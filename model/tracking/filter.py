@@ -15,7 +15,7 @@ from model.signals import BoolArray, FloatArray
 from model.tracking.settings import ProcessNoise
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Belief:
     """N(mean, covariance) of levels and rates."""
 
@@ -35,7 +35,7 @@ class Belief:
         return np.diag(self.covariance)[: self.size]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
     """What a window said beyond the prediction."""
 

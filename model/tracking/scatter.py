@@ -16,7 +16,7 @@ MEMORY = 60.0  # pairs of windows that the running mean remembers
 CLIP = 9.0  # a squared score counts at most as this: one outlier moves the mean by 0.13 at most
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Scatter:
     """Running mean of squared scores, and the last window that a pair started from."""
 

@@ -47,7 +47,7 @@ class Alarm:
         return self.kind, self.parameter, self.opened
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TrackerState:
     """All that the tracker knows about one vehicle; `update` makes a new one.  P parameters."""
 

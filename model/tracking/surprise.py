@@ -17,7 +17,7 @@ THRESHOLD = 14.0  # exp(2 * 0.5 * 14) = 1.2e6 windows between false reopenings o
 MOST = 4.0  # one score counts at most as this: four windows at least
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Surprise:
     """Statistics for predictions that are too low and too high, shape (P,)."""
 
