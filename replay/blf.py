@@ -73,10 +73,11 @@ def _containers(file: BinaryIO, account: Account) -> Iterator[bytes | None]:
             continue
         if len(body) < CONTAINER.size:
             return
-        yield _inflate(body, account)
+        yield _inflate(body, cut, account)
 
 
-def _inflate(body: bytes, account: Account) -> bytes | None:
+def _inflate(body: bytes, cut: bool, account: Account) -> bytes | None:
+    """The objects of a container, checksum verified unless the file is cut in it; None when it is damaged."""
     method, size = CONTAINER.unpack_from(body)
     packed = body[CONTAINER.size :]
     if method == 0:
@@ -84,11 +85,16 @@ def _inflate(body: bytes, account: Account) -> bytes | None:
     if method != 2:
         account.problem(f"a container with unknown compression {method} was passed over")
         return None
+    inflater = zlib.decompressobj()
     try:
-        return zlib.decompressobj().decompress(packed, max(size, 1))
+        data = inflater.decompress(packed, size + 1)
+        if cut or inflater.eof:
+            return data
+        reason = "its size is wrong"
     except zlib.error as error:
-        account.problem(f"a damaged container of {size} bytes was passed over ({error})")
-        return None
+        reason = str(error)
+    account.problem(f"a damaged container of {size} bytes was passed over ({reason})")
+    return None
 
 
 def _seek_object(file: BinaryIO, position: int) -> bool:

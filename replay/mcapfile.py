@@ -64,6 +64,7 @@ class McapFile:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self._counted = 0
+        self._first_time = self._last_time = 0  # log times, ns
         self._unindexed = False  # the last chunk was damaged and its message indexes have not come yet
 
     def batches(self) -> Iterator[Batch]:
@@ -139,6 +140,11 @@ class McapFile:
         """Messages that are in the account or will be put there by the receiver of the batch."""
         self._counted += messages
 
+    def reached(self, log_time: int) -> None:
+        """The recording has been read up to here."""
+        self._first_time = self._first_time or log_time
+        self._last_time = max(self._last_time, log_time)
+
     def _resume(self, file: BinaryIO, at: int, summary: Summary | None, opcode: int) -> bool:
         """After a record that cannot be right: place the file at the next chunk of the index, if there is one."""
         if summary is not None:
@@ -150,8 +156,10 @@ class McapFile:
                 file.seek(later[0])
                 return True
             return False
-        inside = "inside a chunk" if opcode == Opcode.CHUNK else "without an end"
-        self.account.problem(f"file ends {inside}; {self._counted} messages recovered")
+        inside = "inside a chunk" if opcode == Opcode.CHUNK else "before its end record"
+        seconds = (self._last_time - self._first_time) / 1e9
+        line = f"file ends {inside} after {seconds:.1f} s; {self._counted} messages recovered"
+        self.account.problem(line)
         return False
 
     def _summary(self, file: BinaryIO) -> Summary | None:
@@ -218,6 +226,7 @@ class _Splitter:
 
     def take(self) -> Batch:
         self.file.count(self.count)
+        self.file.reached(max(messages.log_time[-1] for messages in self.batch.values()))
         batch, self.batch, self.count = self.batch, {}, 0
         return batch
 

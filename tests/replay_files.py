@@ -1,0 +1,156 @@
+"""One small recording in every format, written by the libraries that others use, and a way to read it back."""
+
+import json
+from collections import defaultdict
+
+import can
+import numpy as np
+from cantools.database.can import Database, Message, Signal
+from cantools.database.conversion import BaseConversion
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory, timestamp_pb2
+from mcap.writer import CompressionType, Writer
+from mcap_protobuf.writer import Writer as ProtobufWriter
+from mcap_ros2.writer import Writer as Ros2Writer
+
+from model.signals import Channel
+from replay import open_recording
+
+START = 1_790_000_000_000_000_000
+STEP = 10_000_000
+ROWS = 300
+CHANNELS = [
+    Channel("left", "m/s^2", 0.01, mcap="/body/acceleration.left", can="Body.Left", csv="left"),
+    Channel("right", "m/s^2", 0.01, mcap="/body/acceleration.axes[1].right", can="Body.Right", csv="right"),
+]
+NUMBERS = np.arange(ROWS)
+LEFT, RIGHT = np.round(np.sin(NUMBERS / 7.0), 3), np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
+VALUES = np.stack([LEFT, RIGHT], axis=1)
+TIMES = START + NUMBERS * STEP
+
+
+def document(row):
+    return {"left": LEFT[row], "axes": [{"right": 0.0}, {"right": RIGHT[row]}]}
+
+
+def write_json(path, *, chunk=4096, compression=CompressionType.ZSTD, close=True, chunked=True, crcs=True):
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk, compression=compression, use_chunking=chunked, enable_crcs=crcs)
+        writer.start()
+        writer.add_metadata("recording", {"vehicle": "tram-7"})
+        schema = writer.register_schema("Body", "jsonschema", b'{"type": "object"}')
+        body = writer.register_channel("/body/acceleration", "json", schema)
+        other = writer.register_channel("/door/state", "json", schema)
+        for row in range(ROWS):
+            time = int(TIMES[row])
+            writer.add_message(body, time + 3_000_000, json.dumps(document(row)).encode(), time, row)
+            if row % 10 == 0:
+                writer.add_message(other, time, b'{"open": false}', time, row)
+        if close:
+            writer.finish()
+
+
+def protobuf_class():
+    """message Body { Timestamp timestamp; double left; repeated Axis axes; }"""
+    file = descriptor_pb2.FileDescriptorProto(name="body.proto", package="t", syntax="proto3")
+    file.dependency.append("google/protobuf/timestamp.proto")
+    axis = file.message_type.add(name="Axis")
+    axis.field.add(name="right", number=1, type=1, label=1)
+    body = file.message_type.add(name="Body")
+    body.field.add(name="timestamp", number=1, type=11, label=1, type_name=".google.protobuf.Timestamp")
+    body.field.add(name="left", number=2, type=1, label=1)
+    body.field.add(name="axes", number=3, type=11, label=3, type_name=".t.Axis")
+    pool = descriptor_pool.DescriptorPool()
+    timestamp = descriptor_pb2.FileDescriptorProto()
+    timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
+    pool.Add(timestamp)
+    pool.Add(file)
+    return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Body"))
+
+
+def write_protobuf(path):
+    kind = protobuf_class()
+    with path.open("wb") as file, ProtobufWriter(file) as writer:
+        for row in range(ROWS):
+            message = kind(left=LEFT[row], axes=[{"right": 0.0}, {"right": RIGHT[row]}])
+            message.timestamp.FromNanoseconds(int(TIMES[row]))
+            late = int(TIMES[row]) + 7_000_000  # the stamp inside counts, not this
+            writer.write_message("/body/acceleration", message, late, late)
+
+
+ROS_BODY = """std_msgs/Header header
+float64 left
+Axis[] axes
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: test_msgs/Axis
+float32 right
+"""
+
+
+def write_ros2(path, stamped=True):
+    with path.open("wb") as file:
+        writer = Ros2Writer(file)
+        schema = writer.register_msgdef("test_msgs/Body", ROS_BODY)
+        for row in range(ROWS):
+            stamp = int(TIMES[row]) if stamped else 0
+            header = {"stamp": {"sec": stamp // 10**9, "nanosec": stamp % 10**9}, "frame_id": "b"}
+            late = int(TIMES[row]) + (7_000_000 if stamped else 0)
+            writer.write_message("/body/acceleration", schema, {"header": header, **document(row)}, late, late)
+        writer.finish()
+
+
+def database():
+    conversion = BaseConversion.factory(scale=0.001, offset=0)
+    wide = {"is_signed": True, "conversion": conversion, "minimum": -30, "maximum": 30}
+    signals = [Signal("Left", 0, 16, **wide), Signal("Right", 23, 16, byte_order="big_endian", **wide)]
+    return Database([Message(0x310, "Body", 8, signals)])
+
+
+def frame(row, frame_id=0x310, **options):
+    data = database_message.encode({"Left": LEFT[row], "Right": RIGHT[row]})
+    return can.Message(
+        timestamp=int(TIMES[row]) / 1e9, arbitration_id=frame_id, is_extended_id=False, data=data, **options
+    )
+
+
+database_message = database().messages[0]
+
+
+def write_can(path):
+    """Every tenth cycle brings a frame of another id, an extended one, a remote frame and an error frame."""
+    with can.Logger(str(path)) as logger:
+        for row in range(ROWS):
+            logger.on_message_received(frame(row, channel=0))
+            if row % 10 == 0:
+                stamp = int(TIMES[row]) / 1e9
+                extra = {"timestamp": stamp, "channel": 0}
+                logger.on_message_received(can.Message(arbitration_id=0x311, is_extended_id=False, data=b"1", **extra))
+                logger.on_message_received(can.Message(arbitration_id=0x310, data=b"12345678", **extra))
+                remote = can.Message(arbitration_id=0x310, is_extended_id=False, is_remote_frame=True, dlc=8, **extra)
+                logger.on_message_received(remote)
+
+
+def write_csv(path):
+    rows = [f"{NUMBERS[i] / 100:.2f},{RIGHT[i]},{LEFT[i]},x" for i in range(ROWS)]
+    path.write_text("\n".join(["time,right,left,note", *rows]) + "\n")
+
+
+def read(path, dbc=None, channels=CHANNELS, **options):
+    """(recording, {channel: (times, values)})."""
+    recording = open_recording(path, channels, dbc=dbc, **options)
+    parts = defaultdict(list)
+    for block in recording.blocks():
+        for index in range(len(channels)):
+            own = block.channel == index
+            parts[index].append((block.time[own], block.value[own]))
+    return recording, {
+        index: (np.concatenate([t for t, _ in found]), np.concatenate([v for _, v in found]))
+        for index, found in parts.items()
+    }

@@ -1,0 +1,197 @@
+"""A bus is read as it runs, lost and found again; a recording can be played onto one."""
+
+import threading
+import time
+from collections import Counter
+from itertools import count
+
+import can
+import numpy as np
+import pytest
+from cantools.database.can import Database, Message, Signal
+
+from model.signals import Channel
+from replay import UnreadableRecording
+from replay.live import LiveBus, send
+from replay.windowing import Windower
+
+CHANNEL = Channel("speed", "m/s", 0.1, can="Train.Speed")
+DATABASE = Database([Message(0x123, "Train", 8, [Signal("Speed", 0, 16, minimum=0, maximum=65000)])])
+NUMBERS = count()
+
+
+@pytest.fixture
+def dbc(tmp_path):
+    path = tmp_path / "train.dbc"
+    path.write_text(DATABASE.as_dbc_string())
+    return path
+
+
+@pytest.fixture
+def bus_name():
+    """A virtual bus of its own for every test."""
+    return f"sprung-test-{next(NUMBERS)}"
+
+
+def frame(value, frame_id=0x123):
+    return can.Message(arbitration_id=frame_id, is_extended_id=False, data=value.to_bytes(8, "little"))
+
+
+class Listener:
+    """Collects blocks in a thread, with the moment at which each came."""
+
+    def __init__(self, bus):
+        self.bus = bus
+        self.blocks = []
+        self.thread = threading.Thread(target=self._run)
+        self.thread.start()
+
+    def _run(self):
+        for block in self.bus.blocks():
+            self.blocks.append((time.monotonic(), block))
+
+    def values(self):
+        return [float(v) for _, block in self.blocks for v in block.value]
+
+    def wait(self, condition, seconds=5.0):
+        end = time.monotonic() + seconds
+        while not condition() and time.monotonic() < end:
+            time.sleep(0.01)
+        return condition()
+
+    def stop(self):
+        self.bus.stop.set()
+        self.thread.join(5.0)
+        assert not self.thread.is_alive()
+
+
+def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc, bus_name):
+    live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.05)
+    listener = Listener(live)
+    assert listener.wait(lambda: live.connected)
+    with can.Bus(interface="virtual", channel=bus_name) as sender:
+        begun = time.monotonic()
+        for value in range(20):
+            sender.send(frame(value))
+        sender.send(frame(1, 0x99))
+        sender.send(frame(65535))
+        assert listener.wait(lambda: len(listener.values()) == 21)
+        assert listener.blocks[0][0] - begun < 1.0  # 0.05 s, and a busy machine
+    listener.stop()
+    assert listener.values()[:20] == list(range(20))
+    assert np.isnan(listener.values()[20])
+    assert live.tally.as_dict() == {"used": 20, "repaired": 0, "dropped": 1, "corrupt": 0, "foreign": 1}
+    stamps = np.concatenate([block.time for _, block in listener.blocks])
+    assert abs(stamps[0] / 1e9 - time.time()) < 60.0
+
+
+def test_a_silent_bus_stops_at_once(dbc, bus_name):
+    live = LiveBus("virtual", bus_name, [CHANNEL], dbc)
+    listener = Listener(live)
+    assert listener.wait(lambda: live.connected)
+    begun = time.monotonic()
+    listener.stop()
+    assert time.monotonic() - begun < 2.0
+
+
+def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
+    """The first opening fails, the second bus breaks after three frames, the third stays."""
+    monkeypatch.setattr("replay.live.FIRST_RETRY", 0.01)
+    opened = count(1)
+
+    class Breaking:
+        def __init__(self, number):
+            self.number, self.sent = number, 0
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def recv(self, timeout):
+            self.sent += 1
+            if self.sent <= 3:
+                return frame(10 * self.number + self.sent)
+            if self.number == 2:
+                raise can.CanOperationError("Network is down")
+            time.sleep(timeout)
+            return None
+
+    def open_bus(**_):
+        number = next(opened)
+        if number == 1:
+            raise OSError("No such device")
+        return Breaking(number)
+
+    live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.02, open_bus=open_bus)
+    listener = Listener(live)
+    assert listener.wait(lambda: len(listener.values()) == 6)
+    listener.stop()
+    assert listener.values() == [21, 22, 23, 31, 32, 33]
+    assert live.reconnects == 2
+    assert live.account.problems[0].startswith(f"bus virtual:{bus_name} lost: No such device")
+    assert "Network is down" in live.account.problems[1]
+
+
+def test_an_unknown_interface_is_one_clear_line(dbc):
+    with pytest.raises(UnreadableRecording, match=r"'sockercan' is not known; python-can has .*socketcan"):
+        LiveBus("sockercan", "can0", [CHANNEL], dbc)
+
+
+def write_log(path, seconds=1.0):
+    rows = range(round(seconds * 100))
+    lines = [f"({1_790_000_000 + i / 100:.6f}) can0 123#{i.to_bytes(8, 'little').hex()}" for i in rows]
+    path.write_text("\n".join(lines) + "\n")
+    return len(rows)
+
+
+def test_a_recording_is_played_in_real_time_and_comes_out_as_windows(dbc, bus_name, tmp_path):
+    frames = write_log(tmp_path / "run.log", 1.2)
+    listener = Listener(LiveBus("virtual", bus_name, [CHANNEL], dbc))
+    assert listener.wait(lambda: listener.bus.connected)
+    begun = time.monotonic()
+    assert send(tmp_path / "run.log", "virtual", bus_name) == frames
+    took = time.monotonic() - begun
+    assert listener.wait(lambda: len(listener.values()) == frames)
+    listener.stop()
+    assert 1.1 < took < 3.0
+    windower = Windower([CHANNEL], 100.0, 100, 50)
+    windows = [w for _, block in listener.blocks for w in windower.push(block)] + windower.flush()
+    assert len(windows) == 1
+    assert np.array_equal(listener.values(), np.arange(frames))
+
+
+def test_playing_can_be_scaled_and_stopped(dbc, bus_name, tmp_path):
+    frames = write_log(tmp_path / "run.log", 2.0)
+    begun = time.monotonic()
+    assert send(tmp_path / "run.log", "virtual", bus_name, speed=20.0) == frames
+    assert time.monotonic() - begun < 1.5
+    stop = threading.Event()
+    stop.set()
+    assert send(tmp_path / "run.log", "virtual", bus_name, stop=stop) < frames
+    with pytest.raises(UnreadableRecording, match="not a CAN recording"):
+        send(tmp_path / "run.mcap", "virtual", bus_name)
+    with pytest.raises(UnreadableRecording, match="speed must be positive"):
+        send(tmp_path / "run.log", "virtual", bus_name, speed=0.0)
+
+
+def test_udp_multicast_carries_frames_between_buses(dbc):
+    group = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219}
+    try:
+        with can.Bus(**group) as probe, can.Bus(**group) as other:
+            other.send(frame(1))
+            reached = probe.recv(timeout=1.0)
+    except (can.CanError, OSError) as error:
+        pytest.skip(f"no multicast here: {error}")
+    if reached is None:
+        pytest.skip("no multicast here")
+    live = LiveBus("udp_multicast", group["channel"], [CHANNEL], dbc, port=group["port"])
+    listener = Listener(live)
+    assert listener.wait(lambda: live.connected)
+    with can.Bus(**group) as sender:
+        for value in range(10):
+            sender.send(frame(value))
+        assert listener.wait(lambda: len(listener.values()) >= 10)
+    listener.stop()
+    assert Counter(listener.values()) == Counter(float(value) for value in range(10))
