@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from benchmarks.generator import track
 from benchmarks.generator.draw import Case
 from benchmarks.generator.files import WRITERS
 from benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
+from benchmarks.generator.oracle import SETTLE, oracle_snr
 from benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -50,29 +52,48 @@ def _delayed(signal: Array, lag: float) -> Array:
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")[: signal.size]
 
 
-def _measure(vehicle: Vehicle, case: Case, clean: Array, samples: int) -> Array:
-    """Noise and the case's fault on the true signals; returns (samples, channels)."""
-    rng = np.random.default_rng(case.seed)
-    noise = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
-    scale, values = noise.copy(), clean[:samples].copy()
-    names = [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
-    index, kind, value = -1, "", 0.0
+def _channels(vehicle: Vehicle) -> list[str]:
+    return [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
+
+
+def _faulty(vehicle: Vehicle, case: Case, clean: Array, samples: int) -> Array:
+    """The true signals with the fault of a measuring chain that changes them before noise, (samples, channels)."""
+    values = clean[:samples].copy()
     if case.fault:
         channel, kind, value = case.fault
-        index = names.index(channel)
+        index = _channels(vehicle).index(channel)
         if kind == "sensor_gain":
             values[:, index] *= value
         elif kind == "sensor_lag":
             values[:, index] = _delayed(clean[:, index], value)[:samples]
         elif kind == "sensor_bias":
             values[:, index] += value
-        elif kind == "sensor_noise":
-            scale[index] *= value
-    values += rng.normal(size=values.shape) * scale
+    return values
+
+
+def _noisy(vehicle: Vehicle, case: Case, values: Array) -> Array:
+    """What is recorded: noise, more of it or none at all where that is the fault."""
+    rng = np.random.default_rng(case.seed)
+    scale = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
+    channel, kind, value = case.fault or ("", "", 0.0)
+    if kind == "sensor_noise":
+        scale[_channels(vehicle).index(channel)] *= value
+    values = values + rng.normal(size=values.shape) * scale
     if kind == "sensor_stuck":
-        start = min(int(value * SAMPLE_RATE), samples // 2)
+        start = min(int(value * SAMPLE_RATE), len(values) // 2)
+        index = _channels(vehicle).index(channel)
         values[start:, index] = values[start, index]
     return values
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One made recording and the truth about it."""
+
+    case: Case
+    values: Array  # measured, shape (T, C): displacements, velocities, sensors
+    strengths: list[float]  # of each law: rms of its force over rms of the element's linear force
+    snr: float | None  # of the oracle, see `oracle.py`
 
 
 def make_recordings(
@@ -81,9 +102,8 @@ def make_recordings(
     seconds: float = 60.0,
     batch: int = 32,
     progress: Callable[[str], None] | None = None,
-) -> Iterator[tuple[Case, Array, list[float]]]:
-    """Each case with its measured channels (T, C) in the order displacements, velocities, sensors, and the
-    strength of each of its laws (rms of the law's force over rms of the element's linear force)."""
+) -> Iterator[Recording]:
+    """The recordings of the cases, in their order."""
     samples = round(seconds * SAMPLE_RATE)
     for first in range(0, len(cases), batch):
         group = cases[first : first + batch]
@@ -101,16 +121,19 @@ def make_recordings(
         clean, strength = simulate(vehicle, plant, displacement, velocity, seconds + SLACK / 2, said)
         for column, case in enumerate(group):
             own = [float(s) for s, slot in zip(strength, plant.slots, strict=True) if slot.column == column]
-            yield case, _measure(vehicle, case, clean[:, :, column], samples), own
+            faulty = _faulty(vehicle, case, clean[:, :, column], samples)
+            snr = oracle_snr(vehicle, case, clean[:samples, :, column], faulty) if seconds > 2 * SETTLE else None
+            yield Recording(case, _noisy(vehicle, case, faulty), own, snr)
 
 
-def label(case: Case, strengths: list[float], seconds: float) -> dict[str, Any]:
+def label(made: Recording, seconds: float) -> dict[str, Any]:
     """One entry of labels.json, in the form of the published labels, with the generator's extras."""
+    case = made.case
     entry: dict[str, Any] = {
         "verdict": case.verdict(), "seconds": seconds, "findings": case.findings(),
         "stiffness": case.stiffness, "damping": case.damping, **case.change,
-        "kind": case.kind, "strength": strengths, "speed": case.speed, "joints": case.joints,
-        "track_level": case.level,
+        "kind": case.kind, "strength": made.strengths, "oracle_snr": made.snr,
+        "speed": case.speed, "joints": case.joints, "track_level": case.level,
     }
     if case.flex:
         entry["flex"] = case.flex
@@ -136,10 +159,10 @@ def write_set(
     folder.mkdir(parents=True, exist_ok=True)
     labels: dict[str, Any] = {}
     path = folder / "labels.json"
-    for number, (case, values, own) in enumerate(make_recordings(vehicle, cases, seconds, batch, progress)):
+    for number, made in enumerate(make_recordings(vehicle, cases, seconds, batch, progress)):
         kind = formats[number % len(formats)]
         name = f"concealed-{number:03d}.{kind}"
-        WRITERS[kind](folder / name, vehicle, values, f"concealed-{number:03d}")
-        labels[name] = label(case, own, seconds)
+        WRITERS[kind](folder / name, vehicle, made.values, f"concealed-{number:03d}")
+        labels[name] = label(made, seconds)
         path.write_text(json.dumps(labels, indent=1), encoding="utf-8")
     return path

@@ -1,0 +1,135 @@
+"""What the best possible test could see: the signal-to-noise ratio of an effect whose place and law are known.
+
+The oracle is told everything but the vehicle's own stiffnesses and dampings: it sees the deviation that the effect
+causes in the sensors, takes away what the other parameters could imitate, and whitens by the sensors' noise and the
+inputs' noise through the vehicle,
+
+    R = diag(s^2) + G diag(1 / (1/s_d^2 + w^2/s_v^2)) G^H,        snr^2 = | (I - P) R^-1/2 delta |^2.
+
+Its likelihood ratio exceeds the threshold z^2 of a chosen false-alarm rate in half of all recordings when snr = z, so
+the strength at its detection limit is the given strength times z / snr.  Computed from the noise-free truth in the
+frequency domain with an own transfer matrix.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.generator.draw import Case
+from benchmarks.generator.integrate import SAMPLE_RATE
+from benchmarks.generator.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+BLEND = 4.0  # s of smooth return that make a record periodic
+SETTLE = 15.0  # s at the start in which the assumed past still rings
+TOP = 40.0  # Hz: below the anti-aliasing filter's edge
+
+
+def _periodic(x: Array) -> Array:
+    """The record continued by a cubic that leads from its end back to its start, value and slope."""
+    n = int(BLEND * SAMPLE_RATE)
+    u = (np.arange(1, n + 1) / (n + 1))[:, None]
+    slope_end, slope_start = (x[-1] - x[-3]) / 2 * (n + 1), (x[2] - x[0]) / 2 * (n + 1)
+    bridge = (
+        x[-1] * (2 * u**3 - 3 * u**2 + 1) + slope_end * (u**3 - 2 * u**2 + u)
+        + x[0] * (3 * u**2 - 2 * u**3) + slope_start * (u**3 - u**2)
+    )
+    return np.vstack([x, bridge])
+
+
+class Transfer:
+    """Frequency responses of one vehicle from the wheels to the sensors, and to element motions."""
+
+    def __init__(self, vehicle: Vehicle, stiffness: Array, damping: Array, omega: Array) -> None:
+        jw = 1j * omega[:, None]
+        impedance = stiffness + jw * damping  # (F, E)
+        geometry = vehicle.geometry
+        stands = np.zeros((len(vehicle.elements), len(vehicle.inputs)))
+        for row, wheel in enumerate(vehicle.support):
+            if wheel >= 0:
+                stands[row, wheel] = 1.0
+        dynamic = np.einsum("ei,fe,ej->fij", geometry, impedance, geometry) - np.einsum(
+            "f,ij->fij", omega**2, np.diag(vehicle.inertia)
+        )
+        self.compliance = np.linalg.inv(dynamic)  # displacement per generalised force, (F, D, D)
+        drive = np.einsum("ei,fe,ew->fiw", geometry, impedance, stands)
+        motion = self.compliance @ drive  # (F, D, wheels)
+        felt = -(omega**2)[:, None, None] * vehicle.pickup
+        self.to_sensors = felt @ motion
+        self.stretch = geometry @ motion - stands  # deflection per wheel displacement, (F, E, wheels)
+        self.load_to_sensors = felt @ self.compliance @ (-geometry.T)  # per element force, (F, S, E)
+
+
+def _sensitivities(transfer: Transfer, wheels: Complex, omega: Array) -> Complex:
+    """Response of the sensors to a relative change of every stiffness and damping (unscaled), (F, S, 2 E)."""
+    deflection = np.einsum("few,fw->fe", transfer.stretch, wheels)
+    by_stiffness = transfer.load_to_sensors * deflection[:, None, :]
+    return np.concatenate([by_stiffness, by_stiffness * (1j * omega)[:, None, None]], axis=2)
+
+
+def _windowed_spectrum(series: Array, keep: slice) -> Complex:
+    """FFT of the settled part under a Hann-edged window, scaled to unit variance per unit white noise."""
+    part = series[keep]
+    n = len(part)
+    edge = int(0.04 * n)
+    taper = np.ones(n)
+    taper[:edge] = 0.5 - 0.5 * np.cos(np.pi * np.arange(edge) / edge)
+    taper[-edge:] = taper[:edge][::-1]
+    shape = (n,) + (1,) * (part.ndim - 1)
+    spectrum: Complex = np.fft.rfft(part * taper.reshape(shape), axis=0) / np.sqrt(np.sum(taper**2))
+    return spectrum
+
+
+def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> float | None:
+    """The signal-to-noise ratio of the case's concealed effects together; None where no oracle is defined.
+
+    `clean` are the true filtered signals, `faulty` the same with a sensor's fault and no noise; both (T, channels) in
+    the order displacements, velocities, sensors.
+    """
+    if case.fault and case.fault[1] in {"sensor_noise", "sensor_stuck"}:
+        return None
+    wheels = len(vehicle.inputs)
+    periodic = _periodic(clean[:, :wheels])
+    omega_full: Array = 2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE)
+    stiffness, damping = (
+        np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping)
+    )
+    full = Transfer(vehicle, stiffness, damping, omega_full)
+    spectrum = np.fft.rfft(periodic, axis=0)
+
+    def back(values: Complex) -> Array:
+        result: Array = np.fft.irfft(values, len(periodic), axis=0)[: len(clean)]
+        return result
+
+    linear = back(np.einsum("fsw,fw->fs", full.to_sensors, spectrum))
+    keep = slice(int(SETTLE * SAMPLE_RATE), len(clean))
+    delta = _windowed_spectrum(faulty[:, 2 * wheels :] - linear, keep)
+    columns = _windowed_spectrum(back(_sensitivities(full, spectrum, omega_full)), keep)
+    n = len(clean[keep])
+    frequency = np.fft.rfftfreq(n, 1 / SAMPLE_RATE)
+    band = (frequency > 0) & (frequency < TOP)
+    omega: Array = 2 * np.pi * frequency[band]
+    there = Transfer(vehicle, stiffness, damping, omega)
+    s_d, s_v = vehicle.input_noise
+    variance = 1 / (1 / s_d**2 + (omega[:, None] / s_v) ** 2)  # of the fused displacement, (F, wheels)
+    delta = delta[band]
+    extra = 0.0
+    if case.fault and (faulty[:, : 2 * wheels] != clean[:, : 2 * wheels]).any():
+        wrong = _windowed_spectrum(faulty[:, : 2 * wheels] - clean[:, : 2 * wheels], keep)[band]
+        shifted = wrong[:, :wheels] / s_d**2 + wrong[:, wheels:] * omega[:, None] / s_v**2 / 1j
+        delta = delta - np.einsum("fsw,fw->fs", there.to_sensors, shifted * variance)
+        contradiction = wrong[:, wheels:] / (1j * omega[:, None]) - wrong[:, :wheels]
+        extra = 2 * float(np.sum(np.abs(contradiction) ** 2 / (s_d**2 + (s_v / omega[:, None]) ** 2)))
+    noise = np.einsum("fsw,fw,ftw->fst", there.to_sensors, variance, there.to_sensors.conj())
+    noise += np.diag(vehicle.sensor_noise**2)
+    whiten = np.linalg.inv(np.linalg.cholesky(noise))
+    flat = (whiten @ delta[:, :, None]).ravel()
+    matrix = (whiten @ columns[band]).reshape(flat.size, -1)
+    left = np.concatenate([flat.real, flat.imag])
+    basis, _ = np.linalg.qr(np.vstack([matrix.real, matrix.imag]) / (np.linalg.norm(matrix, axis=0) + 1e-300))
+    left = left - basis @ (basis.T @ left)
+    share = len(clean) / n  # the settling part would have told as much per second
+    return float(np.sqrt(2 * share * (left @ left) + extra * share))
