@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -31,10 +32,8 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
             flush=True,
         )
 
-    try:
+    with suppress(KeyboardInterrupt):  # the usual way to stop
         serve(settings, Feeds(tuple(files), speed, tuple(buses), vehicle), watch, announce)
-    except KeyboardInterrupt:
-        pass  # the usual way to stop
     return 0
 
 

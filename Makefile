@@ -1,0 +1,61 @@
+# The same commands for people and for CI.  Everything lands in .venv beside this file.
+PYTHON ?= python3
+# A further package index, only needed where the CPU build of torch is not on the configured ones:
+#   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
+TORCH_INDEX ?=
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+SOURCES := model replay service benchmarks tests
+DEMO := tests/data/drift-600s.blf
+PORT ?= 8000
+
+.PHONY: help install install-dev demo test test-slow lint format bench clean
+
+help:
+	@echo "make demo       install, replay the bundled recording, leave the service running"
+	@echo "make test       install, run the tests"
+	@echo "make test-slow  the tests that take minutes"
+	@echo "make lint       ruff and mypy"
+	@echo "make bench      list the benchmarks; make bench NAME=replay runs one"
+
+install: $(VENV)/.installed
+
+install-dev: $(VENV)/.installed-dev
+
+# torch comes first and by itself: with the exact CPU build there, nothing pulls the CUDA packages
+$(VENV)/.installed: requirements.lock pyproject.toml
+	@echo "installing into $(VENV) (a few minutes the first time)"
+	$(PYTHON) -m venv $(VENV)
+	$(PIP) "$$(grep '^torch==' requirements.lock)"
+	$(PIP) -r requirements.lock
+	$(PIP) --no-deps --editable .
+	@touch $@
+
+$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock
+	$(PIP) -r requirements-dev.lock
+	@touch $@
+
+demo: install
+	$(BIN)/sprung serve --replay $(DEMO) --port $(PORT) --data-dir .demo
+
+test: install-dev
+	$(BIN)/python -m pytest
+
+test-slow: install-dev
+	$(BIN)/python -m pytest -m slow
+
+lint: install-dev
+	$(BIN)/ruff check $(SOURCES)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/mypy
+
+format: install-dev
+	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix $(SOURCES)
+
+bench: install
+	$(BIN)/sprung bench $(NAME)
+
+clean:
+	rm -rf $(VENV) .demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

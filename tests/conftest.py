@@ -1,0 +1,49 @@
+"""Fixtures of the service's tests: the real system and tracker, a tiny strict identifier, a store in a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from model.system import MANCHESTER_DBC, System, load_system
+from service.compute import Compute
+from service.engine import Engine, make_tracker
+from service.pipeline import Pipeline
+from service.store import Store, open_store
+from tests.service_fakes import FakeIdentifier
+
+
+@pytest.fixture(scope="session")
+def system() -> System:
+    return load_system()
+
+
+@pytest.fixture
+def identifier(system: System) -> FakeIdentifier:
+    return FakeIdentifier(system)
+
+
+@pytest.fixture
+def engine(system: System, identifier: FakeIdentifier) -> Engine:
+    return Engine(system, identifier, make_tracker(system), MANCHESTER_DBC)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = open_store(f"sqlite:///{tmp_path}/test.db")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def compute() -> Iterator[Compute]:
+    running = Compute(queue_size=4)
+    yield running
+    running.close()
+
+
+@pytest.fixture
+def pipeline(engine: Engine, store: Store, compute: Compute) -> Pipeline:
+    return Pipeline(engine, store, compute)

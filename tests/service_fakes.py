@@ -1,0 +1,65 @@
+"""A tiny strict identifier and the windows that it reads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from model.signals import Estimate, FloatArray, Window
+from model.system import System
+
+START = 1_790_000_000_000_000_000  # ns
+HOP = 500_000_000  # ns
+
+
+@dataclass
+class Times:
+    """Stage times as the identifier has them."""
+
+    estimate: float = 0.001
+    refine: float = 0.002
+
+
+@dataclass
+class FakeIdentifier:
+    """Reads log-ratios off the window: parameter i is the mean of channel i.  Refuses what the real one refuses."""
+
+    system: System
+    digest: str = "fake-1"
+    times: Times = field(default_factory=Times)
+    identified: int = 0
+    std: float = 0.01
+    chi_square: float = 1.0
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        assert windows.ndim == 3 and windows.shape[2] == len(self.system.channels), windows.shape
+        inputs = len(self.system.inputs)
+        assert np.isfinite(windows[:, :, :inputs]).all(), "an input is missing"
+        self.identified += len(windows)
+        return [self._one(window, states) for window in windows]
+
+    def _one(self, window: FloatArray, states: bool) -> Estimate:
+        count, sensors = len(self.system.parameters), len(self.system.sensors)
+        mean = np.nan_to_num(window.mean(axis=0))
+        log_ratio = np.array([mean[i % len(mean)] for i in range(count)])
+        absent = np.isnan(window[:, -sensors:]).any(axis=0)
+        return Estimate(
+            log_ratio=log_ratio,
+            covariance=self.std**2 * np.eye(count),
+            identifiable=np.ones(count, dtype=bool),
+            nrmse=0.03,
+            per_sensor=np.where(absent, np.nan, 0.03),
+            chi_square=self.chi_square,
+            adequate=self.chi_square < 2,
+            converged=True,
+            iterations=2,
+            states=np.zeros((len(window), 2 * len(self.system.mechanics.dofs))) if states else None,
+        )
+
+
+def make_window(system: System, number: int, level: float = 0.0, outcome: str = "used") -> Window:
+    """Window `number` of a vehicle whose parameters are all exp(level) times nominal, as the fake reads it."""
+    values = np.full((system.window, len(system.channels)), level)
+    reason = "gap" if outcome == "dropped" else None
+    return Window(START + number * HOP, system.sample_rate, values, outcome, reason)  # type: ignore[arg-type]

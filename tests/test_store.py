@@ -1,0 +1,202 @@
+"""The store: migrations, windows once, history and roll-ups against brute force, forgetting."""
+
+from __future__ import annotations
+
+import sqlite3
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import func, select, text
+
+from service.errors import UserError
+from service.store import Store, fleet, history, open_store, retention, work
+from service.store.schema import metadata, posteriors, windows
+from service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from service.times import NANOSECONDS, from_iso, to_iso
+
+P, S = 3, 2
+START = 1_790_000_000 * NANOSECONDS
+HOP = NANOSECONDS // 2
+
+
+def record(number: int, level: float | None = None) -> WindowRecord:
+    mean = np.full(P, 0.001 * number if level is None else level)
+    solved = Solved(
+        mean, np.full(P, 0.1), np.array([True, False, True]), 0.03, np.array([0.02, np.nan]), 1.1, True, True, 2
+    )
+    return WindowRecord(START + number * HOP, "used", None, 0, True, solved, Posterior(mean, np.full(P, 0.01)))
+
+
+def fill(store: Store, records: list[WindowRecord], stored_ns: int = START) -> int:
+    with store.write() as connection:
+        fleet.ensure_vehicle(connection, "a", stored_ns)
+        model = fleet.ensure_model(connection, "digest", "toy", {}, stored_ns)
+        add_windows(connection, "a", model, records, stored_ns, None)
+        history.add_to_rollups(connection, "a", model, records, stored_ns)
+    return model
+
+
+def test_migrations_make_the_tables_that_the_code_uses(store: Store) -> None:
+    with store.read() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, metadata) == []
+
+
+def test_sqlite_runs_in_wal_mode_with_foreign_keys(store: Store) -> None:
+    with store.read() as connection:
+        assert connection.execute(text("PRAGMA journal_mode")).scalar_one() == "wal"
+        assert connection.execute(text("PRAGMA foreign_keys")).scalar_one() == 1
+        assert connection.execute(text("PRAGMA synchronous")).scalar_one() == 1  # NORMAL
+
+
+def test_opening_again_changes_nothing(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/again.db"
+    first = open_store(url)
+    model = fill(first, [record(0)])
+    first.close()
+    second = open_store(url)
+    with second.read() as connection:
+        assert list(known_windows(connection, "a", model, [START])) == [START]
+    second.close()
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["mysql://somewhere/db", "nonsense://", "sqlite://", "sqlite:////proc/nowhere/x.db"],
+)
+def test_a_url_that_cannot_be_used_is_one_clear_line(url: str) -> None:
+    with pytest.raises(UserError) as caught:
+        open_store(url)
+    assert url in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_database_is_one_clear_line(tmp_path: Path) -> None:
+    path = tmp_path / "notes.db"
+    path.write_text("not a database, but longer than a header of one would be " * 40)
+    with pytest.raises(UserError, match="not a database"):
+        open_store(str(path))
+
+
+def test_a_window_comes_back_as_it_was_stored(store: Store) -> None:
+    model = fill(store, [record(7)])
+    with store.read() as connection:
+        found = known_windows(connection, "a", model, [START + 7 * HOP])[START + 7 * HOP]
+    expected = record(7)
+    assert found.solved is not None and expected.solved is not None
+    assert found.posterior is not None and expected.posterior is not None
+    np.testing.assert_array_equal(found.solved.log_ratio, expected.solved.log_ratio)
+    np.testing.assert_array_equal(found.solved.identifiable, expected.solved.identifiable)
+    np.testing.assert_array_equal(found.solved.per_sensor, expected.solved.per_sensor)
+    np.testing.assert_array_equal(found.posterior.std, expected.posterior.std)
+    assert (found.outcome, found.tracked, found.solved.iterations) == ("used", True, 2)
+
+
+def test_a_window_is_stored_once_and_the_first_stays(store: Store) -> None:
+    fill(store, [record(0, level=0.1)])
+    model = fill(store, [record(0, level=0.9), record(1)])
+    with store.read() as connection:
+        assert connection.execute(select(func.count()).select_from(windows)).scalar_one() == 2
+        first = known_windows(connection, "a", model, [START])[START]
+    assert first.solved is not None
+    assert first.solved.log_ratio[0] == 0.1
+
+
+def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
+    with pytest.raises(RuntimeError), store.write() as connection:
+        fleet.ensure_vehicle(connection, "ghost", START)
+        raise RuntimeError
+    with store.read() as connection:
+        assert not fleet.vehicle_exists(connection, "ghost")
+
+
+def test_rollups_equal_the_statistics_of_their_windows_however_they_were_cut(store: Store) -> None:
+    rng = np.random.default_rng(3)
+    records = [record(i, level=float(rng.normal())) for i in range(1000)]  # 500 s: nine minutes are touched
+    for first in range(0, 1000, 37):
+        model = fill(store, records[first : first + 37])
+    with store.read() as connection:
+        points = history.history(connection, "a", model, 0, 2**62, 60, 100)
+    assert sum(p.windows for p in points) == 1000
+    for point in points:
+        inside = [
+            r.posterior.log_ratio[0]
+            for r in records
+            if r.posterior is not None and point.time <= r.start < point.time + 60 * NANOSECONDS
+        ]
+        assert point.windows == len(inside)
+        assert point.mean[0] == pytest.approx(np.mean(inside))
+        assert (point.low[0], point.high[0]) == (min(inside), max(inside))
+
+
+def test_history_bounds_range_and_number_and_keeps_the_newest(store: Store) -> None:
+    model = fill(store, [record(i) for i in range(100)])
+    with store.read() as connection:
+        raw = history.history(connection, "a", model, START + 10 * HOP, START + 20 * HOP, 0, 1000)
+        newest = history.history(connection, "a", model, 0, 2**62, 0, 5)
+        coarse = history.history(connection, "a", model, 0, 2**62, 5, 1000)
+    assert [p.time for p in raw] == [START + i * HOP for i in range(10, 20)]
+    assert [p.time for p in newest] == [START + i * HOP for i in range(95, 100)]
+    assert sum(p.windows for p in coarse) == 100
+    assert all(b.time - a.time == 5 * NANOSECONDS for a, b in pairwise(coarse))
+
+
+def test_hours_are_told_from_hourly_rollups(store: Store) -> None:
+    hours = [record(i * 7200) for i in range(48)]  # one window an hour, for two days
+    model = fill(store, hours)
+    with store.read() as connection:
+        points = history.history(connection, "a", model, 0, 2**62, 6 * 3600, 1000)
+        chosen = history.fitting_resolution(connection, "a", model, 0, 2**62, 10)
+    assert sum(p.windows for p in points) == 48
+    assert chosen >= 47 * 3600 / 10
+
+
+def test_forgetting_counts_from_when_a_window_was_stored(store: Store) -> None:
+    fill(store, [record(0)], stored_ns=100)
+    fill(store, [record(1)], stored_ns=200)
+    with store.write() as connection:
+        forgotten = retention.forget(connection, 150, 0, 0)
+    assert forgotten.windows == 1
+    with store.read() as connection:
+        assert connection.execute(select(windows.c.start_ns)).scalars().all() == [START + HOP]
+        assert connection.execute(select(func.count()).select_from(posteriors)).scalar_one() == 1
+
+
+def test_forgetting_names_old_uploads_but_not_those_a_job_needs(store: Store) -> None:
+    with store.write() as connection:
+        for name in ("old", "needed", "new"):
+            created = 100 if name != "new" else 200
+            row = work.RecordingRow(name, None, f"{name}.blf", "upload", f"{name}.blf", 1, None, created, None)
+            work.add_recording(connection, row)
+        work.add_job(connection, work.JobRow("j", "recording", "queued", "needed", None, 0.0, None, None, 100, 100))
+        assert retention.forget(connection, 0, 0, 150).upload_files == ("old.blf",)
+
+
+def test_two_processes_can_share_a_file(store: Store, tmp_path: Path) -> None:
+    fill(store, [record(0)])
+    with sqlite3.connect(tmp_path / "test.db") as other:
+        assert other.execute("SELECT count(*) FROM windows").fetchone() == (1,)
+    other.close()
+
+
+@pytest.mark.parametrize(
+    ("text_", "nanoseconds"),
+    [
+        ("2026-09-21T14:13:20Z", 1_790_000_000 * NANOSECONDS),
+        ("2026-09-21T14:13:20.500Z", 1_790_000_000 * NANOSECONDS + 500_000_000),
+        ("2026-09-21T16:13:20+02:00", 1_790_000_000 * NANOSECONDS),
+        ("2026-09-21T14:13:20", 1_790_000_000 * NANOSECONDS),
+        ("1790000000", 1_790_000_000 * NANOSECONDS),
+    ],
+)
+def test_times_are_read_in_the_ways_people_write_them(text_: str, nanoseconds: int) -> None:
+    assert from_iso(text_) == nanoseconds
+
+
+def test_times_are_written_to_the_millisecond() -> None:
+    assert to_iso(1_790_000_000_499_600_000) == "2026-09-21T14:13:20.500Z"
+    assert from_iso(to_iso(START)) == START
