@@ -70,7 +70,7 @@ def simulate_runs(
     frequency = FrequencyModel(LinearSimulator(system), omega)
     values = frequency.simulator.element_values(torch.as_tensor(log_ratio))
     knots = torch.as_tensor(np.stack([drives, 1j * omega[:, None] * drives], axis=3).reshape(B, len(bins), -1))
-    out = torch.cat([frequency.response(values).output @ knots.unsqueeze(3)], dim=2).squeeze(3)
+    out = (frequency.response(values) @ torch.as_tensor(drives).unsqueeze(3)).squeeze(3)
     columns: Tensor = torch.zeros(B, len(bins), len(system.channels), dtype=out.dtype)
     for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
         columns[:, :, value] = knots[:, :, 2 * i]

@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
-from model.signals import FloatArray
+from model.signals import FloatArray, IntArray
 from model.simulate.linear import LinearSimulator
 from model.system import System
 
@@ -48,7 +48,7 @@ class ForceBalance:
             raise ValueError(f"{system.name}: the sensors do not give the motion of every body; no force balance")
         frequency = np.fft.rfftfreq(samples, 1 / system.sample_rate)
         low, high = BAND[0] * system.sample_rate, BAND[1] * system.sample_rate
-        self.bins = np.flatnonzero((frequency >= low) & (frequency <= high))
+        self.bins: IntArray = np.flatnonzero((frequency >= low) & (frequency <= high)).astype(np.int64)
         self.simulator = LinearSimulator(system)
         time = np.arange(samples) / system.sample_rate
         by_order = _time_operators(self.kind, time)
@@ -116,7 +116,7 @@ def _time_operators(kind: int, time: FloatArray) -> list[FloatArray]:
     return [eye, spline(time, 1), CubicSpline(time, spline(time, 1))(time, 1)]
 
 
-def _spectrum_operator(samples: int, bins: FloatArray) -> FloatArray:
+def _spectrum_operator(samples: int, bins: IntArray) -> FloatArray:
     """Hann window and DFT after removal of constant and slope; real parts then imaginary parts, (2F, T)."""
     line = np.vander(np.linspace(-1, 1, samples), 2)
     projection = np.eye(samples) - line @ np.linalg.pinv(line)

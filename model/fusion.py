@@ -44,7 +44,7 @@ def fused_noise(omega: FloatArray, dt: float, noise: tuple[float, float]) -> Flo
     """Standard deviation per sample of the fused displacement at angular frequencies omega."""
     one, two = omega * dt, 2 * omega * dt
     derivative = (20 * np.sin(one) + 2 * np.sin(two)) / 24 / ((66 + 52 * np.cos(one) + 2 * np.cos(two)) / 120) / dt
-    return 1 / np.sqrt(1 / noise[0] ** 2 + derivative**2 / noise[1] ** 2)
+    return np.asarray(1 / np.sqrt(1 / noise[0] ** 2 + derivative**2 / noise[1] ** 2), dtype=np.float64)
 
 
 @lru_cache(maxsize=32)

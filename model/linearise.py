@@ -68,7 +68,7 @@ class WindowModel:
         weight = np.full(self.bins, np.sqrt(2 / samples))
         weight[0] = np.sqrt(1 / samples)
         self.weight = torch.as_tensor(weight)
-        self.drive_noise = torch.as_tensor(self.frequency.input_noise())  # (F, W/2)
+        self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
         self.sensor_noise = system.sensor_noise
         self._compressions: dict[bytes, Tensor] = {}
 
@@ -90,15 +90,13 @@ class WindowModel:
                 at = np.flatnonzero(kind == motion)
                 if len(at):
                     q, r = np.linalg.qr(S[at] / noise[at, None])
-                    rank = np.linalg.matrix_rank(r)
+                    rank = int(np.linalg.matrix_rank(r))
                     basis = q[:, :rank] if rank == r.shape[1] else np.linalg.svd(S[at] / noise[at, None])[0][:, :rank]
                     block = np.zeros((rank, len(kind)))
                     block[:, at] = basis.T / noise[at]
                     blocks.append(block)
-            for at in np.flatnonzero(kind > DISPLACEMENT):
-                block = np.zeros((1, len(kind)))
-                block[0, at] = 1 / noise[at]
-                blocks.append(block)
+            of_elements = np.flatnonzero(kind > DISPLACEMENT)
+            blocks.append(np.diag(1 / noise)[of_elements])
             self._compressions[key] = torch.as_tensor(np.concatenate(blocks))
         return self._compressions[key]
 
@@ -180,25 +178,17 @@ class WindowModel:
         compliance = torch.linalg.inv(f.stiffness(values))
         kind = compliance.dtype
         Q = self.compression(data.present).to(kind) @ torch.eye(len(data.present), dtype=kind)[data.present]
-        if f.element_sensors:
-            per_load = Q @ (f.sensing(values) @ compliance)
-        else:
-            per_load = (Q @ f.motion_sensing) @ compliance
+        sensing = f.sensing(values) if f.element_sensors else f.motion_sensing
+        per_load = (Q @ sensing) @ compliance
         per_force = -per_load @ s.H.T.to(kind)
-        dynamic = torch.complex(
-            values.stiffness[:, None].expand(-1, self.bins, -1), f.omega[:, None] * values.damping[:, None]
-        )
+        dynamic = self.frequency.dynamic(values)
         drive = per_load.new_zeros(*per_load.shape[:3], s.W // 2)
         if len(s.supports):
             drive[..., s.supports // 2] = (per_force * dynamic.unsqueeze(2)) @ s.G.to(kind)
         if len(s.forces):
             drive[..., s.forces // 2] = per_load @ s.F.to(kind)
         if f.element_sensors:
-            of_d, of_v = f.element_gain(values)
-            through = torch.complex(
-                (of_d @ s.G)[:, None].expand(-1, self.bins, -1, -1), f.omega[:, None, None] * (of_v @ s.G)[:, None]
-            )
-            drive[..., s.supports // 2] += Q @ through
+            drive[..., s.supports // 2] += Q @ f.element_response(values, s.G)
             forces = torch.where((s.kind == FORCE)[:, None], s.L, torch.zeros_like(s.L))
             per_force = per_force + Q @ forces.to(kind)
         return compliance, per_force, drive * self.drive_noise[:, None]
@@ -231,9 +221,7 @@ class WindowModel:
         E = s.H.shape[0]
         # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
         kind = compliance.dtype
-        dynamic = torch.complex(
-            values.stiffness[:, None].expand(-1, self.bins, -1), self.frequency.omega[:, None] * values.damping[:, None]
-        )
+        dynamic = self.frequency.dynamic(values)
         support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)  # deflections, (B, F, E)
         load = -(dynamic * support) @ s.H.to(kind)
         if len(s.forces):

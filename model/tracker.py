@@ -105,7 +105,14 @@ class Tracker:
         if usable and mask.any() and _proper(estimate.covariance[np.ix_(mask, mask)]):
             new = self._fuse(state, estimate, mask, time_ns, centre)
         learning = bool(np.any(new.changes.learned < self.settings.learning))
-        fit = misfit.update(state.fit, estimate.chi_square, estimate.adequate, learning, centre)
+        fit = misfit.update(
+            state.fit,
+            estimate.chi_square,
+            adequate=estimate.adequate,
+            inflation=float(new.scatter.inflation.max()),
+            learning=learning,
+            time=centre,
+        )
         new = replace(new, time=time_ns, fit=fit)
         return replace(new, alarms=self._alarms(new, centre))
 
