@@ -250,11 +250,11 @@ class Problem:
             self.smooth(lin.spectrum, lin.residual)
             proposal = self.linearise(trial, _start(lin.forces))
             value = _objective(proposal.residual, trial)
-            if value <= best + 1e-6 * best or size < tolerance:
+            if value <= best + 0.5:
                 gained = best - value
                 point, lin, best = trial, proposal, value
                 damping = max(damping / 10, 1e-9)
-                if size < tolerance or (gained < 0.01 and size < 0.1):
+                if size < tolerance or gained < 0.02 * max(1.0, size):
                     converged = True
                     break
                 if count in (2, 4):
@@ -396,7 +396,7 @@ class Motions:
 
     deflection: ComplexArray  # (F, elements)
     rate: ComplexArray  # (F, elements)
-    acceleration: ComplexArray  # of the degrees of freedom, (F, n); empty when no mass is estimated
+    acceleration: ComplexArray  # of the degrees of freedom, (F, n)
 
 
 def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> Motions:
@@ -413,18 +413,14 @@ def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> M
     free = propagate(A, np.eye(2 * n), state, grid.step, grid.samples)
     d = periodic + grid.monomial_spectra @ d_poly + grid.forward(free[:, :n] @ s.H.T)
     v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n:] @ s.H.T)
-    acceleration = np.zeros((len(grid.omega), 0), dtype=complex)
-    if any(p.quantity == "mass" for p in forward.system.parameters):
-        q = np.zeros((len(grid.omega), n), dtype=complex)
-        if part.support.shape[1]:
-            loads = -(plant.impedance[:, None, :] * s.H.T) @ s.G
-            q += np.einsum("fnm,fmi,fi->fn", plant.receptance, loads, part.support, optimize=True)
-        if part.force.shape[1]:
-            q += np.einsum("fnm,fm->fn", plant.receptance, part.force @ s.F[:, : part.force.shape[1]].T)
-        if forces is not None:
-            q += forces.q
-        bend = plant.derivative(plant.derivative(q_poly))
-        acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
+    load = -((part.support @ s.G.T) * plant.impedance) @ s.H
+    if part.force.shape[1]:
+        load = load + part.force @ s.F[:, : part.force.shape[1]].T
+    q = np.einsum("fnm,fm->fn", plant.receptance, load)
+    if forces is not None:
+        q += forces.q
+    bend = plant.derivative(plant.derivative(q_poly))
+    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
     return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
 
 

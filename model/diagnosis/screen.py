@@ -1,0 +1,268 @@
+"""Every law at every place with every shape, as a score test on the residual of a fit.
+
+A candidate's force along the fitted motion, taken through the fitted system to the sensors and whitened, is a column
+c of unit-noise numbers, like the residual r and the fit's own sensitivities J.  With everything that J can imitate
+projected out, c' = c - Q Q^T c, the statistic (c'^T r)^2 / |c'|^2 is chi-square with one degree of freedom when the
+candidate is absent (Rao's score test), whatever the parameters have absorbed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import stats
+
+from model.diagnosis.catalogue import ElementLaw, Law, SpringDamper, observe
+from model.diagnosis.fit import Fit, Problem
+from model.diagnosis.hysteresis import force_along
+from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
+from model.diagnosis.terms import Term, impedance, is_waveform
+from model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Hit:
+    """One candidate as screened."""
+
+    term: Term  # with the amplitude that the screening found
+    score: float  # chi-square
+    freedom: int
+    family: str  # which group of tests it belongs to: "law", "mode", "line", "mass", "sensor", "input"
+    p_single: float
+    step: FloatArray | None = None  # what the fit's parameters and state would move by, (P + p + 2n,)
+
+    @property
+    def location(self) -> str:
+        return self.term.location
+
+    @property
+    def effect(self) -> str:
+        return self.term.law.name
+
+
+@dataclass(frozen=True)
+class Screening:
+    """All candidates, best first, with p-values corrected for everything that was tried."""
+
+    hits: tuple[Hit, ...]  # the best shape of every law at every place
+    tests: dict[str, int]  # how many were tried per family
+
+    def p_value(self, hit: Hit) -> float:
+        """Bonferroni over the family, then over the families."""
+        return float(min(1.0, hit.p_single * self.tests[hit.family] * len(self.tests)))
+
+    def localization(self) -> dict[str, float]:
+        best: dict[str, float] = {}
+        for hit in self.hits:
+            best[hit.location] = max(best.get(hit.location, 0.0), hit.score)
+        return dict(sorted(best.items(), key=lambda item: -item[1]))
+
+
+class Projector:
+    """Residual and candidates with the fit's sensitivities projected out."""
+
+    def __init__(self, problem: Problem, fit: Fit, project: bool = True) -> None:
+        jacobian = fit.jacobian if project else fit.jacobian[:, -len(fit.point.state) :]
+        scale = np.linalg.norm(jacobian, axis=0)
+        self.kept = scale > 1e-9 * max(scale.max(initial=0.0), 1e-300)
+        q, r = np.linalg.qr(jacobian[:, self.kept] / scale[self.kept])
+        strong = np.abs(np.diag(r)) > 1e-9
+        self.q, self.r, self.scale = q[:, strong], r, scale
+        self.strong = strong
+        self.residual = fit.residual - self.q @ (self.q.T @ fit.residual)
+        self.problem, self.fit = problem, fit
+        grid = problem.part.grid
+        self.grid = grid
+        assert problem.whitener is not None
+        factor = problem.whitener.factor
+        shown = fit.forward.sensor_factor[grid.band, :, None]
+        plant = fit.forward.plant
+        self.of_force = factor @ (plant.sensor_of_force[grid.band] * shown)  # whitened, (F, S, E)
+        self.of_load = factor @ (plant.sensor_of_load[grid.band] * shown)  # (F, S, n)
+        self.factor = factor
+
+    @cached_property
+    def complex_q(self) -> ComplexArray:
+        """The projection's basis as band spectra, (F, S, q)."""
+        return self.unpack(self.q)
+
+    @cached_property
+    def complex_residual(self) -> ComplexArray:
+        return self.unpack(self.residual)
+
+    def unpack(self, packed: FloatArray) -> ComplexArray:
+        """Real vectors (2 F S, ...) as weighted band spectra (F, S, ...)."""
+        half = len(packed) // 2
+        shape = (self.grid.band.stop, -1, *packed.shape[1:])
+        return (packed[:half] + 1j * packed[half:]).reshape(shape)
+
+    def pack(self, whitened: ComplexArray) -> FloatArray:
+        """Already whitened band spectra (F, S) as a real vector."""
+        weighted = whitened * self.grid.weight[:, None]
+        return np.concatenate([weighted.real.ravel(), weighted.imag.ravel()])
+
+    def score(self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """Statistic and amplitude of a column; `more`: product with, and square of, residuals outside the sensors."""
+        inside = self.q.T @ column
+        size = float(column @ column)
+        left = size - float(inside @ inside)
+        if left <= 1e-7 * size and more[1] <= 0:
+            return 0.0, 0.0
+        left = max(left, 1e-7 * size) + more[1]
+        product = float(column @ self.residual) + more[0]
+        return product**2 / left, product / left
+
+
+class Channel:
+    """Scores of columns that are one response (F, S) times a scalar spectrum h (F,): all trials at once."""
+
+    def __init__(self, projector: Projector, response: ComplexArray) -> None:
+        weighted = (response * projector.grid.weight[:, None]).conj()
+        self.product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
+        self.size = np.sum(np.abs(weighted) ** 2, axis=1)
+        self.inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+
+    def scores(self, h: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Statistics and amplitudes of trials h (trials, F)."""
+        conj = h.conj()
+        product = np.real(conj @ self.product)
+        size = np.abs(h) ** 2 @ self.size
+        inside = np.real(conj @ self.inside)
+        left = size - np.sum(inside**2, axis=1)
+        visible = left > 1e-7 * size
+        left = np.where(visible, left, 1.0)
+        return np.where(visible, product**2 / left, 0.0), np.where(visible, product / left, 0.0)
+
+
+def screen(
+    problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True, exclude: frozenset = frozenset()
+) -> Screening:
+    """Screen all candidates on the residual of a fit."""
+    from model.diagnosis.bodies import body_hits
+    from model.diagnosis.sensors import measurement_hits
+
+    projector = Projector(problem, fit, project)
+    hits: list[Hit] = []
+    tests: dict[str, int] = {}
+    for group in (element_hits, body_hits, measurement_hits):
+        for hit, count in group(projector, laws):
+            tests[hit.family] = tests.get(hit.family, 0) + count
+            if hit.score > 0 and hit.term.key not in exclude:
+                hits.append(hit)
+    hits.sort(key=lambda h: (h.p_single, -h.score))
+    return Screening(tuple(hits), tests or {"law": 1})
+
+
+def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+    """The best shape of every element law at every element or pair, and how many shapes were tried."""
+    system = projector.problem.system
+    d_all, v_all = element_motion(projector.fit)
+    channels: dict[str, Channel] = {}
+    for law in laws:
+        if not isinstance(law, ElementLaw):
+            continue
+        for location in places(system, law):
+            if location not in channels:
+                port = Term(law, location, law.absent).port(system)
+                channels[location] = Channel(projector, projector.of_force[:, :, : len(port)] @ port)
+            yield _best_shape(projector, law, location, d_all, v_all, channels[location])
+
+
+def places(system, law: ElementLaw) -> list[str]:
+    """Locations of an element law: elements, or pairs of elements between the same bodies at the same x."""
+    if law.where == "element":
+        return list(system.elements)
+    if law.where != "pair":
+        return []
+    pairs = []
+    items = list(system.file.elements.items())
+    for i, (a, first) in enumerate(items):
+        for b, second in items[i + 1 :]:
+            same = first.upper == second.upper and first.lower == second.lower
+            level = first.position and second.position and first.position[0] == second.position[0]
+            if same and level:
+                pairs.append(f"{a}|{b}")
+    return pairs
+
+
+def element_motion(fit: Fit) -> tuple[FloatArray, FloatArray]:
+    """Deflection and rate of every element along the fit, oversampled, 2 x (4N, E)."""
+    forward, forces = fit.forward, fit.forces
+    ports = np.eye(forward.elements)
+    d, v = forward.fine_motion(ports, fit.point.state)
+    if forces is not None:
+        grid = forward.part.grid
+        plant = forward.plant
+        H = plant.structure.H[: forward.elements]
+        spectrum = forces.deflections[:, : forward.elements]
+        polynomial = forces.motion @ H.T
+        powers = np.vander(grid.fine_time / grid.length, len(polynomial), increasing=True)
+        d = d + grid.fine(spectrum) + powers @ polynomial
+        v = v + grid.fine(1j * grid.omega[:, None] * spectrum) + powers @ plant.derivative(polynomial)
+    return d, v
+
+
+def _best_shape(
+    projector: Projector,
+    law: ElementLaw,
+    location: str,
+    d_all: FloatArray,
+    v_all: FloatArray,
+    channel: Channel,
+) -> tuple[Hit, int]:
+    fit, grid = projector.fit, projector.grid
+    system = projector.problem.system
+    probe = Term(law, location, law.absent)
+    port = probe.port(system)
+    d, v = d_all @ port, v_all @ port
+    element = fit.forward.element_of(probe)
+    seen = observe(
+        d[::OVERSAMPLING], v[::OVERSAMPLING], 1 / grid.step, float(element.stiffness), float(element.damping)
+    )
+    scales = tuple(max(abs(q.typical(seen)), 1e-12) for q in law.parameters)
+    trials = law.shapes(seen)
+    absent = Hit(Term(law, location, law.absent, scales=scales), 0.0, 1, "law", 1.0)
+    if not len(trials):
+        return absent, 0
+    terms = [Term(law, location, tuple(float(value) for value in trial), scales=scales) for trial in trials]
+    spectra = np.array([_force_spectrum(projector, term, d, v, element)[grid.band] for term in terms])
+    scores, amplitudes = channel.scores(spectra)
+    fine = np.array([_admissible(law, t, a) for t, a in zip(trials, amplitudes, strict=True)])
+    scores = np.where(fine, scores, 0.0)
+    i = int(np.argmax(scores))
+    if scores[i] <= 0:
+        return absent, len(trials)
+    found = law.clip(law.scaled(trials[i], float(amplitudes[i])))
+    term = Term(law, location, tuple(float(value) for value in found), scales=scales)
+    return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1))), len(trials)
+
+
+def _force_spectrum(
+    projector: Projector, term: Term, d: FloatArray, v: FloatArray, element: SpringDamper
+) -> ComplexArray:
+    """Spectrum of the law's force along a motion, (F,)."""
+    grid = projector.grid
+    if is_waveform(term):
+        time = grid.start + grid.fine_time
+        force = force_along(term.law, term.parameters, d, v, time, element)  # type: ignore[arg-type]
+        return grid.coarse_spectrum(force)
+    factor = impedance(term, grid.omega, float(element.damping))
+    assert factor is not None
+    # series impedances vanish at zero frequency, so the rate carries them and ends that do not meet do no harm
+    per_rate = np.zeros_like(factor)
+    per_rate[1:] = factor[1:] / (1j * grid.omega[1:])
+    return per_rate * grid.coarse_spectrum(v)
+
+
+def _admissible(law: ElementLaw, trial: FloatArray, amplitude: float) -> bool:
+    """Whether the amplitude found leaves the law's strength within its bounds."""
+    if law.strength is None:
+        return amplitude > 0
+    value = float(law.scaled(trial, amplitude)[law.strength])
+    spec = law.parameters[law.strength]
+    slack = 0.0 if spec.low == 0 and law.absent[law.strength] == 0 else abs(spec.high - spec.low)
+    return spec.low - 0.5 * min(slack, 1.0) <= value <= spec.high + 0.5 * min(slack, 1.0)
+
