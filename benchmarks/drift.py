@@ -25,7 +25,7 @@ from model.identify import Identifier
 from model.signals import Estimate, FloatArray
 from model.system import System, load_system
 from model.tracker import Tracker, TrackerSettings
-from model.tracking import changes, scatter
+from model.tracking import changes, misfit, scatter
 from model.tracking.settings import SECONDS_PER_MONTH
 from service.errors import UserError
 
@@ -143,6 +143,7 @@ def step_delays(
 class FalseAlarms:
     months: float  # vehicle-months that were run
     alarms: int
+    contradictions: int  # windows after which scatter alone would speak of a misfit
     crossings: FloatArray  # per vehicle-month, upward crossings of `NOISE_LEVELS` of the threshold
 
     @property
@@ -166,7 +167,7 @@ def false_alarms(covariances: FloatArray, months: float, rng: np.random.Generato
     size = covariances.shape[1]
     fleet, errors = Fleet(vehicles, size, settings), Errors(covariances, vehicles, rng)
     windows = int(np.ceil(months * SECONDS_PER_MONTH / settings.hop / vehicles))
-    alarms, crossings = 0, np.zeros(len(NOISE_LEVELS))
+    alarms, contradictions, crossings = 0, 0, np.zeros(len(NOISE_LEVELS))
     evidence = settings.evidence(size)
     quiet = np.zeros((vehicles, size), dtype=np.int8)
     highest = np.zeros((vehicles, size))
@@ -176,12 +177,13 @@ def false_alarms(covariances: FloatArray, months: float, rng: np.random.Generato
         opened = (state.active != 0) & (quiet == 0)
         alarms += int(np.count_nonzero(opened))
         quiet = state.active
+        contradictions += int(np.count_nonzero(fleet.scatter.square.max(axis=1) >= misfit.CONTRADICTION))
         now = np.maximum(state.up, state.down)
         for i, level in enumerate(NOISE_LEVELS * evidence):
             crossings[i] += np.count_nonzero((now >= level) & (highest < level))
         highest = np.where(now > 0, np.maximum(highest, now), 0.0)  # one crossing per excursion from zero
     run = windows * vehicles * settings.hop / SECONDS_PER_MONTH
-    return FalseAlarms(run, alarms, crossings / run)
+    return FalseAlarms(run, alarms, contradictions, crossings / run)
 
 
 def run(budget: str = "quick", *, seed: int = 1, system: Path | None = None) -> Iterator[dict[str, Any]]:
@@ -317,6 +319,8 @@ def _false_alarm_figures(covariances: FloatArray, months: float, rng: np.random.
     yield _figure("false_alarms_designed", design, "1/vehicle-month", "< 1", "closed form, docs/tracking.md")
     yield _figure("false_alarms_counted", float(result.alarms), "1", "0", f"in {result.months:.1f} vehicle-months")
     yield _figure("false_alarms_bound", result.bound, "1/vehicle-month", "< 1", "95 % upper bound from the count")
+    note = f"windows whose scatter alone would count against the fit, in {result.months:.1f} vehicle-months"
+    yield _figure("false_contradictions", float(result.contradictions), "1", "0", note)
     read = ", ".join(f"{level:g}: {rate:.3g}" for level, rate in zip(NOISE_LEVELS, result.crossings, strict=True))
     note = f"exponential tail through excursions a month beyond shares of the evidence needed ({read})"
     yield _figure("false_alarms_extrapolated", result.extrapolated, "1/vehicle-month", "< 1", note)

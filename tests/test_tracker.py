@@ -184,6 +184,34 @@ def test_residual_power_above_the_vehicles_own_floor_is_a_misfit_though_each_win
     assert state.misfit_since is not None
 
 
+def test_windows_that_contradict_each_other_are_a_misfit_though_each_fits() -> None:
+    rng = np.random.default_rng(19)
+    tracker = make_tracker(4)
+    covariance = correlated(rng, np.full(4, 0.01))
+    wild = windows(rng, constant(np.zeros(4)), 120, covariance, scatter=2.2)
+    state = tracker.update_many(tracker.initial_state(), wild)
+    assert [alarm.kind for alarm in state.active] == ["misfit"]
+    calm = windows(rng, constant(np.zeros(4)), 240, covariance, start=120.0)
+    assert tracker.update_many(state, calm).active == ()
+
+
+def test_wear_that_takes_a_quarter_of_an_hour_alarms() -> None:
+    rng = np.random.default_rng(20)
+    tracker = make_tracker(4)
+    covariance = correlated(rng, np.array([0.004, 0.016, 0.01, 0.008]))
+
+    def truth(time: float) -> FloatArray:
+        return np.array([0.0, -1e-4 * max(0.0, time - 60.0), 0.0, 0.0])
+
+    state = tracker.update_many(tracker.initial_state(), windows(rng, truth, 900, covariance))
+    (alarm,) = state.alarms
+    assert alarm.parameter == tracker.names[1]
+    assert alarm.change is not None
+    assert alarm.std is not None
+    assert alarm.change == pytest.approx(np.expm1(-0.084), abs=4 * alarm.std)
+    assert 0.015 < 1e-4 * ((alarm.opened - EPOCH) * 1e-9 - 60.0) < 0.06
+
+
 def test_components_that_a_window_does_not_tell_keep_their_prior_and_disturb_nobody() -> None:
     rng = np.random.default_rng(10)
     tracker = make_tracker(6)
@@ -213,12 +241,12 @@ def test_windows_that_scatter_more_than_they_say_widen_the_posterior() -> None:
     tracker = make_tracker()
     scores = []
     for _ in range(3):
-        stream = windows(rng, constant(np.zeros(24)), 150, correlated(rng), scatter=2.0)
+        stream = windows(rng, constant(np.zeros(24)), 150, correlated(rng), scatter=1.4)
         state = tracker.update_many(tracker.initial_state(), stream)
         mean, std = tracker.posterior(state)
         scores.append(mean / std)
-        assert np.sqrt(state.scatter.inflation.mean()) == pytest.approx(2.0, rel=0.15)
-        assert state.alarms == ()
+        assert np.sqrt(state.scatter.inflation.mean()) == pytest.approx(1.4, rel=0.1)
+        assert all(alarm.kind == "misfit" for alarm in state.alarms)
     assert np.sqrt(np.mean(np.square(scores))) < 1.15
 
 

@@ -163,10 +163,10 @@ def test_surprise_fires_for_a_lasting_offset_and_hardly_ever_without() -> None:
 def test_one_bad_window_is_no_misfit() -> None:
     fit = misfit.Fit()
     for k in range(50):
-        fit = misfit.update(fit, 1.0, True, True, k)
-    fit = misfit.update(fit, 50.0, False, False, 50)
-    fit = misfit.update(fit, float("nan"), False, False, 51)
+        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, learning=True, time=k)
+    fit = misfit.update(fit, 50.0, adequate=False, inflation=1.0, learning=False, time=50)
+    fit = misfit.update(fit, float("nan"), adequate=False, inflation=1.0, learning=False, time=51)
     assert fit.misfit_since is None
     for k in range(20):
-        fit = misfit.update(fit, 1.0, True, False, 52 + k)
+        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, learning=False, time=52 + k)
     assert fit.statistic == 0.0

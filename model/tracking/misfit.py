@@ -1,4 +1,9 @@
-"""Do windows still fit?  Their residual power against the vehicle's own noise floor, and the estimator's verdict."""
+"""Do windows still fit?
+
+Three things speak against: the estimator's verdict on a window, residual power above the vehicle's own noise floor,
+and estimates of neighbouring windows that contradict each other.  The last finds what one window cannot: a law that
+was left out lets each window fit with parameters of its own (hysteresis, for one).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +13,8 @@ from dataclasses import dataclass, replace
 REFERENCE = 2.0  # standard deviations above the floor that count as normal
 MOST = 4.0  # one window adds at most this less REFERENCE
 THRESHOLD = 20.0  # so ten windows in a row at least; 2 h k = 80: Gaussian scatter alone never gets there
+CONTRADICTION = 2.5  # scatter over what windows state, as variances; by chance 1 + 6 standard deviations of 60 pairs
+AGREEMENT = 1.8  # once contradicting, windows agree again below this
 LEAST_SPREAD = 0.1  # of log chi-square; windows of one vehicle differ by that with speed and track
 
 
@@ -23,8 +30,11 @@ class Fit:
     misfit_since: int | None = None  # ns; None: windows fit
 
 
-def update(fit: Fit, chi_square: float, adequate: bool, learning: bool, time: int) -> Fit:
-    """After one window; `time` in ns.  The floor is learned from adequate windows while `learning`."""
+def update(fit: Fit, chi_square: float, *, adequate: bool, inflation: float, learning: bool, time: int) -> Fit:
+    """After one window; `time` in ns, `inflation` the largest scatter of a parameter over what windows state.
+
+    The floor is learned from adequate windows while `learning`.
+    """
     usable = math.isfinite(chi_square) and chi_square > 0
     level = math.log(chi_square) if usable else math.inf
     if adequate and usable and learning:
@@ -32,7 +42,8 @@ def update(fit: Fit, chi_square: float, adequate: bool, learning: bool, time: in
         mean = fit.mean + (level - fit.mean) / count
         fit = replace(fit, windows=count, mean=mean, moment=fit.moment + (level - fit.mean) * (level - mean))
     score = MOST
-    if adequate and usable:
+    contradicting = inflation >= (CONTRADICTION if fit.misfit_since is None else AGREEMENT)
+    if adequate and usable and not contradicting:
         spread = max(LEAST_SPREAD, math.sqrt(fit.moment / max(fit.windows - 1, 1)))
         score = min(MOST, (level - fit.mean) / spread) if fit.windows else 0.0
     statistic = min(max(0.0, fit.statistic + max(score, -MOST) - REFERENCE), 1.5 * THRESHOLD)
