@@ -17,8 +17,11 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from model.signals import IntArray
 from replay.account import Account, UnreadableRecording
-from replay.frames import FrameBlock
+from replay.frames import ByteArray, FrameBlock
+
+IndexArray = NDArray[np.intp]
 
 FILE_HEADER = struct.Struct("<4sLBBBBBBBBQQLL8H8H")
 OBJECT_BASE = struct.Struct("<4sHHLL")  # signature, header size, header version, object size, type
@@ -29,6 +32,7 @@ HEADER_BYTES = {1: 32, 2: 40}  # base and rest, by header version
 TEN_MICROSECONDS = 1  # value of the object's flags: the time stamp counts 10 us, else 1 ns
 LARGEST_OBJECT = 1 << 28
 RESYNC_BYTES = 1 << 20
+BATCH_BYTES = 1 << 19  # of inflated objects that are read together
 
 
 def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
@@ -42,6 +46,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         reader = _Objects(_system_time(fields[14:22], account), account)
         for data in _containers(file, account):
             yield from reader.read(data)
+    yield from reader.flush()
     if reader.tail.strip(b"\0"):
         account.problem(f"file ends inside an object after {reader.seconds:.1f} s; what came before was read")
     expected = fields[12]  # number of objects that the writer counted; 0 when it did not finish
@@ -124,50 +129,74 @@ class _Objects:
 
     def read(self, data: bytes | None) -> Iterator[FrameBlock]:
         if data is None:  # the rest of a straddling object is lost
+            yield from self.flush()
             self.tail = b""
             return
-        data = self.tail + data
+        self.tail += data
+        if len(self.tail) >= BATCH_BYTES:
+            yield from self.flush()
+
+    def flush(self) -> Iterator[FrameBlock]:
+        """The objects that are whole; an unfinished one stays in `tail`."""
+        data = self.tail
         offsets, kinds, end = self._walk(data)
         self.tail = data[end:]
-        if not offsets:
+        if not len(offsets):
             return
         self.objects += len(offsets)
         octets = np.frombuffer(data, dtype=np.uint8)
-        block = _columns(octets, np.array(offsets), np.array(kinds), self.start, self.account)
+        block = _columns(octets, offsets, kinds, self.start, self.account)
         if block is not None:
             self.seconds = (int(block.time[-1]) - self.start) / 1e9
             yield block
 
-    def _walk(self, data: bytes) -> tuple[list[int], list[int], int]:
+    def _walk(self, data: bytes) -> tuple[IndexArray, IntArray, int]:
         """Offsets and types of the whole objects, and where the unfinished rest begins."""
-        offsets: list[int] = []
-        kinds: list[int] = []
-        find, unpack, total = data.find, OBJECT_BASE.unpack_from, len(data)
-        position = 0
+        runs: list[tuple[IndexArray, int]] = []
+        total, position, end = len(data), 0, 0
         while position + OBJECT_BASE.size <= total:
-            found = find(b"LOBJ", position, position + 8)
+            found = data.find(b"LOBJ", position, position + 8)
             if found < 0:
-                found = find(b"LOBJ", position)
-                if position:
+                found = data.find(b"LOBJ", position)
+                if runs:
                     self.account.problem("a damaged object inside a container was passed over")
                 if found < 0:
-                    return offsets, kinds, total
+                    end = total
+                    break
+            end = found
             if found + OBJECT_BASE.size > total:
-                return offsets, kinds, found
-            _, _, _, size, kind = unpack(data, found)
-            if size < OBJECT_BASE.size or size > LARGEST_OBJECT:
+                break
+            _, _, _, size, kind = OBJECT_BASE.unpack_from(data, found)
+            if not OBJECT_BASE.size <= size <= LARGEST_OBJECT:
                 position = found + 4
                 continue
             if found + size > total:
-                return offsets, kinds, found
-            offsets.append(found)
-            kinds.append(kind)
-            position = found + size
-        return offsets, kinds, position
+                break
+            count = _alike(data, found, size)
+            runs.append((found + size * np.arange(count), kind))
+            position = end = found + size * count
+        if not runs:
+            return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.int64), end
+        offsets = np.concatenate([run for run, _ in runs])
+        return offsets, np.repeat([kind for _, kind in runs], [len(run) for run, _ in runs]), end
+
+
+def _alike(data: bytes, offset: int, size: int) -> int:
+    """Number of objects of the same size and type that follow each other from `offset` on; at least 1."""
+    count, most = 1, (len(data) - offset) // size if size % 4 == 0 else 1
+    while count < most:  # in growing steps, so that mixed objects cost little
+        reach = min(4 * count, most)
+        words = np.frombuffer(data, "<u4", reach * size // 4, offset).reshape(reach, -1)
+        same = (words[:, 0] == words[0, 0]) & (words[:, 2] == words[0, 2]) & (words[:, 3] == words[0, 3])
+        run = reach if same.all() else int(np.argmin(same))
+        if run < reach:
+            return run
+        count = reach
+    return count
 
 
 def _columns(
-    octets: NDArray[np.uint8], offsets: NDArray[np.intp], kinds: NDArray[np.intp], start: int, account: Account
+    octets: ByteArray, offsets: IndexArray, kinds: IntArray, start: int, account: Account
 ) -> FrameBlock | None:
     account.foreign(int(np.isin(kinds, ERROR_TYPES).sum()), "error frame")
     is_classic, is_fd, is_fd64 = np.isin(kinds, CLASSIC_TYPES), kinds == FD_TYPE, kinds == FD64_TYPE
@@ -196,12 +225,12 @@ def _columns(
     return FrameBlock(start + (ticks * unit)[keep], identifier[keep], length[keep], data[keep])
 
 
-def _field(octets: NDArray[np.uint8], offsets: NDArray[np.intp], dtype: str) -> NDArray[np.unsignedinteger]:
+def _field(octets: ByteArray, offsets: IndexArray, dtype: str) -> NDArray[np.unsignedinteger]:
     size = np.dtype(dtype).itemsize
     return np.ascontiguousarray(octets[offsets[:, None] + np.arange(size)]).view(dtype)[:, 0]
 
 
-def _clipped(octets: NDArray[np.uint8], offsets: NDArray[np.intp]) -> NDArray[np.uint8]:
+def _clipped(octets: ByteArray, offsets: IndexArray) -> ByteArray:
     return octets[np.minimum(offsets, len(octets) - 1)]
 
 

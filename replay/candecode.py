@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from model.signals import BoolArray, Channel, FloatArray, SampleBlock
 from replay.account import Account, UnreadableRecording
-from replay.frames import EXTENDED, FrameBlock, WordArray, id_text, last_byte, raw_bits
+from replay.frames import EXTENDED, ByteArray, FrameBlock, WordArray, id_text, last_byte, raw_bits
 
 INVALID_CHOICE = re.compile(
     r"invalid|not[ _]?(available|avail|valid|supported|defined|used)|unavailable|unknown|undefined|"
@@ -40,7 +40,7 @@ class Bits:
     length: int
     big_endian: bool
 
-    def raw(self, data: NDArray[np.uint8]) -> WordArray:
+    def raw(self, data: ByteArray) -> WordArray:
         """Unsigned integers of the signal, shape (n,)."""
         return raw_bits(data, self.start, self.length, big_endian=self.big_endian)
 
@@ -64,23 +64,43 @@ class SignalPlan:
     invalid_raw: tuple[int, ...]  # raw values, as unsigned integers, that mark a missing value
     conditions: tuple[tuple[Bits, tuple[int, ...]], ...]  # multiplexer fields and the values that select it
 
-    def values(self, data: NDArray[np.uint8]) -> tuple[FloatArray, BoolArray, BoolArray]:
-        """Physical values (NaN where missing), which were marked invalid, which were out of range: (n,) each."""
+    def values(self, data: ByteArray) -> tuple[FloatArray, BoolArray | None, BoolArray | None]:
+        """Physical values (NaN where missing), which were marked invalid, which were out of range: (n,) each; None
+        stands for "none of them" and costs nothing."""
         raw = self.bits.raw(data)
-        with np.errstate(invalid="ignore", over="ignore"):  # a float signal may carry any bits
-            physical = self._number(raw) * self.scale + self.offset
-        invalid = ~np.isfinite(physical)
-        for code in self.invalid_raw:
-            invalid |= raw == np.uint64(code)
-        outside = np.zeros(len(raw), dtype=bool)
-        slack = 0.5 * abs(self.scale) if self.kind != "float" else 0.0  # decimal limits are rounded
-        if self.minimum is not None:
-            outside |= physical < self.minimum - slack
-        if self.maximum is not None:
-            outside |= physical > self.maximum + slack
-        outside &= ~invalid
-        physical[invalid | outside] = np.nan
+        if self.kind == "float":
+            with np.errstate(invalid="ignore", over="ignore"):  # a float signal may carry any bits
+                physical = self._number(raw) * self.scale + self.offset
+            invalid = _any(~np.isfinite(physical))
+        else:
+            physical = self._number(raw)
+            if self.scale != 1.0:
+                physical *= self.scale
+            if self.offset != 0.0:
+                physical += self.offset
+            invalid = None
+        if self.invalid_raw:
+            invalid = _any(
+                np.isin(raw, np.array(self.invalid_raw, dtype=np.uint64)) | (False if invalid is None else invalid)
+            )
+        outside = self._outside(physical)
+        if invalid is not None:
+            outside = _any(outside & ~invalid) if outside is not None else None
+            physical[invalid] = np.nan
+        if outside is not None:
+            physical[outside] = np.nan
         return physical, invalid, outside
+
+    def _outside(self, physical: FloatArray) -> BoolArray | None:
+        """Values beyond the database's range, by more than the rounding of its decimal limits."""
+        slack = 0.5 * abs(self.scale) if self.kind != "float" else 0.0
+        outside = None
+        if self.minimum is not None:
+            outside = _any(physical < self.minimum - slack)
+        if self.maximum is not None:
+            above = _any(physical > self.maximum + slack)
+            outside = above if outside is None else outside if above is None else outside | above
+        return outside
 
     def _number(self, raw: WordArray) -> FloatArray:
         length = self.bits.length
@@ -92,12 +112,16 @@ class SignalPlan:
             return ((raw << shift).view(np.int64) >> np.int64(64 - length)).astype(np.float64)
         return raw.astype(np.float64)
 
-    def selected(self, data: NDArray[np.uint8]) -> BoolArray:
+    def selected(self, data: ByteArray) -> BoolArray:
         """Frames whose multiplexer fields select this signal, shape (n,)."""
         chosen = np.ones(len(data), dtype=bool)
         for bits, codes in self.conditions:
             chosen &= np.isin(bits.raw(data), np.array(codes, dtype=np.uint64))
         return chosen
+
+
+def _any(mask: BoolArray) -> BoolArray | None:
+    return mask if mask.any() else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +136,11 @@ class MessagePlan:
     def multiplexed(self) -> bool:
         return any(signal.conditions for signal in self.signals)
 
+    @property
+    def end(self) -> int:
+        """Bytes that a frame needs to hold all of the wanted signals."""
+        return max(signal.bits.end for signal in self.signals)
+
 
 class CanDecoder:
     """Blocks of frames in, blocks of samples out; every frame goes into the account."""
@@ -124,16 +153,23 @@ class CanDecoder:
     def decode(self, frames: FrameBlock, account: Account) -> SampleBlock:
         """Samples of the wanted signals in the order of the frames; a missing value is NaN."""
         place = np.minimum(np.searchsorted(self.ids, frames.id), len(self.ids) - 1)
-        ours = self.ids[place] == frames.id
-        self._count_contents(frames, ours, account)
-        account.foreign(int((~ours).sum()))
+        place[self.ids[place] != frames.id] = len(self.ids)
         most = max(len(plan.signals) for plan in self.plans)
-        value = np.full((len(ours), most), np.nan)  # (n, most) keeps the order of the frames
-        channel = np.full((len(ours), most), -1, dtype=np.int32)
+        value = np.empty((len(place), most))  # (n, most) keeps the order of the frames
+        channel = np.full((len(place), most), -1, dtype=np.int32)
+        ours = 0
         for index, plan in enumerate(self.plans):
-            rows = np.flatnonzero(ours & (place == index))
+            rows = np.flatnonzero(place == index)
             if len(rows):
-                self._decode_message(plan, frames, rows, value, channel, account)
+                ours += len(rows)
+                account.contents[id_text(plan.frame_id)] += len(rows)
+                width = len(plan.signals)
+                value[rows, :width], channel[rows, :width] = self._decode_message(
+                    plan, frames.data[rows], frames.length[rows], account
+                )
+        if ours < len(place):
+            account.foreign(len(place) - ours)
+            self._count_foreign(frames.id[place == len(self.ids)], account)
         time = np.repeat(frames.time, most)
         flat = channel.reshape(-1)
         if np.all(flat >= 0):
@@ -142,45 +178,64 @@ class CanDecoder:
         return SampleBlock(time[keep], flat[keep], value.reshape(-1)[keep])
 
     def _decode_message(
-        self,
-        plan: MessagePlan,
-        frames: FrameBlock,
-        rows: NDArray[np.intp],
-        value: FloatArray,
-        channel: NDArray[np.int32],
-        account: Account,
-    ) -> None:
-        data, length = frames.data[rows], frames.length[rows]
-        if data.shape[1] < max(signal.bits.end for signal in plan.signals):  # an FD layout in a classic block
-            data = np.pad(data, ((0, 0), (0, 64 - data.shape[1])))
-        wanted = np.zeros(len(rows), dtype=bool)
-        short = np.zeros(len(rows), dtype=bool)
-        usable = np.zeros(len(rows), dtype=bool)
+        self, plan: MessagePlan, data: ByteArray, length: ByteArray, account: Account
+    ) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Values and channels (-1: nothing there), shape (n, wanted signals), of the frames of one message."""
+        if plan.multiplexed or length.min() < plan.end:
+            return _decode_piecewise(plan, data, length, account)
+        value = np.empty((len(data), len(plan.signals)))
+        missing = False
         for column, signal in enumerate(plan.signals):
-            chosen = signal.selected(data)
-            lacking = chosen & (length < signal.bits.end)
-            for bits, _ in signal.conditions:
-                lacking |= length < bits.end
-            chosen &= ~lacking
-            short |= lacking
-            wanted |= chosen
-            physical, invalid, outside = signal.values(data)
-            usable |= chosen & ~np.isnan(physical)
-            account.values["marked invalid"] += int((invalid & chosen).sum())
-            account.values["outside the database's range"] += int((outside & chosen).sum())
-            value[rows, column] = physical
-            channel[rows, column] = np.where(chosen, signal.channel, -1)
-        channel[rows[short]] = -1
-        account.corrupt(int(short.sum()), "frame shorter than its message")
-        account.foreign(int((~wanted & ~short).sum()), "other multiplexer value")
-        account.drop(int((wanted & ~usable & ~short).sum()), "no valid value")
-        account.tally.used += int((wanted & usable & ~short).sum())
+            value[:, column], invalid, outside = signal.values(data)
+            if invalid is not None or outside is not None:
+                missing = True
+                _count_missing(invalid, outside, None, account)
+        lost = int(np.isnan(value).all(axis=1).sum()) if missing else 0
+        account.drop(lost, "no valid value")
+        account.tally.used += len(data) - lost
+        channel = np.array([signal.channel for signal in plan.signals], dtype=np.int32)
+        return value, np.broadcast_to(channel, value.shape)
 
-    def _count_contents(self, frames: FrameBlock, ours: BoolArray, account: Account) -> None:
-        if not (ours.all() and account.contents):
-            found, counts = np.unique(frames.id, return_counts=True)
-            for frame_id, count in zip(found.tolist(), counts.tolist(), strict=True):
-                account.contents[id_text(frame_id)] += count
+    def _count_foreign(self, ids: NDArray[np.uint32], account: Account) -> None:
+        for frame_id, count in zip(*(part.tolist() for part in np.unique(ids, return_counts=True)), strict=True):
+            account.contents[id_text(frame_id)] += count
+
+
+def _decode_piecewise(
+    plan: MessagePlan, data: ByteArray, length: ByteArray, account: Account
+) -> tuple[FloatArray, NDArray[np.int32]]:
+    """As `_decode_message`, where not every frame holds every signal."""
+    if data.shape[1] < plan.end:  # an FD layout in a classic block
+        data = np.pad(data, ((0, 0), (0, 64 - data.shape[1])))
+    shape = (len(data), len(plan.signals))
+    value, channel = np.full(shape, np.nan), np.full(shape, -1, dtype=np.int32)
+    short = np.zeros(len(data), dtype=bool)
+    for column, signal in enumerate(plan.signals):
+        chosen = signal.selected(data)
+        lacking = chosen & (length < signal.bits.end)
+        for bits, _ in signal.conditions:
+            lacking |= length < bits.end
+        chosen &= ~lacking
+        short |= lacking
+        value[:, column], invalid, outside = signal.values(data)
+        _count_missing(invalid, outside, chosen, account)
+        channel[chosen, column] = signal.channel
+    channel[short] = -1
+    wanted = (channel >= 0).any(axis=1)
+    usable = ((channel >= 0) & ~np.isnan(value)).any(axis=1)
+    account.corrupt(int(short.sum()), "frame shorter than its message")
+    account.foreign(int((~wanted & ~short).sum()), "other multiplexer value")
+    account.drop(int((wanted & ~usable).sum()), "no valid value")
+    account.tally.used += int(usable.sum())
+    return value, channel
+
+
+def _count_missing(
+    invalid: BoolArray | None, outside: BoolArray | None, chosen: BoolArray | None, account: Account
+) -> None:
+    for mask, reason in ((invalid, "marked invalid"), (outside, "outside the database's range")):
+        if mask is not None:
+            account.values[reason] += int((mask if chosen is None else mask & chosen).sum())
 
 
 def load_database(path: Path) -> Database:
@@ -232,17 +287,35 @@ def _signal_plan(index: int, signal: Signal, signals: dict[str, Signal], message
     unsigned = not signal.is_signed and not conversion.is_float
     if unsigned and signal.length >= ALL_ONES_BITS and (not ranged or message.protocol == "j1939"):
         invalid.add(full)
+    minimum, maximum = _binding_limits(signal) if ranged else (None, None)
     return SignalPlan(
         channel=index,
         bits=_bits(signal),
         kind="float" if conversion.is_float else "signed" if signal.is_signed else "unsigned",
         scale=float(conversion.scale),
         offset=float(conversion.offset),
-        minimum=float(signal.minimum) if ranged and signal.minimum is not None else None,
-        maximum=float(signal.maximum) if ranged and signal.maximum is not None else None,
+        minimum=minimum,
+        maximum=maximum,
         invalid_raw=tuple(sorted(invalid)),
         conditions=tuple(_conditions(signal, signals)),
     )
+
+
+def _binding_limits(signal: Signal) -> tuple[float | None, float | None]:
+    """The limits of the database that some bit pattern can exceed; the others need no check."""
+    minimum = None if signal.minimum is None else float(signal.minimum)
+    maximum = None if signal.maximum is None else float(signal.maximum)
+    if signal.conversion.is_float:
+        return minimum, maximum
+    scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+    lowest = -(1 << (signal.length - 1)) if signal.is_signed else 0
+    ends = sorted((lowest * scale + offset, (lowest + (1 << signal.length) - 1) * scale + offset))
+    slack = 0.5 * abs(scale)
+    if minimum is not None and ends[0] >= minimum - slack:
+        minimum = None
+    if maximum is not None and ends[1] <= maximum + slack:
+        maximum = None
+    return minimum, maximum
 
 
 def _choices(signal: Signal) -> Iterable[tuple[int, str]]:

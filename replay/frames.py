@@ -38,6 +38,11 @@ def raw_bits(data: ByteArray, start: int, length: int, *, big_endian: bool) -> W
     significant bit (sawtooth numbering) of a big-endian one; `length` is 1..64 bits.  A signal touches at most
     nine bytes: eight are read as one word, a ninth is shifted in.
     """
+    if data.shape[1] == 8 and data.flags.c_contiguous:  # a classic frame is one word
+        if big_endian:
+            last_bit = 8 * (start // 8) + 7 - start % 8 + length - 1
+            return _masked(data.view(">u8")[:, 0].astype(np.uint64) >> np.uint64(63 - last_bit), length)
+        return _masked(data.view("<u8")[:, 0] >> np.uint64(start), length)
     if big_endian:
         first_bit = 8 * (start // 8) + 7 - start % 8  # distance from the first bit on the wire
         last_bit = first_bit + length - 1
@@ -55,9 +60,11 @@ def raw_bits(data: ByteArray, start: int, length: int, *, big_endian: bool) -> W
     bits = word.view("<u8")[:, 0].astype(np.uint64, copy=False) >> np.uint64(drop)
     if len(columns) == 9:
         bits |= columns[8].astype(np.uint64) << np.uint64(64 - drop)
-    if length < 64:
-        bits &= np.uint64((1 << length) - 1)
-    return bits
+    return _masked(bits, length)
+
+
+def _masked(bits: WordArray, length: int) -> WordArray:
+    return bits & np.uint64((1 << length) - 1)
 
 
 def last_byte(start: int, length: int, *, big_endian: bool) -> int:
