@@ -99,7 +99,7 @@ class MemoryStep:
         self.f2 = 2 * h * (two - 2 * three)
         self.f3 = h * (4 * three - two)
 
-    def source(self, d: FloatArray, v: FloatArray, t: float, z: FloatArray) -> FloatArray:
+    def source(self, d: FloatArray, v: FloatArray, t: float | FloatArray, z: FloatArray) -> FloatArray:
         return self.law.memory_rate(Motion(d, v, t, z), self.p, self.element) + self.decay * z
 
 
