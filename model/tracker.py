@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 STALE_PAIR = 5.0  # windows; a pair further apart than this does not measure scatter, for a drift may enter
+OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -207,6 +208,8 @@ class Tracker:
         if state.last is not None:
             belief = kalman.predict(belief, elapsed, process, settings.prior)
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
+        reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.inflation)
+        plausible = np.clip(value, belief.level - reach, belief.level + reach)
         watch, jumped = surprise.update(
             state.surprise, value - belief.level, belief.level_variance + fresh, mask & known
         )
@@ -221,6 +224,7 @@ class Tracker:
             seconds=share * settings.window,
             time=centre,
             settings=settings,
+            plausible=plausible,
         )
         return replace(
             state,

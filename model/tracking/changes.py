@@ -63,22 +63,41 @@ def update(
     seconds: float,  # of signal that no earlier window held
     time: int,  # ns, centre of the window
     settings: TrackerSettings,
+    plausible: FloatArray | None = None,  # `value` with outliers pulled in, for the baseline, shape (..., P)
 ) -> Changes:
-    """After one window: learns or tests."""
-    evidence = settings.evidence(value.shape[-1])
-    learned = changes.learned + np.where(mask, seconds, 0.0)
+    """After one window: tests, then learns."""
     armed = mask & (changes.learned >= settings.learning)
-    safe = np.where(mask, variance, 1.0)
+    variance = np.where(mask, variance, 1.0)
+    tested, highest, threshold = _tested(changes, value, variance, armed, time, settings)
+    quiet = (highest < QUIET * threshold) & (tested.active == 0)
+    refining = quiet & (changes.weight < settings.baseline_std**-2)
+    gain = np.where(mask & (~armed | refining), 1.0 / variance, 0.0)
+    return replace(
+        tested,
+        learned=changes.learned + np.where(mask, seconds, 0.0),
+        weight=changes.weight + gain,
+        weighted=changes.weighted + gain * np.where(mask, value if plausible is None else plausible, 0.0),
+    )
+
+
+def _tested(
+    changes: Changes,
+    value: FloatArray,
+    variance: FloatArray,
+    armed: BoolArray,
+    time: int,
+    settings: TrackerSettings,
+) -> tuple[Changes, FloatArray, FloatArray]:
+    """Statistics and alarms after one window where `armed`; the larger statistic and the threshold, (..., P)."""
     baseline = changes.weighted / np.maximum(changes.weight, np.finfo(float).tiny)
     spread = 1.0 / np.maximum(changes.weight, settings.prior**-2)
-    size, threshold = design(evidence, settings.change, spread)
+    size, threshold = design(settings.evidence(value.shape[-1]), settings.change, spread)
     offset = np.where(armed, value - baseline, 0.0)
-    scale = np.where(armed, size / safe, 0.0)
+    scale = np.where(armed, size / variance, 0.0)
     most = threshold / STEPS
     up = _page(changes.up, scale * (offset - size / 2), most, threshold)
     down = _page(changes.down, scale * (-offset - size / 2), most, threshold)
-    up_since = np.where((changes.up == 0) & (up > 0), time, changes.up_since)
-    down_since = np.where((changes.down == 0) & (down > 0), time, changes.down_since)
+    highest = np.maximum(up, down)
 
     closed, active, recovery = np.zeros_like(armed), changes.active, changes.recovery
     if active.any():
@@ -87,24 +106,18 @@ def update(
         recovery = _page(recovery, np.where(active != 0, healthy, 0.0), most, threshold)
         closed = (active != 0) & (recovery >= settings.recovery_evidence)
         active = np.where(closed, 0, active)
-    highest = np.maximum(up, down)
     crossed = armed & (active == 0) & ~closed & (highest >= threshold)
     active = np.where(crossed, np.where(up >= down, 1, -1), active).astype(np.int8)
-
-    quiet = (highest < QUIET * threshold) & (active == 0) & (spread > settings.baseline_std**2)
-    learning = mask & (~armed | quiet)
-    gain = np.where(learning, 1.0 / safe, 0.0)
-    return Changes(
-        learned,
-        changes.weight + gain,
-        changes.weighted + gain * np.where(mask, value, 0.0),
-        np.where(closed, 0.0, up),
-        np.where(closed, 0.0, down),
-        up_since,
-        down_since,
-        np.where(active == 0, 0.0, recovery),
-        active,
+    tested = replace(
+        changes,
+        up=np.where(closed, 0.0, up),
+        down=np.where(closed, 0.0, down),
+        up_since=np.where((changes.up == 0) & (up > 0), time, changes.up_since),
+        down_since=np.where((changes.down == 0) & (down > 0), time, changes.down_since),
+        recovery=np.where(active == 0, 0.0, recovery),
+        active=active,
     )
+    return tested, highest, threshold
 
 
 def _page(statistic: FloatArray, increment: FloatArray, most: FloatArray, threshold: FloatArray) -> FloatArray:
