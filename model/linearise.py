@@ -165,6 +165,44 @@ class WindowModel:
         at = torch.as_tensor(data.present)
         return states @ discrete.C[:, at].mT + data.w @ discrete.D[:, at].mT, states
 
+    def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
+        """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
+
+        Near one, the window holds no excitation of the parameter: what looks like information is noise.
+        """
+        s, f = self.simulator, self.frequency
+        values = s.element_values(at.x)
+        compliance, per_force, carried = self._transfer(values, data)
+        kind = compliance.dtype
+        dynamic = f.dynamic(values)
+        load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)
+        direct = torch.zeros(s.H.shape[0], s.W // 2, dtype=kind)
+        if len(s.supports):
+            load[..., s.supports // 2] = -(s.H.T.to(kind) @ (dynamic.unsqueeze(3) * s.G.to(kind)))
+            direct[:, s.supports // 2] = s.G.to(kind)
+        if len(s.forces):
+            load[..., s.forces // 2] = s.F.to(kind)
+        deflection = (s.H.to(kind) @ (compliance @ load) + direct) * self.drive_noise[:, None]  # (B, F, E, W/2)
+        # Sensor noise reaches the fitted motion, at the least, as the motion that it cannot be told from.
+        motion = torch.linalg.pinv(self._sensing(values, data))
+        power = deflection.abs().square().sum(dim=3) + (s.H.to(kind) @ motion).abs().square().sum(dim=3)
+        power = power * self.samples
+        white = (self._whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
+        by_k = (white * values.stiffness.square().unsqueeze(1)).sum(dim=1)
+        by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
+        k_at, c_at = s.estimated_elements
+        noise = torch.cat([by_k[:, k_at], by_c[:, c_at]], dim=1)
+        shown = at.columns[:, -at.x.shape[1] :].square().sum(dim=2)
+        share = torch.zeros_like(shown)
+        share[:, : noise.shape[1]] = noise / shown[:, : noise.shape[1]].clamp_min(1e-300)
+        return share
+
+    def _sensing(self, values: ElementValues, data: WindowBatch) -> Tensor:
+        """Compressed signals per degree of freedom, (B, F, R, n)."""
+        kind = self.frequency.jw.dtype
+        select = torch.eye(len(data.present), dtype=kind)[data.present]
+        return (self.compression(data.present).to(kind) @ select) @ self.frequency.sensing(values)
+
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression(data.present).mT
 
@@ -245,7 +283,7 @@ class WindowModel:
         data: WindowBatch,
     ) -> Tensor:
         """Whitened sensitivities to the masses: inertia forces m q'' along the motion, (B, F, R, masses)."""
-        s, f = self.simulator, self.frequency
+        s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]
         states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
@@ -254,8 +292,7 @@ class WindowModel:
         )
         spectra = torch.fft.rfft(acceleration, dim=1)[:, : self.bins] * values.mass[:, None]
         kind = compliance.dtype
-        Q = self.compression(data.present).to(kind) @ torch.eye(len(data.present), dtype=kind)[data.present]
-        per_load = -(whiten @ (Q @ (f.sensing(values) @ compliance)))
+        per_load = -(whiten @ (self._sensing(values, data) @ compliance))
         masses = s.m_of[-s.estimated_masses :].T.to(kind)  # (n, masses)
         return (per_load * spectra[:, :, None]) @ masses
 

@@ -30,6 +30,8 @@ from model.signals import BoolArray, FloatArray
 from model.system import System
 
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
+_WEAK_STD = 0.05  # beyond this the excitation of a window is held against its noise
+_NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
 _CHUNK = 64  # windows worked on at a time: larger ones leave the caches
@@ -146,6 +148,11 @@ class Refiner:
         simulated, path = self.model.simulate(x, x0, data)
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
+        weak = (std > _WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = data.take(weak)
+            share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
+            identifiable[weak] &= share < _NOISE_SHARE
         signals = len(self.model.compression(data.present))
         freedom = (2 * self.model.bins - 1) * signals - x0.shape[1] - identifiable.sum(dim=1)
         chi_square = cost / freedom.clamp_min(1)

@@ -234,9 +234,7 @@ def _explain(error: ValidationError, node: yaml.Node | None) -> str:
         location = key.split(".")
         keys = location
     if first["type"] == "model_type":
-        message = (
-            "a number or a mapping is expected" if keys and keys[-1] in ("stiffness", "damping", "mass") else message
-        )
+        message = "a number or a mapping is expected"
     elif first["type"] == "extra_forbidden":
         message = "unknown key"
     elif first["type"] == "missing":

@@ -1,0 +1,156 @@
+"""Refinement: recovery, honest uncertainty, missing sensors, quiet windows, misfits."""
+
+import numpy as np
+import pytest
+import torch
+from test_system import OSCILLATOR, QUARTER_CAR
+
+from model.excitation import draw_log_ratios, simulate_runs
+from model.features import ForceBalance, magnitudes
+from model.identify import Identifier, UnusableWindow, identifiability
+from model.linearise import WindowModel
+from model.refine import Refiner
+from model.system import load_system, parse_system
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    system = load_system()
+    rng = np.random.default_rng(11)
+    truth = draw_log_ratios(system, 96, 0.5, rng)
+    return system, truth, simulate_runs(system, truth, system.window, rng)
+
+
+def scores(refined, truth):
+    return (refined.log_ratio - truth) / np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
+
+
+def test_without_noise_the_truth_comes_back(vehicle):
+    system, truth, runs = vehicle
+    refined = Refiner(system).refine(runs.clean[:16])
+    assert refined.converged.all()
+    assert np.abs(refined.log_ratio - truth[:16]).max() < 0.01
+    assert np.abs(refined.log_ratio - truth[:16]).mean() < 5e-4
+
+
+def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(vehicle):
+    system, truth, runs = vehicle
+    refiner = Refiner(system)
+    from_nominal = refiner.refine(runs.values)
+    near = refiner.refine(runs.values, truth + 0.03 * np.random.default_rng(0).standard_normal(truth.shape))
+    for refined in (from_nominal, near):
+        z = scores(refined, truth)
+        assert refined.converged.all()
+        assert 0.93 < (np.abs(z) < 1.96).mean() < 0.97
+        assert abs(z.mean()) < 0.07
+        assert 0.97 < np.median(refined.chi_square) < 1.03
+    assert np.abs(scores(near, from_nominal.log_ratio)).max() < 0.5
+    assert near.iterations.mean() < 0.6 * from_nominal.iterations.mean()
+
+
+def test_one_window_alone_is_the_window_in_a_batch(vehicle):
+    system, _, runs = vehicle
+    refiner = Refiner(system)
+    batch, alone = refiner.refine(runs.values[:5]), refiner.refine(runs.values[3:4])
+    assert np.allclose(batch.log_ratio[3], alone.log_ratio[0], atol=1e-9)
+    assert np.allclose(batch.covariance[3], alone.covariance[0], rtol=1e-6, atol=1e-12)
+
+
+def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle):
+    system, truth, runs = vehicle
+    model = WindowModel(system, system.window)
+    data = model.batch(runs.clean[:2], np.ones(12, dtype=bool))
+    x = torch.as_tensor(truth[:2])
+    with torch.no_grad():
+        at = model.linearise(x, data)
+        for p in (0, 9, 12, 23):
+            direction = torch.zeros(2, 24, dtype=torch.float64)
+            direction[:, p] = 1e-3
+            # Moving away from the truth by a known step, the chord must lead back.
+            here = model.chord(at, x, at.x0, data)[1]
+            back = model.chord(at, x + direction, at.state_after(direction), data)[1] - here
+            assert torch.allclose(back, -direction, atol=3e-5)
+
+
+def test_a_missing_sensor_widens_the_uncertainty_and_nothing_breaks(vehicle):
+    system, truth, runs = vehicle
+    refiner = Refiner(system)
+    windows = runs.values[:48].copy()
+    windows[:24, :, 16 + 4 : 16 + 6] = np.nan
+    refined, whole = refiner.refine(windows), refiner.refine(runs.values[:48])
+    assert np.abs(scores(refined, truth[:48])).mean() < 1.0
+    ratio = np.diagonal(refined.covariance[:24], axis1=1, axis2=2) / np.diagonal(
+        whole.covariance[:24], axis1=1, axis2=2
+    )
+    assert np.median(ratio[:, 0]) > 1.1
+    assert np.isnan(refined.error[0, 4])
+    assert np.allclose(refined.log_ratio[24:], whole.log_ratio[24:], atol=1e-6)
+
+
+def test_a_standing_vehicle_tells_nothing_and_says_so():
+    system = load_system()
+    noise = np.array([c.noise for c in system.channels])
+    windows = noise * np.random.default_rng(0).standard_normal((2, 100, 28))
+    for estimate in Identifier(system).identify(windows):
+        assert not estimate.identifiable.any()
+        assert np.allclose(estimate.covariance, np.eye(24))
+        assert np.all(estimate.log_ratio == 0)
+
+
+def test_a_window_that_does_not_fit_says_so(vehicle):
+    system, _, runs = vehicle
+    windows = runs.values[:4].copy()
+    windows[:2, :, 20] *= 0.7  # one bogie sensor reads too little
+    fits = [estimate.adequate for estimate in Identifier(system).identify(windows)]
+    assert fits == [False, False, True, True]
+
+
+def test_a_missing_input_is_refused_by_name(vehicle):
+    system, _, runs = vehicle
+    windows = runs.values[:1].copy()
+    windows[0, 7, 3] = np.nan
+    with pytest.raises(UnusableWindow, match="wheel_11r.velocity"):
+        Identifier(system).identify(windows)
+
+
+def test_states_are_the_simulated_ones(vehicle):
+    system, truth, runs = vehicle
+    (estimate,) = Identifier(system).identify(runs.clean[:1], truth[:1], states=True)
+    assert estimate.states.shape == (100, 18)
+    rate = np.gradient(estimate.states[:, 0], 0.01)
+    assert np.abs(rate - estimate.states[:, 9])[5:-5].max() < 0.02 * np.abs(estimate.states[:, 9]).max()
+
+
+@pytest.mark.parametrize("text", [OSCILLATOR, QUARTER_CAR])
+def test_other_systems_are_identified_with_masses_and_element_sensors(text):
+    system = parse_system(text)
+    rng = np.random.default_rng(3)
+    truth = draw_log_ratios(system, 64, 0.3, rng)
+    runs = simulate_runs(system, truth, system.window, rng)
+    refined = Refiner(system).refine(runs.values)
+    z = scores(refined, truth)[refined.converged]
+    assert refined.converged.mean() > 0.95
+    assert refined.identifiable.mean() > 0.5
+    assert 0.9 < (np.abs(z[refined.identifiable[refined.converged]]) < 1.96).mean() < 0.985
+
+
+def test_the_force_balance_holds_on_clean_windows(vehicle):
+    system, truth, runs = vehicle
+    target, regressors = ForceBalance(system, system.window)(runs.clean[:8])
+    ratio = torch.as_tensor(np.exp(truth[:8]))
+    residual = target - (regressors @ ratio.unsqueeze(2)).squeeze(2)
+    assert float(residual.norm() / target.norm()) < 0.01
+    wrong = target - regressors.sum(dim=2)
+    assert float(wrong.norm() / target.norm()) > 0.1
+
+
+def test_magnitudes_are_the_absolute_discrete_fourier_transform():
+    signal = torch.randn(2, 32, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    features = magnitudes(signal).reshape(2, 17, 3)
+    assert np.allclose(features[1, :, 2], np.abs(np.fft.fft(signal[1, :, 2].numpy()))[:17])
+
+
+def test_identifiability_names_what_a_window_cannot_tell():
+    std = identifiability(load_system())
+    assert np.all(std < 0.05)
+    assert std[12:20].min() > std[:8].max()  # primary dampings are the hardest
