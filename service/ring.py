@@ -27,12 +27,15 @@ class Ring:
     def __init__(self, samples: int, channels: int, sample_rate: float) -> None:
         self._values = np.full((samples, channels), np.nan)
         self._rate = sample_rate
+        self._origin = 0  # time of grid index 0, ns since epoch
         self._end: int | None = None  # grid index after the newest sample
 
     def add(self, window: Window) -> None:
         """Take the samples of a window that was used or repaired; older than the ring is ignored."""
         samples = len(self._values)
-        first = round(window.start * self._rate / NANOSECONDS)
+        if self._end is None:
+            self._origin = window.start
+        first = round((window.start - self._origin) * self._rate / NANOSECONDS)
         last = first + len(window.values)
         if self._end is None or first >= self._end + samples:
             self._values[:] = np.nan
@@ -55,7 +58,7 @@ class Ring:
         if len(filled) == 0:
             return None
         first = int(filled[0])
-        start = round((int(rows[0]) + first) * NANOSECONDS / self._rate)
+        start = self._origin + round((int(rows[0]) + first) * NANOSECONDS / self._rate)
         return Excerpt(start, self._rate, values[first:].copy())
 
 

@@ -50,7 +50,8 @@ def problem_response(problem: Problem, instance: str) -> Response:
     }
     if problem.errors:
         body["errors"] = problem.errors
-    return Response(json.dumps(body), problem.status, problem.headers, MEDIA_TYPE)
+    headers = {"X-Content-Type-Options": "nosniff"} | problem.headers  # details may repeat what the client sent
+    return Response(json.dumps(body), problem.status, headers, MEDIA_TYPE)
 
 
 def from_validation(error: ValidationError, prefix: str = "") -> Problem:

@@ -1,0 +1,471 @@
+"""Uploads, live buses, background diagnoses: work that goes on beside the requests."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+
+from model.signals import SampleBlock, Tally
+from model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
+from replay.live import LiveBus
+from service.api.app import create_app
+from service.compute import Compute
+from service.core import Core, build_core
+from service.diagnoses import load_excerpt, save_excerpt
+from service.engine import Engine, make_tracker
+from service.errors import UserError
+from service.feed import feed_file, feed_live, prefetched, vehicle_of
+from service.main import Feeds, _bus
+from service.pipeline import Pipeline
+from service.ring import Excerpt, Ring, Rings
+from service.settings import Settings
+from service.store import open_store, work
+from service.store.work import JobRow
+from tests.service_fakes import HOP, START, FakeIdentifier, make_window
+
+SECONDS = 5
+
+
+def eventually(check: Callable[[], Any], seconds: float = 20.0) -> Any:
+    """The first true value of `check`; fails after a while."""
+    deadline = time.monotonic() + seconds
+    while not (found := check()):
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.02)
+    return found
+
+
+@pytest.fixture
+def csv_engine() -> Engine:
+    """The Manchester system, its signals found in the columns of a CSV file."""
+    text = MANCHESTER.read_text().replace("can: ", "csv: ")
+    found = parse_system(text)
+    return Engine(found, FakeIdentifier(found), make_tracker(found))
+
+
+@pytest.fixture
+def recording(tmp_path: Path, csv_engine: Engine) -> Path:
+    """A few seconds in which every channel stays at 0.01."""
+    path = tmp_path / "car 7.csv"
+    with open(path, "w", newline="") as target:
+        writer = csv.writer(target)
+        writer.writerow(["time", *(channel.csv for channel in csv_engine.system.channels)])
+        for row in range(100 * SECONDS):
+            writer.writerow([f"{START / 1e9 + row / 100:.3f}", *[0.01] * len(csv_engine.system.channels)])
+    return path
+
+
+@pytest.fixture
+def core(csv_engine: Engine, tmp_path: Path) -> Core:
+    return build_core(Settings(data_dir=tmp_path / "data", misfit_seconds=5, job_queue=2), csv_engine)
+
+
+@pytest.fixture
+def client(core: Core) -> Iterator[TestClient]:
+    with TestClient(create_app(core)) as running:
+        yield running
+
+
+def finished(client: TestClient, job: dict[str, Any]) -> dict[str, Any]:
+    """The job when it is done or failed."""
+
+    def ended() -> Any:
+        found = client.get(f"/jobs/{job['id']}").json()
+        return found if found["state"] in ("done", "failed") else None
+
+    answer: dict[str, Any] = eventually(ended)
+    return answer
+
+
+def upload(client: TestClient, path: Path, name: str | None = None, **form: str) -> Any:
+    with open(path, "rb") as stream:
+        return client.post("/recordings", files={"file": (name or path.name, stream)}, data=form)
+
+
+def test_a_file_is_fed_whole_and_counted(csv_engine: Engine, recording: Path, tmp_path: Path) -> None:
+    store, compute = open_store(str(tmp_path / "x.db")), Compute(4)
+    fed = feed_file(Pipeline(csv_engine, store, compute), recording, batch_windows=4)
+    compute.close()
+    store.close()
+    assert fed.vehicle == "car_7"
+    assert fed.windows == {"used": 9, "repaired": 0, "dropped": 0}
+    assert fed.tally.used == 100 * SECONDS
+    assert fed.recorded_seconds(100.0) == pytest.approx(SECONDS)
+    assert (fed.lost, fed.expected) == (0, 28 * 100 * SECONDS)
+
+
+def test_an_upload_becomes_a_job_and_its_windows_are_stored(client: TestClient, recording: Path) -> None:
+    response = upload(client, recording)
+    assert response.status_code == 202
+    job = response.json()
+    assert response.headers["location"] == f"/jobs/{job['id']}"
+    done = finished(client, job)
+    assert (done["state"], done["progress"]) == ("done", 1.0), done
+    assert done["result"]["vehicle"] == "car_7"
+    assert done["result"]["windows"]["used"] == 9
+    assert client.get("/vehicles/car_7").json()["windows"]["used"] == 9
+    assert 'sprung_frames_total{outcome="used",source="upload"} 500.0' in client.get("/metrics").text
+
+
+def test_the_same_upload_twice_stores_nothing_twice(client: TestClient, recording: Path) -> None:
+    for _ in range(2):
+        finished(client, upload(client, recording, vehicle="bus-7").json())
+    assert client.get("/vehicles/bus-7").json()["windows"]["used"] == 9
+
+
+@pytest.mark.parametrize("name", ["../../etc/cron.d/evil.csv", "..\\..\\evil.csv", "/abs/evil.csv", "a\0b.csv"])
+def test_no_name_of_a_client_reaches_the_file_system(
+    client: TestClient, core: Core, recording: Path, name: str
+) -> None:
+    response = upload(client, recording, name)
+    stored = list(core.settings.data_dir.rglob("*.csv"))
+    if response.status_code == 202:
+        assert [path.parent for path in stored] == [core.settings.uploads]
+        assert "evil" not in stored[0].name
+        finished(client, response.json())
+    else:
+        assert response.status_code in (400, 422) and stored == []
+
+
+def test_unknown_kinds_of_files_are_refused(client: TestClient, recording: Path) -> None:
+    for name in ("virus.exe", "noextension", ".csv"):
+        response = upload(client, recording, name)
+        assert response.status_code == 422
+        assert response.headers["content-type"] == "application/problem+json"
+
+
+def test_a_wrong_vehicle_in_the_form_is_refused(client: TestClient, recording: Path) -> None:
+    assert upload(client, recording, vehicle="../x").status_code == 422
+
+
+def test_an_upload_that_cannot_be_read_fails_with_one_line_and_the_users_name_for_it(
+    client: TestClient, tmp_path: Path
+) -> None:
+    path = tmp_path / "other.csv"
+    path.write_text("time,speed\n0,1\n1,2\n")
+    job = finished(client, upload(client, path).json())
+    assert job["state"] == "failed"
+    assert "other.csv" in job["error"]
+    assert str(tmp_path) not in job["error"]
+
+
+def test_a_job_that_a_stop_interrupts_goes_on_at_the_next_start(
+    csv_engine: Engine, tmp_path: Path, recording: Path
+) -> None:
+    settings = Settings(data_dir=tmp_path / "data")
+    core = build_core(settings, csv_engine)
+    started, release = threading.Event(), threading.Event()
+    with TestClient(create_app(core, on_stop=lambda: None)) as client:
+        core.compute.submit(lambda: (started.set(), release.wait()))
+        started.wait(5)
+        job = upload(client, recording).json()
+        eventually(lambda: client.get(f"/jobs/{job['id']}").json()["state"] == "running")
+        closing = threading.Thread(target=core.close)
+        closing.start()
+        eventually(core.stopping.is_set)
+        release.set()
+        closing.join()
+    again = build_core(settings, csv_engine)
+    with TestClient(create_app(again)) as client:
+        assert finished(client, job)["state"] == "done"
+        assert client.get("/vehicles/car_7").json()["windows"]["used"] == 9
+
+
+def test_more_jobs_than_the_queue_holds_are_refused(client: TestClient, core: Core, recording: Path) -> None:
+    started, release = threading.Event(), threading.Event()
+    core.compute.submit(lambda: (started.set(), release.wait()))
+    started.wait(5)
+    answers = [upload(client, recording, vehicle=f"v{i}").status_code for i in range(3)]
+    release.set()
+    assert answers == [202, 202, 503]
+
+
+class SlowSource:
+    """Blocks that come one at a time, for ever."""
+
+    def __init__(self, channels: int) -> None:
+        self.tally = Tally()
+        self._channels = channels
+
+    def blocks(self) -> Iterator[SampleBlock]:
+        row = 0
+        while True:
+            times = np.full(self._channels, START + row * 10_000_000)
+            self.tally.used += 1
+            row += 1
+            yield SampleBlock(times, np.arange(self._channels, dtype=np.int32), np.full(self._channels, 0.01))
+
+
+def test_a_live_source_stops_when_told_and_what_came_is_stored(core: Core, csv_engine: Engine) -> None:
+    stopping = threading.Event()
+    source = SlowSource(len(csv_engine.system.channels))
+    thread = threading.Thread(
+        target=feed_live, args=(core.pipeline, source, "live", stopping, core.tally_counter("test"))
+    )
+    thread.start()
+    eventually(lambda: any(entry.windows["used"] > 3 for entry in core.board.entries()))
+    stopping.set()
+    thread.join(5)
+    assert not thread.is_alive()
+    assert b'sprung_frames_total{outcome="used",source="test"}' in core.metrics.render()
+    core.close()
+
+
+def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(Settings(data_dir=tmp_path), engine)
+    database = cantools.database.load_file(MANCHESTER_DBC)
+    bus = LiveBus("virtual", "sprung-test", engine.system.channels, MANCHESTER_DBC, stop=core.stopping)
+    thread = threading.Thread(
+        target=feed_live, args=(core.pipeline, bus, "live", core.stopping, core.tally_counter(bus.name))
+    )
+    frames = [
+        can.Message(
+            arbitration_id=message.frame_id,
+            data=message.encode(dict.fromkeys((s.name for s in message.signals), 0.0)),
+            is_extended_id=False,
+        )
+        for message in database.messages
+    ]
+    app = create_app(core, on_start=thread.start)
+    with TestClient(app) as client, can.Bus(interface="virtual", channel="sprung-test") as sender:
+        eventually(lambda: bus.connected)
+        begun = time.monotonic()
+        for row in range(240):
+            time.sleep(max(0.0, begun + row / 100 - time.monotonic()))
+            for frame in frames:
+                sender.send(frame)
+        ended = time.monotonic()
+        eventually(lambda: client.get("/vehicles").json()["vehicles"], seconds=2.0)
+        assert time.monotonic() - ended < 2.0
+        assert 'source="virtual:sprung-test"' in client.get("/metrics").text
+    thread.join(5)
+
+
+@pytest.mark.parametrize("name", ["can0", "virtual:", ":0", "carrier-pigeon:0"])
+def test_a_bus_that_cannot_be_is_one_clear_line(engine: Engine, tmp_path: Path, name: str) -> None:
+    core = build_core(Settings(data_dir=tmp_path), engine)
+    try:
+        with pytest.raises(ValueError, match="can"):
+            _bus(core, name)
+    finally:
+        core.close()
+    assert Feeds().buses == ()
+
+
+def test_reading_ahead_hands_over_everything_and_errors_too() -> None:
+    assert list(prefetched(iter(range(100)), 2)) == list(range(100))
+
+    def broken() -> Iterator[int]:
+        yield 1
+        raise KeyError("late")
+
+    items = prefetched(broken(), 2)
+    assert next(items) == 1
+    with pytest.raises(KeyError):
+        next(items)
+
+
+def test_reading_ahead_stops_when_nobody_listens() -> None:
+    produced = []
+
+    def endless() -> Iterator[int]:
+        while True:
+            produced.append(1)
+            yield 1
+
+    items = prefetched(endless(), 2)
+    next(items)
+    items.close()
+    assert len(produced) < 10
+
+
+@pytest.mark.parametrize(
+    ("named", "recorded", "file", "vehicle"),
+    [
+        ("a", "b", "c.blf", "a"),
+        (None, "b", "c.blf", "b"),
+        (None, None, "run 4/c d.blf", "c_d"),
+        (None, "Zug Nr. 1/2", "c.blf", "Zug_Nr._1_2"),
+        (None, "..", "c.blf", "v.."),
+    ],
+)
+def test_the_vehicle_is_as_the_user_says_else_as_recorded_else_the_file(
+    named: str | None, recorded: str | None, file: str, vehicle: str
+) -> None:
+    assert vehicle_of(named, recorded, file) == vehicle
+
+
+def test_a_ring_holds_the_last_samples_in_order(system: System) -> None:
+    ring = Ring(300, len(system.channels), 100.0)
+    assert ring.excerpt() is None
+    for number in range(20):
+        ring.add(make_window(system, number, level=float(number)))
+    excerpt = ring.excerpt()
+    assert excerpt is not None
+    assert excerpt.values.shape == (300, len(system.channels))
+    assert excerpt.start == START + 19 * HOP + 10**9 - 3 * 10**9
+    np.testing.assert_array_equal(np.unique(excerpt.values), [15, 16, 17, 18, 19])
+    assert (np.diff(excerpt.values[:, 0]) >= 0).all()
+
+
+def test_a_ring_does_not_pass_off_old_samples_as_new(system: System) -> None:
+    ring = Ring(400, len(system.channels), 100.0)
+    ring.add(make_window(system, 0, level=1.0))
+    ring.add(make_window(system, 5, level=2.0))  # 1.5 s are missing between them
+    excerpt = ring.excerpt()
+    assert excerpt is not None
+    assert len(excerpt.values) == 350
+    assert np.isnan(excerpt.values[100:250]).all()
+    ring.add(make_window(system, 500, level=3.0))
+    after = ring.excerpt()
+    assert after is not None and len(after.values) == 100 and (after.values == 3.0).all()
+
+
+def test_rings_forget_the_vehicle_heard_from_longest_ago(system: System) -> None:
+    rings = Rings(2, 1.0, len(system.channels), 100.0)
+    for vehicle in ("a", "b", "a", "c"):
+        rings.add(vehicle, [make_window(system, 0)])
+    assert rings.excerpt("b") is None
+    assert rings.excerpt("a") is not None and rings.excerpt("c") is not None
+
+
+def test_an_excerpt_comes_back_as_it_was_saved(tmp_path: Path) -> None:
+    values = np.random.default_rng(1).normal(size=(50, 3))
+    values[10:12, 1] = np.nan
+    save_excerpt(tmp_path / "new" / "x.npz", Excerpt(START, 100.0, values))
+    record = load_excerpt(tmp_path / "new" / "x.npz")
+    np.testing.assert_array_equal(record.values, values)
+    assert (record.start, record.sample_rate, record.lost) == (START, 100.0, 2)
+
+
+REPORT = {
+    "system": "x",
+    "recording": {"file": "x", "seconds": 5.0, "samples": 500, "lost": 0},
+    "verdict": "missing_physics",
+    "findings": [{"location": "secondary_1r", "effect": "coulomb_friction", "sentence": "secondary_1r: dry friction"}],
+}
+
+
+@pytest.fixture
+def tool(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A stand-in for the program that diagnoses: writes what it was asked, answers REPORT or fails when told so."""
+    path = tmp_path / "tool"
+    path.write_text(
+        f"#!{sys.executable}\n"
+        "import json, pathlib, sys\n"
+        "here = pathlib.Path(__file__).parent\n"
+        "(here / 'asked').write_text(json.dumps(sys.argv[1:]))\n"
+        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir(parents=True)\n"
+        "(out / 'report.html').write_text('<p>the page</p>')\n"
+        "if (here / 'fail').exists():\n"
+        "    print('sprung: ' + sys.argv[4] + ': too short to tell', file=sys.stderr); sys.exit(2)\n"
+        f"print({json.dumps(json.dumps(REPORT))}); sys.exit(1)\n"
+    )
+    path.chmod(0o755)
+    monkeypatch.setattr("service.diagnoses.sys.executable", str(path))
+    return path
+
+
+def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recording: Path, tool: Path) -> None:
+    with open(recording, "rb") as stream:
+        response = client.post("/diagnose", files={"file": ("ride.csv", stream)})
+    assert response.status_code == 202, response.text
+    done = finished(client, response.json())
+    assert done["result"]["verdict"] == "missing_physics", done
+    report = client.get(f"/reports/{done['result']['report']}").json()
+    assert report["findings"][0]["effect"] == "coulomb_friction"
+    assert report["recording"]["file"] == "ride.csv"
+    page = client.get(f"/reports/{done['result']['report']}", headers={"accept": "text/html"})
+    assert page.text == "<p>the page</p>"
+    asked = json.loads((tool.parent / "asked").read_text())
+    assert asked[:3] == ["-m", "service.cli", "diagnose"] and "--json" in asked
+
+
+def test_a_stored_recording_is_diagnosed_by_id(client: TestClient, recording: Path, tool: Path) -> None:
+    job = finished(client, upload(client, recording).json())
+    response = client.post("/diagnose", json={"recording": job["recording"]})
+    assert finished(client, response.json())["state"] == "done"
+    assert client.post("/diagnose", json={"recording": "none"}).status_code == 404
+
+
+def test_a_diagnosis_that_cannot_be_made_fails_with_its_line(client: TestClient, recording: Path, tool: Path) -> None:
+    (tool.parent / "fail").touch()
+    with open(recording, "rb") as stream:
+        job = finished(client, client.post("/diagnose", files={"file": ("ride.csv", stream)}).json())
+    assert (job["state"], job["error"]) == ("failed", "ride.csv: too short to tell")
+
+
+@pytest.mark.parametrize("content", [b"{}", b'{"recording": "a", "vehicle": "b"}', b'{"file": 1}', b"["])
+def test_wrong_bodies_of_diagnose_are_refused(client: TestClient, content: bytes) -> None:
+    headers = {"content-type": "application/json"}
+    assert client.post("/diagnose", content=content, headers=headers).status_code == 422
+    assert client.post("/diagnose", content=content, headers={"content-type": "text/csv"}).status_code == 415
+
+
+def test_windows_that_stop_fitting_start_one_diagnosis_that_joins_the_alarm(
+    client: TestClient, core: Core, csv_engine: Engine, tool: Path
+) -> None:
+    identifier = csv_engine.identifier
+    assert isinstance(identifier, FakeIdentifier)
+    core.pipeline.process("a", [make_window(csv_engine.system, i) for i in range(80)])
+    assert jobs(core) == []
+    identifier.chi_square = 9.0
+    for first in range(80, 160, 8):
+        core.pipeline.process("a", [make_window(csv_engine.system, first + i) for i in range(8)])
+    assert len(jobs(core)) == 1
+    job = finished(client, {"id": jobs(core)[0].id})
+    assert job["state"] == "done", job
+    alarm = client.get("/vehicles/a/alarms").json()["alarms"][0]
+    assert (alarm["kind"], alarm["report"]) == ("misfit", job["result"]["report"])
+    core.pipeline.process("a", [make_window(csv_engine.system, 160 + i) for i in range(8)])
+    assert len(jobs(core)) == 1  # the same vehicle is left alone for an hour
+    page = client.get("/pages/vehicles/a").text
+    assert "dry friction" in page and "mismatch report" in page
+
+
+def test_a_vehicles_last_minute_is_diagnosed_on_request(
+    client: TestClient, core: Core, csv_engine: Engine, tool: Path
+) -> None:
+    core.pipeline.process("a", [make_window(csv_engine.system, i) for i in range(8)])
+    response = client.post("/diagnose", json={"vehicle": "a"})
+    assert finished(client, response.json())["state"] == "done"
+    assert client.post("/diagnose", json={"vehicle": "nobody"}).status_code == 404
+
+
+def jobs(core: Core) -> list[JobRow]:
+    """Diagnoses, whatever their state."""
+    from sqlalchemy import select
+
+    from service.store.schema import jobs as table
+
+    with core.store.read() as connection:
+        rows = connection.execute(select(table).where(table.c.kind == "diagnosis"))
+        return [JobRow(*row) for row in rows]
+
+
+def test_housekeeping_deletes_what_is_old(core: Core, recording: Path) -> None:
+    core.settings.uploads.mkdir(parents=True)
+    (core.settings.uploads / "old.csv").write_text("x")
+    with core.store.write() as connection:
+        work.add_recording(connection, work.RecordingRow("r", None, "n", "upload", "old.csv", 1, None, 0, None))
+    core.housekeeping.once(time.time_ns())
+    assert not (core.settings.uploads / "old.csv").exists()
+    core.close()
+
+
+def test_no_recent_samples_is_told(core: Core) -> None:
+    with pytest.raises(UserError, match="no recent samples"):
+        core.diagnoses.from_excerpt("nobody")
+    core.close()
