@@ -51,7 +51,8 @@ class Case:
             found.append({"location": body, "effect": "mass_change", "parameters": [ratio]})
         if self.fault:
             channel, kind, value = self.fault
-            found.append({"location": channel, "effect": kind, "parameters": [value]})
+            known = [] if kind == "sensor_stuck" else [value]
+            found.append({"location": channel, "effect": kind, "parameters": known})
         return found
 
     def verdict(self) -> str:

@@ -93,7 +93,7 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
         return None
     wheels = len(vehicle.inputs)
     periodic = _periodic(clean[:, :wheels])
-    omega_full: Array = 2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE)
+    omega_full = np.asarray(2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE), dtype=np.float64)
     stiffness, damping = (
         np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping)
     )
@@ -111,7 +111,7 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
     n = len(clean[keep])
     frequency = np.fft.rfftfreq(n, 1 / SAMPLE_RATE)
     band = (frequency > 0) & (frequency < TOP)
-    omega: Array = 2 * np.pi * frequency[band]
+    omega = np.asarray(2 * np.pi * frequency[band], dtype=np.float64)
     there = Transfer(vehicle, stiffness, damping, omega)
     s_d, s_v = vehicle.input_noise
     variance = 1 / (1 / s_d**2 + (omega[:, None] / s_v) ** 2)  # of the fused displacement, (F, wheels)
