@@ -19,6 +19,8 @@ from model.schema import SupportInput
 from model.signals import FloatArray
 from model.system import System
 
+_INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
+
 
 @dataclass(frozen=True)
 class Signals:
@@ -33,6 +35,7 @@ class Signals:
     sensor_names: tuple[str, ...]
     support_names: tuple[str, ...]
     force_names: tuple[str, ...]
+    integrated: np.ndarray  # supports whose displacement is only the integral of the velocity, (supports,)
 
     @property
     def samples(self) -> int:
@@ -88,6 +91,8 @@ def declared_noise(system: System, signals: Signals) -> Noise:
         if isinstance(source, SupportInput):
             level = source.displacement.noise or 1e-3 * _size(signals.displacement[:, at_support])
             displacement.append(level)
+            if signals.integrated[at_support]:
+                displacement[-1] = _INTEGRATED * max(level, _size(signals.displacement[:, at_support]))
             measured = source.velocity is not None and np.isfinite(signals.velocity[0, at_support])
             stated = source.velocity.noise if source.velocity is not None else 0.0
             level = stated or 1e-3 * _size(signals.velocity[:, at_support])
@@ -127,7 +132,7 @@ def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
     integrated[0] = D[0]
     precision_d, precision_v = 1 / noise.displacement**2, (omega / noise.velocity) ** 2
     fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
-    pairs = np.flatnonzero(has_rate & np.isfinite(noise.displacement))
+    pairs = np.flatnonzero(has_rate & ~signals.integrated)
     redundancy = (integrated - D)[:, pairs]
     force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
     if signals.force.shape[1]:

@@ -15,11 +15,12 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
-from model.diagnosis.catalogue import ElementLaw, Law, SpringDamper, observe
+from model.diagnosis.catalogue import ElementLaw, Law, Observed, SpringDamper, find_law, observe
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, impedance, is_waveform
+from model.diagnosis.unknown import static_law, trials
 from model.signals import FloatArray
 
 
@@ -74,6 +75,7 @@ class Projector:
         self.strong = strong
         self.residual = fit.residual - self.q @ (self.q.T @ fit.residual)
         self.problem, self.fit = problem, fit
+        self.any_law = find_law("cubic_stiffness")  # element_of asks a term for its place only
         grid = problem.part.grid
         self.grid = grid
         assert problem.whitener is not None
@@ -136,6 +138,18 @@ class Channel:
         left = np.where(visible, left, 1.0)
         return np.where(visible, product**2 / left, 0.0), np.where(visible, product / left, 0.0)
 
+    def joint(self, h: ComplexArray) -> tuple[float, FloatArray]:
+        """Statistic and amplitudes of several columns h (m, F) together."""
+        conj = h.conj()
+        inside = np.real(conj @ self.inside)
+        gram = np.real((conj * self.size) @ h.T) - inside @ inside.T
+        product = np.real(conj @ self.product)
+        scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
+        good = values > 1e-6
+        turned = vectors[:, good].T @ (product * scale)
+        return float(np.sum(turned**2 / values[good])), scale * (vectors[:, good] @ (turned / values[good]))
+
 
 def screen(
     problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True, exclude: frozenset = frozenset()
@@ -169,6 +183,9 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
                 port = Term(law, location, law.absent).port(system)
                 channels[location] = Channel(projector, projector.of_force[:, :, : len(port)] @ port)
             yield _best_shape(projector, law, location, d_all, v_all, channels[location])
+    for index, location in enumerate(system.elements):
+        if location in channels:
+            yield from _unnamed(projector, location, d_all[:, index], v_all[:, index], channels[location])
 
 
 def places(system, law: ElementLaw) -> list[str]:
@@ -213,15 +230,10 @@ def _best_shape(
     v_all: FloatArray,
     channel: Channel,
 ) -> tuple[Hit, int]:
-    fit, grid = projector.fit, projector.grid
-    system = projector.problem.system
-    probe = Term(law, location, law.absent)
-    port = probe.port(system)
+    grid = projector.grid
+    port = Term(law, location, law.absent).port(projector.problem.system)
     d, v = d_all @ port, v_all @ port
-    element = fit.forward.element_of(probe)
-    seen = observe(
-        d[::OVERSAMPLING], v[::OVERSAMPLING], 1 / grid.step, float(element.stiffness), float(element.damping)
-    )
+    seen, element = _seen(projector, location, d, v)
     scales = tuple(max(abs(q.typical(seen)), 1e-12) for q in law.parameters)
     trials = law.shapes(seen)
     absent = Hit(Term(law, location, law.absent, scales=scales), 0.0, 1, "law", 1.0)
@@ -238,6 +250,30 @@ def _best_shape(
     found = law.clip(law.scaled(trials[i], float(amplitudes[i])))
     term = Term(law, location, tuple(float(value) for value in found), scales=scales)
     return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1))), len(trials)
+
+
+def _unnamed(
+    projector: Projector, location: str, d: FloatArray, v: FloatArray, channel: Channel
+) -> Iterator[tuple[Hit, int]]:
+    """Static forces without a name at one element."""
+    grid = projector.grid
+    seen, element = _seen(projector, location, d, v)
+    for name, basis in trials().items():
+        law = static_law(basis, seen)
+        count = len(law.parameters)
+        scales = tuple(q.typical(seen) for q in law.parameters)
+        unit = [Term(law, location, tuple(float(i == j) for j in range(count)), name) for i in range(count)]
+        spectra = np.array([_force_spectrum(projector, t, d, v, element)[grid.band] for t in unit])
+        score, amplitudes = channel.joint(spectra)
+        term = Term(law, location, tuple(float(a) for a in amplitudes), name, scales=scales)
+        yield Hit(term, score, count, "unnamed", float(stats.chi2.sf(score, count))), 1
+
+
+def _seen(projector: Projector, location: str, d: FloatArray, v: FloatArray) -> tuple[Observed, SpringDamper]:
+    element = projector.fit.forward.element_of(Term(projector.any_law, location, ()))
+    thin = slice(None, None, OVERSAMPLING)
+    k, c = float(element.stiffness), float(element.damping)
+    return observe(d[thin], v[thin], 1 / projector.grid.step, k, c), element
 
 
 def _force_spectrum(

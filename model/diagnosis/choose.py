@@ -1,0 +1,163 @@
+"""Which candidate, if any: full fits of the best screened ones, compared by evidence, one finding after the other.
+
+Evidence of a model, up to constants:   chi^2 + sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
+
+(Laplace's approximation with a flat prior of `width`, MacKay 2003, chapter 28): a parameter costs what the recording
+tells about it, so a shape that does not matter costs nothing, where BIC would charge log n for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from model.diagnosis.catalogue import SensorLaw
+from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.screen import Hit, Screening
+from model.diagnosis.terms import Term, is_waveform
+from model.diagnosis.unknown import SMALL, UNKNOWN
+
+_LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
+_WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
+_UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
+_CLOSE = 0.25  # share of the best score from which a candidate is fitted
+_NEAR = 45.0  # or this close to it
+_MOST = 9  # candidates that are fitted
+_LAST = 3  # that are fitted to the end
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate with everything refitted around it."""
+
+    hit: Hit
+    fit: Fit
+    gain: float  # chi-square of the model without it, less that with it
+    evidence: float  # gain less what its parameters cost
+    finished: bool = True
+
+    @property
+    def term(self) -> Term:
+        return self.fit.point.terms[-1]
+
+    @property
+    def named(self) -> bool:
+        return self.term.law.name != UNKNOWN
+
+    def delta_bic(self) -> float:
+        """BIC with the candidate less BIC without."""
+        return -self.gain + len(self.term.parameters) * float(np.log(self.fit.count))
+
+
+def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Hit]:
+    """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
+    good = [
+        h for h in screening.hits if (screening.p_value(h) if multiplicity else h.p_single) <= alpha
+    ]
+    if not good:
+        return []
+    good.sort(key=_strength, reverse=True)
+    top = _strength(good[0])
+    place = good[0].location
+    chosen: list[Hit] = []
+    unnamed: dict[str, int] = {}
+    for hit in good:
+        s = _strength(hit)
+        share = _CLOSE if hit.location == place else 0.6
+        if s < share * top and s < top - _NEAR:
+            continue
+        if hit.family == "unnamed":
+            unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
+            if unnamed[hit.location] > 2:
+                continue
+        chosen.append(hit)
+        if len(chosen) >= _MOST:
+            break
+    return chosen
+
+
+def _strength(hit: Hit) -> float:
+    """Score less what chance gives its degrees of freedom; input faults are weighed by the same measure."""
+    extra = 4.0 if hit.family == "unnamed" else 0.0
+    extra += 22.0 if hit.family == "line" else 0.0
+    return hit.score - 2.0 * (hit.freedom - 1) - extra
+
+
+def compete(
+    problem: Problem,
+    base: Fit,
+    hits: list[Hit],
+    progress: Callable[[str], None] = lambda text: None,
+) -> list[Trial]:
+    """Fits of the hits around the present model, best evidence first."""
+    trials: list[Trial] = []
+    for hit in hits:
+        progress(f"fitting {hit.effect} at {hit.location}")
+        trial = _try(problem, base, hit, start_of(base, hit), 3)
+        if trial is not None:
+            trials.append(trial)
+    trials.sort(key=lambda t: -t.evidence)
+    if not trials:
+        return []
+    best = trials[0].evidence
+    finished = []
+    for rank, trial in enumerate(trials):
+        close = trial.evidence > best - max(_NEAR, 0.3 * abs(best))
+        if rank < _LAST or (close and rank < 6):
+            point = trial.fit.point
+            done = _try(problem, base, trial.hit, point, 10)
+            finished.append(done if done is not None else trial)
+        else:
+            finished.append(replace(trial, finished=False))
+    finished.sort(key=lambda t: -t.evidence)
+    return finished
+
+
+def start_of(base: Fit, hit: Hit) -> Point:
+    """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
+    point = base.point
+    state = point.state
+    if hit.family == "mode":  # one more degree of freedom, at the end of q and of q'
+        n = len(state) // 2
+        state = np.concatenate([state[:n], [0.0], state[n:], [0.0]])
+    return Point(point.theta, (*point.terms, hit.term), state)
+
+
+def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
+    own = replace(problem, smoothed=None)
+    try:
+        fit = own.fit(start, iterations=iterations)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return None
+    if not np.isfinite(fit.chi_square):
+        return None
+    gain = base.chi_square - fit.chi_square
+    return Trial(hit, fit, gain, gain - cost(fit, len(hit.term.parameters)) - _prior_cost(hit))
+
+
+def cost(fit: Fit, count: int) -> float:
+    """What the last `count` law parameters cost in evidence."""
+    term = fit.point.terms[-1]
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[-count:], 0)) / np.abs(term.slopes) if count else np.zeros(0)
+    total = 0.0
+    for spec, scale, s in zip(term.law.parameters, term.scales, sigma, strict=True):
+        width = _LOG_WIDTH if spec.log else _WIDTHS * scale
+        if s > 0:
+            total += max(0.0, 2 * float(np.log(width / (s * np.sqrt(2 * np.pi)))))
+    return total
+
+
+def _prior_cost(hit: Hit) -> float:
+    if hit.family != "unnamed":
+        return 0.0
+    return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))
+
+
+def is_sensor(term: Term) -> bool:
+    return isinstance(term.law, SensorLaw)
+
+
+def uses_trajectory(term: Term) -> bool:
+    return is_waveform(term)

@@ -1,0 +1,207 @@
+"""Where a simulation departs from a recording, what was left out, the model with it, and how much better it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from model.diagnosis.catalogue import CATALOGUE, Law
+from model.diagnosis.channels import Prepared, prepare
+from model.diagnosis.choose import Trial, compete, shortlist
+from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.heldout import HeldOut
+from model.diagnosis.inputs import InputFault, best_input_fault, input_faults_of
+from model.diagnosis.measured import Noise, Signals, declared_noise, transform
+from model.diagnosis.noise import input_noise, sensor_noise
+from model.diagnosis.report import Report
+from model.diagnosis.screen import Screening, screen
+from model.diagnosis.unknown import UNKNOWN
+from model.signals import FloatArray
+from model.system import System
+
+Progress = Callable[[float, str], None]
+
+
+class Recorded(Protocol):
+    """What is needed of a recording; `replay.record.Record` has it."""
+
+    @property
+    def sample_rate(self) -> float: ...
+    @property
+    def values(self) -> FloatArray: ...
+    @property
+    def lost(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to diagnose.  The first three switch parts off, for measuring what each is worth."""
+
+    project: bool = True  # take out of every candidate what the nominal parameters can imitate
+    multiplicity: bool = True  # account for the number of candidates tried
+    held_out: bool = True  # accept a finding only if it improves the part that no fit saw
+    alpha: float = 3e-3  # chance of a false finding per recording before the held-out check
+    train_share: float = 0.7  # of the recording, from its start
+    most_findings: int = 4
+    file: str = ""  # name of the recording, for the report
+    catalogue: tuple[Law, ...] = CATALOGUE
+
+
+@dataclass
+class Found:
+    """One accepted finding with what it was chosen among."""
+
+    trial: Trial
+    trials: list[Trial]
+    p_value: float
+
+
+@dataclass
+class Course:
+    """Everything that a diagnosis went through; the report is made from it."""
+
+    system: System
+    options: Options
+    prepared: Prepared
+    signals: Signals  # with input faults mended
+    noise: Noise
+    problem: Problem
+    base: Fit
+    fit: Fit
+    held: HeldOut
+    first: Screening
+    last: Screening
+    found: list[Found] = field(default_factory=list)
+    input_faults: list[InputFault] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+
+def diagnose(
+    system: System, record: Recorded, options: Options | None = None, progress: Progress | None = None
+) -> Report:
+    """Diagnose a recording whose columns are in the order of `system.channels`.
+
+    Errors: `DiagnosisError` when the recording cannot be used at all.
+    """
+    from model.diagnosis.narrate import narrate
+
+    options = options or Options()
+    tell = progress or (lambda share, text: None)
+    course = investigate(system, record, options, tell)
+    tell(0.95, "report")
+    report = narrate(course, record)
+    tell(1.0, "done")
+    return report
+
+
+def investigate(system: System, record: Recorded, options: Options, tell: Progress) -> Course:
+    """Baseline, then finding after finding until the rest is noise."""
+    tell(0.02, "channels and noise")
+    prepared = prepare(system, record.values, record.sample_rate)
+    signals = prepared.signals
+    declared = declared_noise(system, signals)
+    tell(0.05, "nominal structure identified again")
+    problem, base = baseline(system, signals, declared, options)
+    tell(0.2, "screening all laws at all places")
+    screening = screen(problem, base, options.catalogue, options.project)
+    course = Course(
+        system, options, prepared, signals, problem.noise, problem, base, base, None, screening, screening  # type: ignore[arg-type]
+    )
+    _mend_inputs(course, declared, tell)
+    split = course.problem.part.grid.samples
+    course.held = HeldOut(system, course.signals, course.problem.noise, split)
+    for number in range(options.most_findings):
+        if not _next_finding(course, number, tell):
+            break
+    return course
+
+
+def baseline(system: System, signals: Signals, declared: Noise, options: Options) -> tuple[Problem, Fit]:
+    """The nominal structure on the first part, with noise levels estimated on the way."""
+    split = int(round(options.train_share * signals.samples))
+    first = signals.part(0, split)
+    noise = input_noise(transform(first, declared), declared)
+    part = transform(first, noise)
+    problem = Problem(system, part, signals.sensor_index, noise)
+    n = 2 * system.mechanics.n
+    start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
+    fit = problem.fit(start, iterations=12)
+    return refreshed(problem, fit)
+
+
+def refreshed(problem: Problem, fit: Fit, iterations: int = 6) -> tuple[Problem, Fit]:
+    """Noise levels and whitening at a fit, and the fit again."""
+    noise = sensor_noise(fit.forward, fit.spectrum, problem.noise)
+    problem = replace(problem, noise=noise, whitener=None, smoothed=None)
+    return problem, problem.fit(fit.point, iterations=iterations)
+
+
+def _mend_inputs(course: Course, declared: Noise, tell: Progress) -> None:
+    """Faults of input channels come first: everything else is simulated from the inputs."""
+    options = course.options
+    for _ in range(2):
+        hit = best_input_fault(course.first, options.alpha)
+        if hit is None:
+            return
+        tell(0.25, f"input channel {hit.location}")
+        fault, signals = input_faults_of(course, hit, declared)
+        if fault is None:
+            return
+        course.input_faults.append(fault)
+        course.signals = signals
+        course.problem, course.base = baseline(course.system, signals, declared, options)
+        course.fit, course.noise = course.base, course.problem.noise
+        course.last = screen(course.problem, course.base, options.catalogue, options.project)
+        course.first = course.last
+
+
+def _next_finding(course: Course, number: int, tell: Progress) -> bool:
+    """Find, fit and accept one more finding; False when the rest is noise."""
+    options = course.options
+    hits = [h for h in shortlist(course.last, options.alpha, options.multiplicity) if h.family != "input"]
+    hits = [h for h in hits if not _repeats(course, h)]
+    if not hits:
+        return False
+    share = 0.25 + 0.17 * number
+    trials = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
+    trials = [t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)]
+    for trial in trials[:1]:
+        if options.held_out and not _holds(course, trial):
+            return False
+        p_value = course.last.p_value(trial.hit) if options.multiplicity else trial.hit.p_single
+        rivals = [t for t in trials if t is not trial]
+        course.found.append(Found(trial, rivals, p_value))
+        course.problem, course.fit = refreshed(course.problem, trial.fit)
+        tell(share + 0.12, "screening what is left")
+        course.last = screen(course.problem, course.fit, options.catalogue, options.project)
+        return True
+    return False
+
+
+def _repeats(course: Course, hit) -> bool:
+    """The same law at the same place, or physics at a place that is unknown already."""
+    for term in course.fit.point.terms:
+        if hit.term.key[:2] == term.key[:2]:
+            return True
+        if hit.location == term.location and term.law.name == UNKNOWN:
+            return True
+    return False
+
+
+def _minor(course: Course, trial: Trial) -> bool:
+    """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
+    for found in course.found:
+        same = found.trial.term.location == trial.term.location
+        if trial.gain < (0.05 if same else 0.002) * found.trial.gain:
+            return True
+    return False
+
+
+def _holds(course: Course, trial: Trial) -> bool:
+    """Whether the finding improves the free run on the held-out part."""
+    before = course.held.run(course.fit.point)
+    after = course.held.run(trial.fit.point)
+    return after.chi_square < before.chi_square
