@@ -1,0 +1,137 @@
+"""The independent generator of recordings, against closed forms and through the product's readers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from benchmarks.generator import draw_cases, make_recordings, read_vehicle, track, write_set
+from benchmarks.generator.draw import FAULTS
+from benchmarks.generator.files import WRITERS
+from benchmarks.generator.integrate import STEP_RATE, Motion, Plant, Slot
+from benchmarks.generator.laws import LAWS
+from model.system import MANCHESTER, MANCHESTER_DBC, load_system
+from replay.record import load_record
+
+VEHICLE = read_vehicle(MANCHESTER)
+
+
+def plant(slots: list[Slot], batch: int = 1) -> Plant:
+    def tile(values: np.ndarray) -> np.ndarray:
+        return np.repeat(values[:, None], batch, 1)
+
+    zeros = np.zeros((4, batch))
+    return Plant(tile(VEHICLE.stiffness), tile(VEHICLE.damping), tile(VEHICLE.inertia), zeros, zeros, slots)
+
+
+def test_the_vehicle_has_the_published_modes() -> None:
+    motion, matrix = Motion(VEHICLE, plant([])), np.zeros((20, 20))
+    for column in range(20):
+        state = np.zeros((20, 1))
+        state[column] = 1.0
+        matrix[:, column] = motion(state, np.zeros(0), np.zeros((16, 1)), 0.0)[0][:, 0]
+    rigid = np.r_[0:9, 10:19]  # the elastic mode is off
+    frequency = np.sort(np.abs(np.linalg.eigvals(matrix[np.ix_(rigid, rigid)])))[::2] / (2 * np.pi)
+    published = [0.81, 1.08, 1.31, 7.41, 7.43, 9.17, 9.19, 11.71, 11.71]
+    assert frequency == pytest.approx(published, abs=0.006)
+
+
+def test_the_rails_have_the_erri_spectrum_and_the_velocity_is_the_derivative() -> None:
+    speed, seconds = 45.0, 120.0
+    w, v = track.wheels(
+        np.random.default_rng(3), seconds, speed, track.LOW_TRACK, VEHICLE.input_position, VEHICLE.input_side
+    )
+    frequency, power = signal.welch(w[:, 0], track.RATE, nperseg=8192)
+    inside = (frequency > 1.0) & (frequency < 15.0)
+    wanted = track.errib176(2 * np.pi * frequency[inside] / speed, track.LOW_TRACK) * 2 * np.pi / speed
+    assert np.mean(power[inside] / wanted) == pytest.approx(1.0, abs=0.12)
+    central = (w[2:] - w[:-2]) * track.RATE / 2
+    assert np.abs(central - v[1:-1]).max() < 0.02 * np.abs(v).max()
+
+
+def test_a_rear_wheel_sees_what_the_front_wheel_saw_a_wheelbase_earlier() -> None:
+    speed = 2560.0 / 64  # 2.56 m of wheelbase are 64 samples of 1 ms
+    w, _ = track.wheels(
+        np.random.default_rng(4), 10.0, speed, track.LOW_TRACK, VEHICLE.input_position, VEHICLE.input_side
+    )
+    assert w[64:, 2] == pytest.approx(w[:-64, 0], abs=1e-9)
+    assert 0.3 < np.corrcoef(w[:, 0], w[:, 1])[0, 1] < 0.7
+
+
+@pytest.mark.parametrize("name", list(LAWS))
+def test_a_law_acts_on_its_own_element_and_column_alone(name: str) -> None:
+    law, rng = LAWS[name], np.random.default_rng(5)
+    p = law.draw(rng, 0.1, 4.3e5, 2e4, 2.5e-3, 0.026)
+    slots = [Slot(1, 8, name, p)]
+    plain, hidden = Motion(VEHICLE, plant([], 2)), Motion(VEHICLE, plant(slots, 2))
+    state = 8e-3 * rng.normal(size=(20, 1)).repeat(2, 1)
+    state[10:] *= 20
+    memory = np.full(1, 2e-4 if name == "bouc_wen" else 0.0)
+    support = np.zeros((16, 2))
+    difference = hidden(state, memory, support, 20.0)[0] - plain(state, np.zeros(0), support, 20.0)[0]
+    assert np.abs(difference[:, 0]).max() == 0
+    assert np.abs(difference[10:19, 1]).max() > 1e-6
+    assert difference[16:19, 1] == pytest.approx(0.0, abs=1e-12)  # bogie 2 does not touch secondary_1l
+
+
+def test_a_constant_force_of_friction_decelerates_the_car_by_force_over_mass() -> None:
+    motion = Motion(VEHICLE, plant([Slot(0, 8, "coulomb_friction", [320.0, 1e-3])]))
+    plain = Motion(VEHICLE, plant([]))
+    state = np.zeros((20, 1))
+    state[10] = 0.5  # the car rises
+    rates = [m(state, np.zeros(n), np.zeros((16, 1)), 0.0)[0] for m, n in ((motion, 1), (plain, 0))]
+    assert float((rates[0] - rates[1])[10, 0]) == pytest.approx(-320.0 / 32000)
+
+
+def test_a_seed_draws_the_same_cases_and_whole_rounds_hold_every_kind() -> None:
+    first, again, other = (draw_cases(VEHICLE, 34, seed) for seed in (9, 9, 10))
+    assert [c.findings() for c in first] == [c.findings() for c in again]
+    assert [c.stiffness for c in first] != [c.stiffness for c in other]
+    kinds = {c.kind for c in first}
+    assert set(LAWS) | set(FAULTS) | {"flexible_mode", "external_force", "mass_change", "two", "clean"} <= kinds
+    verdicts = {c.kind: c.verdict() for c in first}
+    assert verdicts["clean"] == verdicts["k_scale"] == verdicts["c_scale"] == "consistent"
+    assert verdicts["force_ripple"] == "unknown_physics" and verdicts["sensor_lag"] == "sensor_fault"
+
+
+@pytest.mark.parametrize("suffix", ["mcap", "blf", "asc", "log"])
+def test_files_give_back_what_was_written(tmp_path: Path, suffix: str) -> None:
+    system = load_system()
+    order = [c.name for c in system.channels]
+    names = [f"{w}.{q}" for q in ("displacement", "velocity") for w in VEHICLE.inputs] + list(VEHICLE.sensors)
+    values = np.random.default_rng(6).normal(size=(50, 28)) * np.r_[np.full(8, 2e-3), np.full(8, 0.03), np.ones(12)]
+    path = tmp_path / f"made.{suffix}"
+    WRITERS[suffix](path, VEHICLE, values, "made")
+    record = load_record(path, system.channels, 100.0, dbc=MANCHESTER_DBC)
+    back = record.values[:, [order.index(name) for name in names]]
+    quantum = np.r_[np.full(8, 1e-6), np.full(8, 2e-5), np.full(4, 5e-4), np.full(8, 2e-3)]
+    assert record.lost == 0
+    assert (np.abs(back - values).max(axis=0) <= 0.51 * quantum).all()
+
+
+def test_a_set_is_written_with_labels_in_the_published_form(tmp_path: Path) -> None:
+    cases = draw_cases(VEHICLE, 2, 3, ["sensor_gain", "coulomb_friction"])
+    labels = json.loads(write_set(VEHICLE, cases, tmp_path, seconds=0.5).read_text())
+    assert len(labels) == 2
+    for name, entry in labels.items():
+        assert (tmp_path / name).stat().st_size > 1000
+        assert entry["verdict"] in {"missing_physics", "sensor_fault"}
+        assert set(entry["stiffness"]) == set(VEHICLE.elements)
+        assert {"location", "effect", "parameters"} == set(entry["findings"][0])
+
+
+@pytest.mark.slow
+def test_the_oracle_sees_nothing_on_clean_recordings_and_counts_strength_linearly() -> None:
+    clean = draw_cases(VEHICLE, 2, 21, ["clean"])
+    weak = draw_cases(VEHICLE, 1, 22, ["cubic_stiffness"], 0.0)[0]
+    place, law, (k3,) = weak.effects[0]
+    cases = [*clean, *(replace(weak, effects=[(place, law, [share * k3])]) for share in (0.02, 0.01))]
+    assert STEP_RATE >= 2000
+    made = [r.snr or 0.0 for r in make_recordings(VEHICLE, cases, seconds=40.0)]
+    assert max(made[:2]) < 1.5
+    assert made[2] / made[3] == pytest.approx(2.0, rel=0.05)
