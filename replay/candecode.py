@@ -45,6 +45,16 @@ class Bits:
         return raw_bits(data, self.start, self.length, big_endian=self.big_endian)
 
     @property
+    def aligned(self) -> tuple[str, int, int] | None:
+        """Byte order, size and column of the field where the frame, seen as an array of such items, holds it."""
+        size = self.length // 8
+        first = self.start // 8
+        whole = self.start % 8 == (7 if self.big_endian else 0)
+        if self.length not in (8, 16, 32, 64) or not whole or first % size:
+            return None
+        return (">" if self.big_endian else "<"), size, first // size
+
+    @property
     def end(self) -> int:
         """Bytes that a frame needs to hold the signal."""
         return last_byte(self.start, self.length, big_endian=self.big_endian) + 1
@@ -56,7 +66,7 @@ class SignalPlan:
 
     channel: int
     bits: Bits
-    kind: str  # "unsigned", "signed" or "float"
+    kind: str  # "uint", "int" or "float"
     scale: float
     offset: float
     minimum: float | None
@@ -64,32 +74,24 @@ class SignalPlan:
     invalid_raw: tuple[int, ...]  # raw values, as unsigned integers, that mark a missing value
     conditions: tuple[tuple[Bits, tuple[int, ...]], ...]  # multiplexer fields and the values that select it
 
-    def values(self, data: ByteArray) -> tuple[FloatArray, BoolArray | None, BoolArray | None]:
-        """Physical values (NaN where missing), which were marked invalid, which were out of range: (n,) each; None
-        stands for "none of them" and costs nothing."""
-        raw = self.bits.raw(data)
-        if self.kind == "float":
-            with np.errstate(invalid="ignore", over="ignore"):  # a float signal may carry any bits
-                physical = self._number(raw) * self.scale + self.offset
-            invalid = _any(~np.isfinite(physical))
-        else:
-            physical = self._number(raw)
-            if self.scale != 1.0:
-                physical *= self.scale
-            if self.offset != 0.0:
-                physical += self.offset
-            invalid = None
+    def decode(self, data: ByteArray, out: FloatArray) -> tuple[BoolArray | None, BoolArray | None]:
+        """Write physical values (NaN where missing) to `out` (n,); returns which were marked invalid and which were
+        out of range, where None stands for "none of them" and costs nothing."""
+        with np.errstate(invalid="ignore", over="ignore"):  # a float signal may carry any bits
+            np.multiply(self._number(data), self.scale, out=out, dtype=np.float64)
+        if self.offset != 0.0:
+            out += self.offset
+        invalid = _any(~np.isfinite(out)) if self.kind == "float" else None
         if self.invalid_raw:
-            invalid = _any(
-                np.isin(raw, np.array(self.invalid_raw, dtype=np.uint64)) | (False if invalid is None else invalid)
-            )
-        outside = self._outside(physical)
+            marked = _any(np.isin(self.bits.raw(data), np.array(self.invalid_raw, dtype=np.uint64)))
+            invalid = marked if invalid is None else invalid if marked is None else invalid | marked
+        outside = self._outside(out)
         if invalid is not None:
             outside = _any(outside & ~invalid) if outside is not None else None
-            physical[invalid] = np.nan
+            out[invalid] = np.nan
         if outside is not None:
-            physical[outside] = np.nan
-        return physical, invalid, outside
+            out[outside] = np.nan
+        return invalid, outside
 
     def _outside(self, physical: FloatArray) -> BoolArray | None:
         """Values beyond the database's range, by more than the rounding of its decimal limits."""
@@ -102,15 +104,18 @@ class SignalPlan:
             outside = above if outside is None else outside if above is None else outside | above
         return outside
 
-    def _number(self, raw: WordArray) -> FloatArray:
-        length = self.bits.length
+    def _number(self, data: ByteArray) -> NDArray[Any]:
+        """The field as integers or floats, not scaled yet, shape (n,)."""
+        aligned = self.bits.aligned
+        if aligned is not None:  # a whole item of the frame: no shifting
+            order, size, column = aligned
+            return data.view(f"{order}{self.kind[0]}{size}")[:, column]
+        raw, length = self.bits.raw(data), self.bits.length
         if self.kind == "float":
-            unsigned, floating = {16: ("<u2", "<f2"), 32: ("<u4", "<f4"), 64: ("<u8", "<f8")}[length]
-            return raw.astype(unsigned).view(floating).astype(np.float64)
-        if self.kind == "signed":
-            shift = np.uint64(64 - length)
-            return ((raw << shift).view(np.int64) >> np.int64(64 - length)).astype(np.float64)
-        return raw.astype(np.float64)
+            return raw.astype(f"<u{length // 8}").view(f"<f{length // 8}").astype(np.float64)
+        if self.kind == "int":
+            return (raw << np.uint64(64 - length)).view(np.int64) >> np.int64(64 - length)
+        return raw
 
     def selected(self, data: ByteArray) -> BoolArray:
         """Frames whose multiplexer fields select this signal, shape (n,)."""
@@ -149,66 +154,79 @@ class CanDecoder:
         database = dbc if isinstance(dbc, Database) else load_database(Path(dbc))
         self.plans = sorted(_plan(channels, database), key=lambda plan: plan.frame_id)
         self.ids = np.array([plan.frame_id for plan in self.plans], dtype=np.uint32)
+        most = max(len(plan.signals) for plan in self.plans)
+        self.table = np.full((len(self.plans) + 1, most), -1, dtype=np.int32)  # channels of a message; last: foreign
+        for row, plan in enumerate(self.plans):
+            self.table[row, : len(plan.signals)] = [signal.channel for signal in plan.signals]
 
     def decode(self, frames: FrameBlock, account: Account) -> SampleBlock:
         """Samples of the wanted signals in the order of the frames; a missing value is NaN."""
-        place = np.minimum(np.searchsorted(self.ids, frames.id), len(self.ids) - 1)
+        place = np.minimum(np.searchsorted(self.ids, frames.id), len(self.ids) - 1).astype(np.int16)
         place[self.ids[place] != frames.id] = len(self.ids)
-        most = max(len(plan.signals) for plan in self.plans)
-        value = np.empty((len(place), most))  # (n, most) keeps the order of the frames
-        channel = np.full((len(place), most), -1, dtype=np.int32)
-        ours = 0
-        for index, plan in enumerate(self.plans):
-            rows = np.flatnonzero(place == index)
-            if len(rows):
-                ours += len(rows)
-                account.contents[id_text(plan.frame_id)] += len(rows)
-                width = len(plan.signals)
-                value[rows, :width], channel[rows, :width] = self._decode_message(
-                    plan, frames.data[rows], frames.length[rows], account
-                )
-        if ours < len(place):
-            account.foreign(len(place) - ours)
-            self._count_foreign(frames.id[place == len(self.ids)], account)
-        time = np.repeat(frames.time, most)
-        flat = channel.reshape(-1)
-        if np.all(flat >= 0):
-            return SampleBlock(time, flat, value.reshape(-1))
-        keep = flat >= 0
-        return SampleBlock(time[keep], flat[keep], value.reshape(-1)[keep])
+        order = np.argsort(place, kind="stable")  # message by message, foreign frames last
+        data, length = _take_rows(frames.data, order), frames.length[order]
+        value = np.empty((len(place), self.table.shape[1]))  # what no message fills is left out by its channel, -1
+        channel = np.take(self.table, place, axis=0)
+        begin = 0
+        for index, count in enumerate(np.bincount(place, minlength=len(self.ids) + 1)[:-1].tolist()):
+            if count:
+                rows = slice(begin, begin + count)
+                plan = self.plans[index]
+                account.contents[id_text(plan.frame_id)] += count
+                present = self._decode_message(plan, data[rows], length[rows], value[rows], account)
+                if present is not None:
+                    columns = np.arange(len(plan.signals))
+                    channel[order[rows, None], columns] = np.where(present, channel[order[rows, None], columns], -1)
+                begin += count
+        if begin < len(place):
+            account.foreign(len(place) - begin)
+            self._count_foreign(frames.id[order[begin:]], account)
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        value = _take_rows(value, back)
+        time = np.repeat(frames.time, value.shape[1])
+        keep = channel.reshape(-1) >= 0
+        if keep.all():
+            return SampleBlock(time, channel.reshape(-1), value.reshape(-1))
+        return SampleBlock(time[keep], channel.reshape(-1)[keep], value.reshape(-1)[keep])
 
     def _decode_message(
-        self, plan: MessagePlan, data: ByteArray, length: ByteArray, account: Account
-    ) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Values and channels (-1: nothing there), shape (n, wanted signals), of the frames of one message."""
+        self, plan: MessagePlan, data: ByteArray, length: ByteArray, value: FloatArray, account: Account
+    ) -> BoolArray | None:
+        """Fill `value` (n, at least wanted signals) from the frames of one message; returns which signals each frame
+        holds, shape (n, wanted signals), or None when every frame holds all."""
         if plan.multiplexed or length.min() < plan.end:
-            return _decode_piecewise(plan, data, length, account)
-        value = np.empty((len(data), len(plan.signals)))
+            return _decode_piecewise(plan, data, length, value, account)
         missing = False
         for column, signal in enumerate(plan.signals):
-            value[:, column], invalid, outside = signal.values(data)
+            invalid, outside = signal.decode(data, value[:, column])
             if invalid is not None or outside is not None:
                 missing = True
                 _count_missing(invalid, outside, None, account)
         lost = int(np.isnan(value).all(axis=1).sum()) if missing else 0
         account.drop(lost, "no valid value")
         account.tally.used += len(data) - lost
-        channel = np.array([signal.channel for signal in plan.signals], dtype=np.int32)
-        return value, np.broadcast_to(channel, value.shape)
+        return None
 
     def _count_foreign(self, ids: NDArray[np.uint32], account: Account) -> None:
         for frame_id, count in zip(*(part.tolist() for part in np.unique(ids, return_counts=True)), strict=True):
             account.contents[id_text(frame_id)] += count
 
 
+def _take_rows(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
+    """`array[rows]`; rows of eight bytes are taken as words, which is quicker."""
+    if array.dtype == np.uint8 and array.shape[1] == 8 and array.flags.c_contiguous:
+        return array.view(np.uint64)[rows, 0].view(np.uint8).reshape(-1, 8)
+    return np.take(array, rows, axis=0)
+
+
 def _decode_piecewise(
-    plan: MessagePlan, data: ByteArray, length: ByteArray, account: Account
-) -> tuple[FloatArray, NDArray[np.int32]]:
+    plan: MessagePlan, data: ByteArray, length: ByteArray, value: FloatArray, account: Account
+) -> BoolArray:
     """As `_decode_message`, where not every frame holds every signal."""
     if data.shape[1] < plan.end:  # an FD layout in a classic block
         data = np.pad(data, ((0, 0), (0, 64 - data.shape[1])))
-    shape = (len(data), len(plan.signals))
-    value, channel = np.full(shape, np.nan), np.full(shape, -1, dtype=np.int32)
+    present = np.zeros((len(data), len(plan.signals)), dtype=bool)
     short = np.zeros(len(data), dtype=bool)
     for column, signal in enumerate(plan.signals):
         chosen = signal.selected(data)
@@ -217,17 +235,17 @@ def _decode_piecewise(
             lacking |= length < bits.end
         chosen &= ~lacking
         short |= lacking
-        value[:, column], invalid, outside = signal.values(data)
+        invalid, outside = signal.decode(data, value[:, column])
         _count_missing(invalid, outside, chosen, account)
-        channel[chosen, column] = signal.channel
-    channel[short] = -1
-    wanted = (channel >= 0).any(axis=1)
-    usable = ((channel >= 0) & ~np.isnan(value)).any(axis=1)
+        present[:, column] = chosen
+    present[short] = False
+    wanted = present.any(axis=1)
+    usable = (present & ~np.isnan(value[:, : len(plan.signals)])).any(axis=1)
     account.corrupt(int(short.sum()), "frame shorter than its message")
     account.foreign(int((~wanted & ~short).sum()), "other multiplexer value")
     account.drop(int((wanted & ~usable).sum()), "no valid value")
     account.tally.used += int(usable.sum())
-    return value, channel
+    return present
 
 
 def _count_missing(
@@ -291,7 +309,7 @@ def _signal_plan(index: int, signal: Signal, signals: dict[str, Signal], message
     return SignalPlan(
         channel=index,
         bits=_bits(signal),
-        kind="float" if conversion.is_float else "signed" if signal.is_signed else "unsigned",
+        kind="float" if conversion.is_float else "int" if signal.is_signed else "uint",
         scale=float(conversion.scale),
         offset=float(conversion.offset),
         minimum=minimum,

@@ -140,10 +140,10 @@ class McapFile:
         """Messages that are in the account or will be put there by the receiver of the batch."""
         self._counted += messages
 
-    def reached(self, log_time: int) -> None:
-        """The recording has been read up to here."""
-        self._first_time = self._first_time or log_time
-        self._last_time = max(self._last_time, log_time)
+    def reached(self, first: int, last: int) -> None:
+        """The recording has been read from `first` to `last` (log times)."""
+        self._first_time = self._first_time or first
+        self._last_time = max(self._last_time, last)
 
     def _resume(self, file: BinaryIO, at: int, summary: Summary | None, opcode: int) -> bool:
         """After a record that cannot be right: place the file at the next chunk of the index, if there is one."""
@@ -226,7 +226,8 @@ class _Splitter:
 
     def take(self) -> Batch:
         self.file.count(self.count)
-        self.file.reached(max(messages.log_time[-1] for messages in self.batch.values()))
+        times = [(messages.log_time[0], messages.log_time[-1]) for messages in self.batch.values()]
+        self.file.reached(min(first for first, _ in times), max(last for _, last in times))
         batch, self.batch, self.count = self.batch, {}, 0
         return batch
 
