@@ -143,20 +143,14 @@ def _refined_line(
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
     time = grid.start + grid.time + CLOCK_LEAD
     best: tuple[float, float, FloatArray] = (-1.0, 0.0, np.zeros(2))
+    channel = Channel(projector, projector.of_load[:, :, dof])
     for offset in np.linspace(-0.6, 0.6, 13):
         frequency = (bin_number + offset) / grid.length
         if frequency <= 0:
             continue
         angle = 2 * np.pi * frequency * time
         spectra = grid.forward(np.column_stack([np.sin(angle), np.cos(angle)]))[grid.band]
-        columns = np.column_stack(
-            [projector.pack(projector.of_load[:, :, dof] * spectra[:, k, None]) for k in range(2)]
-        )
-        columns -= projector.q @ (projector.q.T @ columns)
-        gram = columns.T @ columns
-        product = columns.T @ projector.residual
-        solution = np.linalg.lstsq(gram, product, rcond=1e-12)[0]
-        score = float(product @ solution)
+        score, solution = channel.joint(spectra.T)
         if score > best[0]:
             best = (score, frequency, solution)
     score, frequency, (sine, cosine) = best

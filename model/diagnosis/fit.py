@@ -21,6 +21,7 @@ from model.diagnosis.measured import Noise, Part
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, is_waveform
 from model.signals import FloatArray
+from model.diagnosis.unknown import StaticLaw
 from model.system import System
 
 PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
@@ -147,25 +148,21 @@ class Problem:
         """Residual and sensitivities at a point."""
         shown, forward, forces = self.predict(point, start)
         grid = self.part.grid
-        free = grid.forward(forward.free_rows())
-        spectrum = self.part.sensors - shown - free @ point.state
         if self.whitener is None:
             self.whitener = Whitener.of(forward, self.noise)
+        free = self._free_columns(forward)
+        spectrum = self.part.sensors - shown - free @ point.state
         motions = _motions(forward, forces, point.state)
         P = len(point.theta)
         count = P + sum(len(t.parameters) for t in point.terms)
-        columns = np.zeros((len(grid.omega), len(self.sensors), count + free.shape[2]), dtype=complex)
-        columns[:, :, count:] = free
         theta_forces, theta_loads = self._theta_forces(forward, motions)
-        plant = forward.plant
-        elements = [p.element for p in self.system.parameters]
+        law_forces = np.zeros((len(grid.omega), count - P, 0 if forces is None else len(forces.terms)), dtype=complex)
+        packed = Columns(self, forward, count + free.shape[2])
         for i, parameter in enumerate(self.system.parameters):
             if parameter.quantity == "mass":
-                columns[:, :, i] = np.einsum("fsn,fn->fs", plant.sensor_of_load, theta_loads[i])
+                packed.add_load(i, theta_loads[i])
             else:
-                e = self.system.elements.index(elements[i])
-                np.multiply(plant.sensor_of_force[:, :, e], theta_forces[:, i, None], out=columns[:, :, i])
-        law_forces = np.zeros((len(grid.omega), count - P, 0 if forces is None else len(forces.terms)), dtype=complex)
+                packed.add_force(i, self.system.elements.index(parameter.element), theta_forces[:, i])
         at = P
         for index, term in enumerate(point.terms):
             for j in range(len(term.parameters)):
@@ -173,21 +170,38 @@ class Problem:
                     assert forces is not None
                     port, change = _law_change(forward, forces, term, j)
                     law_forces[:, at - P, port] = change
-                    columns[:, :, at] = (plant.sensor_of_force @ _wide(forward, forces.ports[port])) * change[:, None]
+                    packed.add_port(at, forces.ports[port], change)
                 else:
-                    columns[:, :, at] = self._difference(point, index, j, forward, forces, shown)
+                    packed.add_shown(at, self._difference(point, index, j, forward, forces, shown))
                 at += 1
-        columns[:, :, :P] *= forward.sensor_factor[:, :, None]
-        waveform = [P + i for i in range(count - P) if np.any(law_forces[0 if len(law_forces) < 2 else 1, i])]
-        columns[:, :, waveform] *= forward.sensor_factor[:, :, None]
+        packed.add_free(count, free)
         if forces is not None:
             along = _port_motions(forward, forces, theta_forces, theta_loads, law_forces, free.shape[2])
             extra = _tangent(forward, forces, along)
-            through = np.stack([plant.sensor_of_force @ _wide(forward, w) for w in forces.ports], axis=2)
-            columns += (through @ extra) * forward.sensor_factor[:, :, None]
-        jacobian = self.whitener(columns, self.part)
+            for k, port in enumerate(forces.ports):
+                for column in range(extra.shape[2]):
+                    packed.add_port(column, port, extra[:, k, column])
         residual = self.whitener(spectrum, self.part)
-        return Linearisation(residual, jacobian, spectrum, forward, forces, motions)
+        return Linearisation(residual, packed.jacobian, spectrum, forward, forces, motions)
+
+    def _free_columns(self, forward: Forward) -> ComplexArray:
+        """Transforms of the free motion per state at the first sample, (F, S, 2n).
+
+        In modal coordinates sum_k c l^k z^-k = c (1 - l^N) / (1 - l / z); by transform where the modes are too
+        close to each other for that.
+        """
+        plant, grid = forward.plant, self.part.grid
+        values, vectors = np.linalg.eig(plant.structure.state_matrix())
+        if np.linalg.cond(vectors) > 1e9:
+            return grid.forward(forward.free_rows())
+        step = np.exp(values * grid.step)
+        turn = np.exp(-1j * grid.omega * grid.step)
+        last = np.exp(values * grid.length)
+        near = np.abs(1 - turn[:, None] * step) < 1e-9  # an undamped mode on a bin
+        scalar = np.where(near, grid.samples, (1 - last) / np.where(near, 1.0, 1 - turn[:, None] * step))
+        rows = forward.free_rows_at_start() @ vectors
+        modal = rows[None] * (scalar / np.sqrt(grid.samples))[:, None, :]
+        return modal @ np.linalg.inv(vectors)
 
     def _theta_forces(
         self, forward: Forward, motions: Motions
@@ -266,6 +280,57 @@ class Problem:
         return _finish(self, point, lin, converged, count)
 
 
+class Columns:
+    """The jacobian, column by column in whitened real numbers, stored so that every column is contiguous."""
+
+    def __init__(self, problem: Problem, forward: Forward, count: int) -> None:
+        assert problem.whitener is not None
+        grid = problem.part.grid
+        band = grid.band
+        self.band, self.forward, self.problem = band, forward, problem
+        weighted = problem.whitener.factor * grid.weight[:, None, None]
+        shown = forward.sensor_factor[band, :, None]
+        self.of_shown = weighted
+        self.of_force = np.ascontiguousarray((weighted @ (forward.plant.sensor_of_force[band] * shown)).transpose(2, 0, 1))
+        size = weighted.shape[0] * weighted.shape[1]
+        self.half = size
+        self.store = np.zeros((count, 2 * size))
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """(2 F S, columns)."""
+        return self.store.T
+
+    def _add(self, column: int, whitened: ComplexArray) -> None:
+        self.store[column, : self.half] += whitened.real.ravel()
+        self.store[column, self.half :] += whitened.imag.ravel()
+
+    def add_force(self, column: int, element: int, force: ComplexArray) -> None:
+        """Response to a force along an element, (F,)."""
+        self._add(column, self.of_force[element] * force[self.band, None])
+
+    def add_port(self, column: int, port: FloatArray, force: ComplexArray) -> None:
+        """Response to a force along a port."""
+        for element in np.flatnonzero(port):
+            self.add_force(column, int(element), port[element] * force)
+
+    def add_load(self, column: int, load: ComplexArray) -> None:
+        """Response to loads on the degrees of freedom, (F, n)."""
+        plant, band = self.forward.plant, self.band
+        shown = np.einsum("fsn,fn->fs", plant.sensor_of_load[band], load[band]) * self.forward.sensor_factor[band]
+        self._add(column, (self.of_shown @ shown[:, :, None])[:, :, 0])
+
+    def add_shown(self, column: int, shown: ComplexArray) -> None:
+        """A change of the shown signals, (F, S)."""
+        self._add(column, (self.of_shown @ shown[self.band][:, :, None])[:, :, 0])
+
+    def add_free(self, first: int, free: ComplexArray) -> None:
+        """Free motions, (F, S, 2n)."""
+        whitened = np.ascontiguousarray((self.of_shown @ free[self.band]).transpose(2, 0, 1))
+        for i, column in enumerate(whitened):
+            self._add(first + i, column)
+
+
 def _loads(forward: Forward, term: Term) -> ComplexArray | float:
     """Sensor signals of a body's unmeasured force."""
     load = getattr(term.law, "load", None)
@@ -289,9 +354,12 @@ def _step_of(term: Term, parameter: int) -> float:
 
 def _law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) -> tuple[int, ComplexArray]:
     """Port of a law and the spectrum of its force's derivative along the present trajectory, (F,)."""
+    port = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    if isinstance(term.law, StaticLaw):
+        values = term.law.values(forces.deflection[:, port], forces.rate[:, port])
+        return port, forward.part.grid.coarse_spectrum(values[parameter])
     step = _step_of(term, parameter)
     change = (_force(forward, term.moved(parameter, step), forces) - _force(forward, term, forces)) / step
-    port = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
     return port, forward.part.grid.coarse_spectrum(change)
 
 

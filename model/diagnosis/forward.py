@@ -30,6 +30,7 @@ from model.system import System
 _TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
 _HISTORY = 8
+_REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
 
 
 def structure_of(
@@ -158,11 +159,15 @@ class Forward:
     def free_rows(self) -> FloatArray:
         """Sensors over the free state at the first sample, (N, S, 2n)."""
         grid = self.part.grid
+        return self.plant.free_motion(self.free_rows_at_start(), grid.step, grid.samples)
+
+    def free_rows_at_start(self) -> FloatArray:
+        """What the sensors show of the state at the first sample, (S, 2n)."""
         rows = self.plant.structure.sensor_rows()
         gain, lag, _ = self.faults
         for i in np.flatnonzero(lag):
             rows[i] = rows[i] @ expm(-self.plant.structure.state_matrix() * lag[i])
-        return self.plant.free_motion(rows * gain[:, None], grid.step, grid.samples)
+        return rows * gain[:, None]
 
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along ports (m, E) on the oversampled axis, laws' forces left out: 2 x (4N, m)."""
@@ -240,7 +245,10 @@ def _solve(forward: Forward, terms: list[Term], state: FloatArray) -> LawForces:
     time = grid.start + grid.fine_time
     elements = [forward.element_of(term) for term in terms]
 
+    reach = _REACH * np.abs(loop.d0).max(axis=0), _REACH * np.abs(loop.v0).max(axis=0)
+
     def law(d: FloatArray, v: FloatArray) -> FloatArray:
+        d, v = np.clip(d, -reach[0], reach[0]), np.clip(v, -reach[1], reach[1])
         columns = [
             force_along(t.law, t.parameters, d[:, i], v[:, i], time, elements[i])
             - t.preload[0] * d[:, i]

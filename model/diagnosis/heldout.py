@@ -53,7 +53,7 @@ class HeldOut:
             now = Point(point.theta, point.terms, state)
             shown, forward, forces = problem.predict(now, waveform or ())
             waveform = None if forces is None else tuple(forces.force.T)
-            rows = _sensor_rows(forward)
+            rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, self.whole.grid.step, self.split)
             particular = self.whole.grid.inverse(shown)
             target = (self.signals.sensors[trained] - particular[trained]) * weights
@@ -90,16 +90,6 @@ class HeldOut:
             F = plant.structure.F[:, : fit.forward.part.force.shape[1]]
             power = power + np.abs(plant.sensor_of_load @ F) ** 2 @ self.noise.force**2
         return np.sqrt(power.mean(axis=0) + self.noise.sensors**2)
-
-
-def _sensor_rows(forward) -> FloatArray:
-    from scipy.linalg import expm
-
-    rows = forward.plant.structure.sensor_rows()
-    gain, lag, _ = forward.faults
-    for i in np.flatnonzero(lag):
-        rows[i] = rows[i] @ expm(-forward.plant.structure.state_matrix() * lag[i])
-    return rows * gain[:, None]
 
 
 def _normal(free: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

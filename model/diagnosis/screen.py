@@ -262,8 +262,8 @@ def _unnamed(
         law = static_law(basis, seen)
         count = len(law.parameters)
         scales = tuple(q.typical(seen) for q in law.parameters)
-        unit = [Term(law, location, tuple(float(i == j) for j in range(count)), name) for i in range(count)]
-        spectra = np.array([_force_spectrum(projector, t, d, v, element)[grid.band] for t in unit])
+        values = np.column_stack(law.values(d, v))
+        spectra = grid.coarse_spectrum(values)[grid.band].T
         score, amplitudes = channel.joint(spectra)
         term = Term(law, location, tuple(float(a) for a in amplitudes), name, scales=scales)
         yield Hit(term, score, count, "unnamed", float(stats.chi2.sf(score, count))), 1

@@ -7,10 +7,12 @@ products of deflection and rate, judges whether a named law leaves something out
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from model.diagnosis.catalogue import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper
+from model.diagnosis.catalogue.base import Values
 from model.signals import FloatArray
 
 UNKNOWN = "unknown"
@@ -18,9 +20,10 @@ _Basis = Callable[[FloatArray, FloatArray], list[FloatArray]]  # of normalised d
 
 
 def _wide(x: FloatArray, y: FloatArray) -> list[FloatArray]:
-    size_x, size_y = np.abs(x), np.abs(y)
-    powers = [x**i * y ** (n - i) for n in (2, 3, 4) for i in range(n + 1)]
-    return [*powers, x * size_y, y * size_x, x * size_x, y * size_y, size_x, size_y]
+    size_x, size_y, xx, xy, yy = np.abs(x), np.abs(y), x * x, x * y, y * y
+    cubes = [yy * y, x * yy, xx * y, xx * x]
+    fourths = [yy * yy, x * cubes[0], xx * yy, xx * xy, xx * xx]
+    return [yy, xy, xx, *cubes, *fourths, x * size_y, y * size_x, x * size_x, y * size_y, size_x, size_y]
 
 
 SMALL: dict[str, _Basis] = {
@@ -44,20 +47,30 @@ def trials() -> dict[str, _Basis]:
     return {**SMALL, **ripples, "map": _wide}
 
 
-def static_law(basis: _Basis, seen: Observed) -> ElementLaw:
+@dataclass(frozen=True)
+class StaticLaw(ElementLaw):
+    """A sum of known functions of deflection and rate."""
+
+    basis: _Basis = _wide
+    scale_d: float = 1.0  # m
+    scale_v: float = 1.0  # m/s
+
+    def values(self, deflection: FloatArray, rate: FloatArray) -> list[FloatArray]:
+        """The functions along a motion."""
+        return self.basis(np.asarray(deflection) / self.scale_d, np.asarray(rate) / self.scale_v)
+
+
+def static_law(basis: _Basis, seen: Observed) -> StaticLaw:
     """A law that is linear in its parameters, which are forces in newtons at the rms deflection and rate."""
     scale_d, scale_v = max(seen.deflection_rms, 1e-12), max(seen.rate_rms, 1e-12)
     count = len(basis(np.zeros(1), np.zeros(1)))
     size = max(seen.stiffness * scale_d, seen.damping * scale_v, 1e-12)
 
-    def force(motion: Motion, p, element: SpringDamper) -> FloatArray:
+    def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
         values = basis(np.asarray(motion.deflection) / scale_d, np.asarray(motion.rate) / scale_v)
-        total = np.zeros(np.shape(motion.deflection))
-        for weight, value in zip(p, values, strict=True):
-            total = total + weight * value
-        return total
+        return np.asarray(sum(weight * value for weight, value in zip(p, values, strict=True)))
 
-    return ElementLaw(
+    return StaticLaw(
         name=UNKNOWN,
         title="a force that no law of the catalogue explains",
         parameters=tuple(
@@ -72,4 +85,7 @@ def static_law(basis: _Basis, seen: Observed) -> ElementLaw:
         sentence="a force that no law of the catalogue explains",
         passive=False,
         odd=False,
+        basis=basis,
+        scale_d=scale_d,
+        scale_v=scale_v,
     )
