@@ -10,6 +10,7 @@ from typing import Any
 
 import can
 import numpy as np
+from cantools.database import Database
 
 from model.signals import Channel, SampleBlock, Tally
 from replay.account import Account, UnreadableRecording
@@ -34,7 +35,7 @@ class LiveBus:
         interface: str,
         channel: str,
         channels: Sequence[Channel],
-        dbc: str | Path,
+        dbc: str | Path | Database,
         *,
         latency: float = 0.05,
         stop: threading.Event | None = None,

@@ -27,6 +27,7 @@ from replay.account import Account, UnreadableRecording
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_SIZE_LIMIT = 1 << 30  # bytes; a longer record is damage, not data
 BATCH_MESSAGES = 4096  # messages outside chunks that are handed out together
+DISORDER = 250_000_000  # ns that messages may lie back in time without being sorted; less than a window waits
 PREFIX = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQI")  # start, end, inflated size, CRC
@@ -63,6 +64,7 @@ class McapFile:
         self.account = account
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
+        self.time_ordered = True  # False: the index shows chunks that lie far back in time, known with the first batch
         self._counted = 0
         self._first_time = self._last_time = 0  # log times, ns
         self._unindexed = False  # the last chunk was damaged and its message indexes have not come yet
@@ -73,6 +75,7 @@ class McapFile:
             if file.read(len(MAGIC)) != MAGIC:
                 raise UnreadableRecording(f"{self.path}: not an MCAP file (its first bytes are not the MCAP magic)")
             summary = self._summary(file)
+            self.time_ordered = summary is None or _ordered(summary.chunks)
             file.seek(len(MAGIC))
             yield from self._data_section(file, summary)
         if summary is not None and summary.messages > self._counted:
@@ -230,6 +233,16 @@ class _Splitter:
         self.file.reached(min(first for first, _ in times), max(last for _, last in times))
         batch, self.batch, self.count = self.batch, {}, 0
         return batch
+
+
+def _ordered(chunks: list[ChunkIndex]) -> bool:
+    """Whether every chunk begins about where the ones before it end."""
+    newest = 0
+    for index in sorted(chunks, key=lambda chunk: chunk.chunk_start_offset):
+        if index.message_start_time < newest - DISORDER:
+            return False
+        newest = max(newest, index.message_end_time)
+    return True
 
 
 def _inflate(body: bytes) -> bytes:

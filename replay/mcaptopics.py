@@ -10,8 +10,9 @@ import numpy as np
 from model.signals import Channel, SampleBlock
 from replay.account import Account, UnreadableRecording
 from replay.mcapfields import Field, TimeSource, Topic, parse_field
-from replay.mcapfile import Batch, McapFile
+from replay.mcapfile import DISORDER, Batch, McapFile
 
+SORTED_SAMPLES = 65_536  # handed out together from a recording that had to be sorted
 SOURCES = ("auto", "header", "publish", "log")
 
 
@@ -26,13 +27,38 @@ def blocks(
         )
     file = McapFile(path, account)
     topics: dict[int, Topic | None] = {}
+    kept: list[SampleBlock] = []
     for batch in file.batches():
         for channel_id in batch:
             if channel_id not in topics:
                 topics[channel_id] = _topic(file, channel_id, channels, sources, account)
         block = _block(file, batch, topics, account)
-        if block is not None:
-            yield block
+        if block is None:
+            continue
+        if file.time_ordered:
+            yield _sorted(block)
+        else:  # written topic by topic: nothing can be aligned before everything is there
+            kept.append(block)
+    if kept:
+        account.problem("messages are not in time order; they were sorted in memory", incomplete=False)
+        whole = _sorted(
+            SampleBlock(
+                np.concatenate([block.time for block in kept]),
+                np.concatenate([block.channel for block in kept]),
+                np.concatenate([block.value for block in kept]),
+            )
+        )
+        for first in range(0, len(whole.time), SORTED_SAMPLES):
+            piece = slice(first, first + SORTED_SAMPLES)
+            yield SampleBlock(whole.time[piece], whole.channel[piece], whole.value[piece])
+
+
+def _sorted(block: SampleBlock) -> SampleBlock:
+    """In time order, where the messages lie further back than a window waits for."""
+    if not len(block.time) or int((np.maximum.accumulate(block.time) - block.time).max()) <= DISORDER:
+        return block
+    order = np.argsort(block.time, kind="stable")
+    return SampleBlock(block.time[order], block.channel[order], block.value[order])
 
 
 def _source(channel: Channel, time_source: str | Mapping[str, str]) -> TimeSource:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from cantools.database import Database
 
 from model.signals import Channel, FloatArray, SampleBlock
 from replay.account import Account, UnreadableRecording
@@ -40,7 +41,7 @@ def load_record(
     channels: Sequence[Channel],
     sample_rate: float,
     *,
-    dbc: str | Path | None = None,
+    dbc: str | Path | Database | None = None,
     time_source: str | Mapping[str, str] = "auto",
     delay: float = 0.5,
     pause: float = 60.0,

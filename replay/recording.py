@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+from cantools.database import Database
 
 from model.signals import Channel, SampleBlock, Tally
 from replay import asc, blf, candump, csvtable, mcaptopics, mf4
@@ -82,13 +83,14 @@ def open_recording(
     path: str | Path,
     channels: Sequence[Channel],
     *,
-    dbc: str | Path | None = None,
+    dbc: str | Path | Database | None = None,
     time_source: str | Mapping[str, str] = "auto",
 ) -> Recording:
     """Choose the reader by the file's extension; raises UnreadableRecording with one line.
 
-    `dbc` is the CAN database that CAN recordings need.  `time_source` (MCAP): "auto" (header stamp where the
-    messages carry one, else publish time), "header", "publish" or "log"; or a table by channel name.
+    `dbc` is the CAN database that CAN recordings need, a file or already loaded.  `time_source` (MCAP): "auto"
+    (header stamp where the messages carry one, else publish time), "header", "publish" or "log"; or a table by
+    channel name.
     """
     path = Path(path)
     extension = path.suffix.lower()

@@ -6,7 +6,7 @@ from cantools.database.can import Database, Message, Signal
 from mcap.writer import CompressionType, Writer
 
 from model.signals import Channel
-from replay import UnreadableRecording
+from replay import UnreadableRecording, open_recording
 from tests.replay_files import (
     CHANNELS,
     LEFT,
@@ -218,3 +218,19 @@ def test_channels_that_never_come_are_named(tmp_path):
     assert any("no field 'leftt'; nearest: left" in line for line in recording.problems)
     assert any(line == "no values of roof" for line in recording.problems)
     assert not recording.incomplete
+
+
+@pytest.mark.parametrize("chunk", [2048, 1 << 20])
+def test_an_mcap_file_written_topic_by_topic_is_put_in_time_order(chunk, tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=chunk)
+        writer.start()
+        for side in ("left", "right"):
+            topic = writer.register_channel(f"/{side}", "json", 0)
+            for row in range(ROWS):
+                writer.add_message(topic, int(TIMES[row]), f'{{"x": {row}}}'.encode(), int(TIMES[row]), row)
+        writer.finish()
+    channels = [Channel(side, "m", 1.0, mcap=f"/{side}.x") for side in ("left", "right")]
+    times = np.concatenate([block.time for block in open_recording(path, channels).blocks()])
+    assert np.array_equal(times, np.repeat(TIMES, 2))

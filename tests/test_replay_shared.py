@@ -1,5 +1,6 @@
 """The labelled recordings and the records made by others, where they lie beside the repository."""
 
+import math
 from collections import Counter
 from pathlib import Path
 
@@ -133,7 +134,7 @@ def test_a_real_car_log_decodes_as_with_cantools():
     present = [known[i] for i in {f.arbitration_id for f in frames} & set(known)]
     channels = [Channel(f"{m.name}.{s.name}", "", 1.0, can=f"{m.name}.{s.name}") for m in present for s in m.signals]
     index = {channel.name: i for i, channel in enumerate(channels)}
-    recording = open_recording(log, channels, dbc=dbc)
+    recording = open_recording(log, channels, dbc=database)
     found = {i: [] for i in range(len(channels))}
     for block in recording.blocks():
         for channel, value in zip(block.channel.tolist(), block.value.tolist(), strict=True):
@@ -155,6 +156,6 @@ def test_a_real_car_log_decodes_as_with_cantools():
             if np.isnan(value):
                 missing += 1
             else:
-                assert value == pytest.approx(float(truth), rel=1e-12, abs=1e-12)
+                assert math.isclose(value, truth, rel_tol=1e-12, abs_tol=1e-12)
     assert compared > 100_000
     assert missing == sum(recording.account.values.values()) > 0
