@@ -130,10 +130,12 @@ class Estimator:
         return EstimatorOutput(log_ratio.numpy(), covariance.numpy())
 
 
-def new_estimator(system: System) -> EstimatorNet:
-    """An untrained network of the right sizes for a system."""
+def new_estimator(system: System, seed: int) -> EstimatorNet:
+    """An untrained network of the right sizes for a system, its first weights drawn from `seed`."""
     features = ForceBalance(system, system.window)
-    return EstimatorNet(Architecture(system.window, features.rows, len(system.parameters)))
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return EstimatorNet(Architecture(system.window, features.rows, len(system.parameters)))
 
 
 def save_estimator(

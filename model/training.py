@@ -67,7 +67,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     features = ForceBalance(system, system.window)
     data = _simulated_rows(features, settings, report)
-    net = new_estimator(system).double()
+    net = new_estimator(system, settings.seed).double()
     _initialise(net, features, data, settings)
     run = _Run(net, out / "checkpoint", settings, _fingerprint(system, settings))
     run.resume()

@@ -1,0 +1,65 @@
+"""Cramer-Rao bounds of window estimates, computed in the time domain apart from the product's own likelihood.
+
+Sensitivities are finite differences of the simulated outputs; the covariance of a window is built whole: sensor
+noise on the diagonal, and the measured inputs' noise carried by every sample's pulse response.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from model.fusion import fuse
+from model.signals import FloatArray
+from model.simulate.linear import LinearSimulator, knot_columns
+from model.system import System
+
+
+def time_domain_bound(system: System, clean: FloatArray, log_ratio: FloatArray, *, fused: bool) -> FloatArray:
+    """Standard deviations (P,) that no unbiased estimator of one window (T, C) can beat; initial state unknown.
+
+    fused: displacement and velocity of a support are known to belong to one motion; otherwise each is an input of
+    its own with its own noise.
+    """
+    simulator = LinearSimulator(system)
+    T, S = len(clean), len(system.sensors)
+    w = torch.as_tensor(simulator.knots(clean[None]))
+    x = torch.as_tensor(log_ratio)[None]
+    values = simulator.element_values(x)
+    discrete = simulator.discretise(values)
+    free = simulator.free_response(discrete, T)[0].numpy().transpose(0, 1, 2).reshape(T * S, -1)
+    measured = clean[:, len(system.inputs) :].reshape(-1)
+    none = torch.zeros(1, free.shape[1], dtype=torch.float64)
+    forced = simulator.simulate(x, w, none)[0].numpy().reshape(-1)
+    x0 = torch.as_tensor(np.linalg.lstsq(free, measured - forced, rcond=None)[0])[None]
+    step = 1e-5
+    offsets = torch.cat([torch.eye(x.shape[1]), -torch.eye(x.shape[1])]).double() * step
+    moved = simulator.simulate(x + offsets, w.expand(len(offsets), -1, -1), x0.expand(len(offsets), -1))[0]
+    up, down = moved.flatten(1).numpy().reshape(2, x.shape[1], -1)
+    J = ((up - down) / (2 * step)).T
+    covariance = np.diag(np.tile(system.sensor_noise**2, T)) + _input_covariance(system, simulator, x, T, fused)
+    factor = np.linalg.cholesky(covariance)
+    J, basis = np.linalg.solve(factor, J), np.linalg.solve(factor, free)
+    q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
+    J = J - q @ (q.T @ J)
+    return np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+
+
+def _input_covariance(system: System, simulator: LinearSimulator, x: torch.Tensor, T: int, fused: bool) -> FloatArray:
+    """Covariance (T S, T S) of outputs from noise of the inputs, each a linear map of its samples' noise."""
+    S = len(system.sensors)
+    total = np.zeros((T * S, T * S))
+    for drive, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
+        noise = system.inputs[value].noise, 0.0 if slope is None else system.inputs[slope].noise
+        if max(noise) == 0:
+            continue
+        samples = np.diag([noise[0]] * T + [noise[1]] * T)  # unit noises to [displacements, velocities]
+        d, v = samples[:, :T], samples[:, T:]
+        if fused and min(noise) > 0:
+            d, v = fuse(d, v, simulator.dt, noise)
+        knots = torch.zeros(2 * T, T, simulator.W, dtype=torch.float64)
+        knots[:, :, 2 * drive], knots[:, :, 2 * drive + 1] = torch.as_tensor(d), torch.as_tensor(v)
+        still = torch.zeros(2 * T, 2 * simulator.H.shape[1], dtype=torch.float64)
+        outputs = simulator.simulate(x.expand(2 * T, -1), knots, still)[0].flatten(1).numpy()
+        total += outputs.T @ outputs
+    return total

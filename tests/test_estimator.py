@@ -1,0 +1,141 @@
+"""The trained estimator: accuracy, files that are refused, reproducible and resumable training."""
+
+import json
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_system import QUARTER_CAR
+
+from model import training
+from model.estimator import WEIGHTS, ModelError, bundled_estimator, load_estimator
+from model.excitation import draw_log_ratios, simulate_runs
+from model.identify import load_identifier
+from model.system import load_system, parse_system
+from model.training import TrainingSettings, train
+
+TINY = TrainingSettings(records=100, windows_per_record=2, steps=30, batch=64, checkpoint_every=10, recording_steps=6)
+SMALL_CAR = QUARTER_CAR.replace("window: 200", "window: 100")
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    system = load_system()
+    rng = np.random.default_rng(77)
+    truth = draw_log_ratios(system, 200, 0.5, rng)
+    return system, truth, simulate_runs(system, truth, system.window, rng).values
+
+
+def test_the_shipped_estimator_is_near_the_bound_and_says_how_near(vehicle):
+    system, truth, windows = vehicle
+    output = bundled_estimator(system).estimate(windows)
+    error = output.log_ratio - truth
+    std = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
+    assert np.abs(error).mean() < 0.016
+    assert 0.9 < (np.abs(error) < 1.96 * std).mean() < 0.98
+
+
+def test_its_start_needs_fewer_iterations_than_nominal_values(vehicle):
+    system, _, windows = vehicle
+    identifier = load_identifier(system)
+    trained = np.mean([e.iterations for e in identifier.identify(windows[:64])])
+    nominal = np.mean([e.iterations for e in identifier.identify(windows[:64], np.zeros((64, 24)))])
+    assert trained <= 0.5 * nominal
+
+
+def test_the_manifest_tells_how_the_weights_came_about():
+    manifest = json.loads((WEIGHTS / "manchester" / "manifest.json").read_text())
+    assert manifest["system_digest"] == load_system().digest
+    assert manifest["measured"]["coverage_95"] > 0.9
+    assert manifest["seed"] == manifest["training"]["seed"]
+
+
+def test_a_model_of_another_system_is_refused():
+    with pytest.raises(ModelError, match=r"trained for 'manchester-passenger'.*quarter-car.*sprung train"):
+        load_estimator(WEIGHTS / "manchester", parse_system(QUARTER_CAR))
+
+
+def test_damaged_weights_and_pickles_are_refused(tmp_path):
+    system = load_system()
+    for name in ("manifest.json", "weights.safetensors"):
+        (tmp_path / name).write_bytes((WEIGHTS / "manchester" / name).read_bytes())
+    weights = tmp_path / "weights.safetensors"
+    data = bytearray(weights.read_bytes())
+    data[-1] ^= 1
+    weights.write_bytes(data)
+    with pytest.raises(ModelError, match="damaged"):
+        load_estimator(tmp_path, system)
+    weights.write_bytes(pickle.dumps({"log_weight": 1}))
+    with pytest.raises(ModelError, match="damaged"):
+        load_estimator(tmp_path, system)
+    with pytest.raises(ModelError, match="not a model directory"):
+        load_estimator(tmp_path / "nothing", system)
+    (tmp_path / "manifest.json").write_text("[]")
+    with pytest.raises(ModelError, match="not a model manifest"):
+        load_estimator(tmp_path, system)
+
+
+@pytest.fixture(scope="module")
+def small_car():
+    """The quarter car: two accelerometers give the motion of both bodies."""
+    return parse_system(SMALL_CAR)
+
+
+def test_training_twice_from_one_seed_gives_the_same_weights(small_car, tmp_path):
+    digests = {train(small_car, tmp_path / str(i), settings=TINY).net.log_weight.sum().item() for i in range(2)}
+    other = train(small_car, tmp_path / "other", settings=replace(TINY, seed=1)).net.log_weight.sum().item()
+    assert len(digests) == 1
+    assert other not in digests
+
+
+def test_training_that_was_interrupted_resumes_to_the_same_weights(small_car, tmp_path):
+    whole = train(small_car, tmp_path / "whole", settings=TINY)
+
+    class Stop(Exception):
+        pass
+
+    def interrupt(stage, done, total, loss):
+        if stage == "train" and done >= 20:
+            raise Stop
+
+    with pytest.raises(Stop):
+        train(small_car, tmp_path / "parts", settings=TINY, progress=interrupt)
+    assert not (tmp_path / "parts" / "manifest.json").exists()
+    stages = []
+    resumed = train(small_car, tmp_path / "parts", settings=TINY, progress=lambda s, d, t, x: stages.append((s, d)))
+    assert ("train", 30) in stages
+    assert ("train", 10) not in stages
+    for name, tensor in whole.net.state_dict().items():
+        assert np.allclose(tensor.numpy(), resumed.net.state_dict()[name].numpy(), atol=1e-12), name
+    assert load_estimator(tmp_path / "parts", small_car).samples == 100
+
+
+def test_recordings_without_labels_lower_the_misfit_of_a_badly_trained_model(small_car, tmp_path):
+    rng = np.random.default_rng(5)
+    truth = np.repeat(rng.uniform(-0.3, 0.3, (1, 4)), 60, axis=0)
+    windows = simulate_runs(small_car, truth, small_car.window, rng).values
+    hasty = replace(TINY, steps=3, learning_rate=0.02)
+    before = train(small_car, tmp_path / "before", settings=hasty)
+    losses = []
+    settings = replace(hasty, recording_steps=40)
+    after = train(
+        small_car, tmp_path / "after", recordings=windows, settings=settings,
+        progress=lambda s, d, t, loss: losses.append(loss) if s == "recordings" else None,
+    )  # fmt: skip
+    assert np.mean(losses[-5:]) < np.mean(losses[:5])
+    errors = [np.abs(e.estimate(windows).log_ratio - truth).mean() for e in (before, after)]
+    assert errors[1] < errors[0]
+
+
+def test_a_system_whose_sensors_give_no_motion_cannot_be_trained(tmp_path):
+    text = QUARTER_CAR.replace("  wheel: {kind: acceleration, body: unsprung, csv: a2, noise: 0.05}\n", "")
+    with pytest.raises(ValueError, match="no force balance"):
+        train(parse_system(text), tmp_path, settings=TINY)
+
+
+def test_progress_goes_from_simulation_through_training(small_car, tmp_path):
+    seen = []
+    training.train(small_car, tmp_path, settings=TINY, progress=lambda *a: seen.append(a[0]))
+    assert seen[0] == "simulate"
+    assert seen[-1] == "train"
