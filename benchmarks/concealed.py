@@ -2,8 +2,8 @@
 
 Recordings are drawn from sealed seeds (`benchmarks.generator`), written as files, diagnosed through the public door
 and judged by `benchmarks.concealed_score`.  Everything is kept in a folder and taken up again where it stopped: the
-recordings with their labels, one JSON per diagnosis.  Three sets: `effects` (every kind, strengths down to hidden in
-the noise), `strong` (the same kinds, strong), `clean` (healthy vehicles and plain parameter changes).
+recordings with their labels, one JSON per diagnosis.  Sets: `strong` and `effects` (every kind, laws strong and down to
+weak), `limit` (laws from weak down to hidden in the noise), `clean` (healthy vehicles and plain parameter changes).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 
 from benchmarks.concealed_score import Score, explained, rate, score, summary
 from benchmarks.generator import draw_cases, read_vehicle, write_set
+from benchmarks.generator.laws import LAWS
 from model.diagnosis.catalogue import CATALOGUE
 from model.diagnosis.diagnose import Options, diagnose
 from model.system import MANCHESTER, System, load_system
@@ -37,7 +38,7 @@ Figures = Iterator[dict[str, Any]]
 
 
 def run(
-    count: int = 68,
+    count: int = 34,
     clean: int = 200,
     seed: int = 2026,
     ablate: int = 34,
@@ -48,14 +49,15 @@ def run(
 ) -> Figures:
     """Yields the figures of each set, of the ablations and of PySINDy.
 
-    `count` recordings with effects (half of them strong) and `clean` without; `ablate` and `pysindy` say on how many
-    of each set those run.
+    `count` recordings in each set with effects, `clean` without; `ablate` and `pysindy` say on how many of each set
+    those run.
     """
     system = load_system(MANCHESTER)
     sets = {
-        "effects": _recordings(out / "effects", count, seed, None, 1.0, seconds),
-        "strong": _recordings(out / "strong", count // 2, seed + 1, None, 0.0, seconds),
-        "clean": _recordings(out / "clean", clean, seed + 2, QUIET_KINDS, 1.0, seconds),
+        "strong": _recordings(out / "strong", count, seed, None, 0.0, seconds),
+        "effects": _recordings(out / "effects", count, seed + 1, None, 1.0, seconds),
+        "limit": _recordings(out / "limit", count, seed + 2, [*LAWS], 2.0, seconds),
+        "clean": _recordings(out / "clean", clean, seed + 3, QUIET_KINDS, 1.0, seconds),
     }
     everything: list[Score] = []
     walls: list[float] = []

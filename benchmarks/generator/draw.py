@@ -91,7 +91,7 @@ def _values(rng: np.random.Generator, vehicle: Vehicle) -> tuple[dict[str, float
 
 def _add_law(case: Case, rng: np.random.Generator, element: str, law: str, weak: float) -> None:
     low, high = LAWS[law].strength
-    strength = _log_uniform(rng, low ** weak * high ** (1 - weak), high)
+    strength = _log_uniform(rng, low**weak * high ** (1 - weak), high if weak <= 1 else low)
     deflection, rate = USUAL["secondary" if element.startswith("secondary") else "primary"]
     roughness = np.sqrt(case.level / LOW_TRACK)
     parameters = LAWS[law].draw(
@@ -148,7 +148,7 @@ def _conceal(case: Case, rng: np.random.Generator, vehicle: Vehicle, weak: float
 def draw_cases(
     vehicle: Vehicle, count: int, seed: int, kinds: list[str] | None = None, weak: float = 1.0
 ) -> list[Case]:
-    """`count` cases of a sealed seed.  `weak` 0 draws only strong effects, 1 down to hidden in the noise."""
+    """`count` cases of a sealed seed.  `weak` 0 draws only strong laws, 1 down to weak ones, 2 weak to hidden ones."""
     root = np.random.SeedSequence(seed)
     chosen = kinds_of_a_set(np.random.default_rng(root.spawn(1)[0]), count, kinds)
     cases = []
