@@ -130,7 +130,7 @@ class Estimator:
         return EstimatorOutput(log_ratio.numpy(), covariance.numpy())
 
 
-def new_estimator(system: System, seed: int) -> EstimatorNet:
+def new_estimator(system: System, seed: int = 0) -> EstimatorNet:
     """An untrained network of the right sizes for a system, its first weights drawn from `seed`."""
     features = ForceBalance(system, system.window)
     with torch.random.fork_rng(devices=[]):
