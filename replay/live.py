@@ -61,6 +61,11 @@ class LiveBus:
         """Frames so far, by what became of them."""
         return self.account.tally
 
+    @property
+    def problems(self) -> list[str]:
+        """One line for every time the bus was lost."""
+        return self.account.problems
+
     def blocks(self) -> Iterator[SampleBlock]:
         """Samples as they come, at most `latency` s after their frames; ends when `stop` is set."""
         retry = FIRST_RETRY
