@@ -1,4 +1,4 @@
-"""Recordings and buses into the pipeline: reading goes on in one thread while the batch before is identified."""
+"""Recordings and buses into the pipeline: reading, identifying and storing overlap, each in a thread of its own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from replay import open_recording
 from replay.pacing import paced
 from replay.windowing import Windower
 from service.compute import Priority
-from service.pipeline import Batch, Pipeline
+from service.pipeline import Batch, Identified, Pipeline
 from service.times import NANOSECONDS
 
 T = TypeVar("T")
@@ -109,12 +109,19 @@ def feed_file(
     windows = _windows(pipeline, paced(recording.blocks(), speed), fed)
     batches = prefetched(_batched(windows, 1 if speed else batch_windows), READ_AHEAD)
     priority = Priority.LIVE if speed else Priority.BATCH
-    try:
+
+    def identified() -> Iterator[Identified]:
         for batch in batches:
             fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
+            yield pipeline.identify(fed.vehicle, batch, priority)
+
+    found = prefetched(identified(), 1)
+    try:
+        for one in found:
             on_tally(recording.tally)
-            on_batch(_process(pipeline, fed, batch, recording_id, priority))
+            on_batch(_count(fed, pipeline.keep(one, recording_id)))
     finally:
+        found.close()
         batches.close()
     on_tally(recording.tally)
     fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
@@ -130,7 +137,7 @@ def feed_live(pipeline: Pipeline, source: Source, vehicle: str, stopping: thread
     """Feed a live source until it ends or `stopping` is set; every window as soon as it is whole."""
     fed = Fed(vehicle)
     for window in _windows(pipeline, _until(source.blocks(), stopping), fed):
-        _process(pipeline, fed, [window], None, Priority.LIVE)
+        _count(fed, pipeline.process(fed.vehicle, [window], None, Priority.LIVE))
         on_tally(source.tally)
     on_tally(source.tally)
 
@@ -174,10 +181,7 @@ def prefetched(items: Iterator[T], ahead: int) -> Generator[T, None, None]:
         thread.join()
 
 
-def _process(
-    pipeline: Pipeline, fed: Fed, windows: list[Window], recording_id: str | None, priority: Priority
-) -> Batch:
-    batch = pipeline.process(fed.vehicle, windows, recording_id, priority)
+def _count(fed: Fed, batch: Batch) -> Batch:
     fed.windows.update(record.outcome for record in batch.records)
     fed.reasons.update(r.reason or "" for r in batch.records if r.outcome == "dropped")
     fed.late += batch.late

@@ -8,6 +8,7 @@ import socket
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -24,7 +25,7 @@ from service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
 from service.pipeline import Batch
 from service.recordings import file_row, finish_row
 from service.settings import Settings
-from service.store import work
+from service.store.work import add_recording
 
 log = logging.getLogger("sprung")
 
@@ -52,48 +53,39 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     Raises UserError for settings, files and buses that cannot be used.
     """
     engine = load_engine(settings)
-    listening = _listen(settings)
-    core = build_core(settings, engine)
-    try:
+    with ExitStack() as stack:
+        listening = stack.enter_context(_listen(settings))
+        core = build_core(settings, engine)
+        stack.callback(core.close)
         buses = [_bus(core, name) for name in feeds.buses]
-    except BaseException:
-        core.close()
-        raise
-    threads = [
-        threading.Thread(target=_feed_files, args=(core, feeds, watch), name="sprung-replay", daemon=True),
-        *(
-            threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), name=f"sprung-{bus.name}", daemon=True)
-            for bus in buses
-        ),
-    ]
+        threads = [threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)]
+        threads += [
+            threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), daemon=True) for bus in buses
+        ]
 
-    def start_feeds() -> None:
-        for thread in threads:
-            thread.start()
+        def start() -> None:
+            for thread in threads:
+                thread.start()
 
-    def stop() -> None:
-        core.stopping.set()
-        for thread in threads:
-            thread.join()
-        core.close()
+        def stop() -> None:
+            core.stopping.set()
+            for thread in threads:
+                thread.join()
+            core.close()
 
-    host, port = listening.getsockname()[:2]
-    announce(f"http://{f'[{host}]' if ':' in host else host}:{port}")
-    config = uvicorn.Config(
-        create_app(core, start_feeds, stop),
-        log_level="warning",
-        access_log=False,
-        timeout_graceful_shutdown=settings.shutdown_seconds,
-        timeout_keep_alive=30,
-        lifespan="on",
-    )
-    # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
-    previous = signal.signal(signal.SIGTERM, _exit)
-    try:
+        host, port = listening.getsockname()[:2]
+        announce(f"http://{f'[{host}]' if ':' in host else host}:{port}")
+        config = uvicorn.Config(
+            create_app(core, start, stop),
+            log_level="warning",
+            access_log=False,
+            timeout_graceful_shutdown=settings.shutdown_seconds,
+            timeout_keep_alive=30,
+            lifespan="on",
+        )
+        # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
+        stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _exit))
         uvicorn.Server(config).run(sockets=[listening])
-    finally:
-        signal.signal(signal.SIGTERM, previous)
-        listening.close()
 
 
 def _exit(_number: int, _frame: FrameType | None) -> NoReturn:
@@ -103,17 +95,14 @@ def _exit(_number: int, _frame: FrameType | None) -> NoReturn:
 def _listen(settings: Settings) -> socket.socket:
     """The socket, before anything else is started, so that a port in use is a plain error."""
     try:
-        family, kind, protocol, _, address = socket.getaddrinfo(
+        found = socket.getaddrinfo(
             settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-        listening = socket.socket(family, kind, protocol)
-        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        listening.bind(address)
+        )
+        family, _, _, _, address = found[0]
+        return socket.create_server(address[:2], family=family, backlog=1024)
     except OSError as error:
         detail = error.strerror or error
         raise UserError(f"cannot listen on {settings.host}:{settings.port}: {detail}; choose another --port") from error
-    listening.listen(1024)
-    return listening
 
 
 def _bus(core: Core, name: str) -> LiveBus:
@@ -145,7 +134,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
         try:
             row = file_row(path)
             with core.store.write() as connection:
-                work.add_recording(connection, row)
+                add_recording(connection, row)
             fed = feed_file(
                 core.pipeline,
                 path,

@@ -34,6 +34,18 @@ class Batch:
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
 
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """Windows on their way: identified, not yet tracked and stored."""
+
+    vehicle: str
+    windows: Sequence[Window]
+    known: dict[int, WindowRecord]  # those that are stored already, by start
+    fresh: list[Window]
+    estimates: list[Estimate | None]  # one per fresh window, None where dropped
+    seconds: dict[str, float]  # by stage
+
+
 @dataclass(slots=True)
 class _Vehicle:
     """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
@@ -79,15 +91,23 @@ class Pipeline:
 
         windows: in order of time.  Returns when the transaction is committed.
         """
+        return self.keep(self.identify(vehicle, windows, priority), recording_id)
+
+    def identify(self, vehicle: str, windows: Sequence[Window], priority: Priority = Priority.BATCH) -> Identified:
+        """The first half of `process`: may run while the batch before is still tracked and stored."""
         with self.store.read() as connection:
             known = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
         estimates, seconds = self._identify(fresh, priority)
-        batch = self._commit(vehicle, fresh, estimates, recording_id)
-        batch.seconds |= seconds
-        if known:
-            stored = {record.start: record for record in batch.records} | known
-            batch.records = [stored[w.start] for w in windows]
+        return Identified(vehicle, windows, known, fresh, estimates, seconds)
+
+    def keep(self, found: Identified, recording_id: str | None = None) -> Batch:
+        """The second half of `process`: track and store, in order of time."""
+        batch = self._commit(found.vehicle, found.fresh, found.estimates, recording_id)
+        batch.seconds |= found.seconds
+        if found.known:
+            stored = {record.start: record for record in batch.records} | found.known
+            batch.records = [stored[w.start] for w in found.windows]
         for listener in self._listeners:
             listener(batch)
         return batch

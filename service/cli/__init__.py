@@ -6,6 +6,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+import typer
+
 USAGE = 2
 INTERRUPTED = 130
 
@@ -17,19 +19,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         status = app(arguments, prog_name="sprung", standalone_mode=False)
         sys.stdout.flush()
-    except KeyboardInterrupt:
-        print("sprung: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except (KeyboardInterrupt, typer.Abort):
+        status = INTERRUPTED  # older versions of typer raise, newer ones return it
     except Exception as error:
-        if type(error).__name__ == "Abort":  # typer's word for Ctrl-C at a prompt
-            return INTERRUPTED
         if os.environ.get("SPRUNG_DEBUG"):
             raise
         print(f"sprung: {describe(error)}", file=sys.stderr)
         return USAGE
+    if status == INTERRUPTED:
+        print("sprung: interrupted", file=sys.stderr)
     return status if isinstance(status, int) else 0
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
@@ -117,3 +117,13 @@ def _state(alarm: str | None, identifiable: bool, drift: float | None) -> str:
     if not identifiable:
         return "not identifiable"
     return "learning" if drift is None else "ok"
+
+
+@contextmanager
+def stage_line(console: Console) -> Iterator[Callable[[str], None]]:
+    """A callback for what is being done now: a spinner on a terminal, else nothing."""
+    if not console.is_terminal:
+        yield lambda _stage: None
+        return
+    with console.status("starting") as status:
+        yield status.update

@@ -1,0 +1,67 @@
+"""`sprung diagnose`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from model.diagnosis.report import Report
+from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from replay.record import Record, load_record
+from service.cli.console import errors, stage_line
+from service.diagnoses import load_excerpt
+
+
+def run(file: Path, system_file: Path | None, dbc: Path | None, out: Path | None, json_lines: bool) -> int:
+    """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
+    system = load_system(system_file or MANCHESTER)
+    record = load(file, system, dbc or (MANCHESTER_DBC if system_file is None else None))
+    for problem in record.problems:
+        print(f"sprung: {file}: {problem}", file=sys.stderr)
+    report = _diagnose(system, record, file)
+    if out is not None:
+        from service.report import write_report
+
+        files = write_report(report, system, out)
+        if not json_lines:
+            print(f"{files.page}")
+    if json_lines:
+        print(json.dumps(report.to_dict(), allow_nan=False), flush=True)
+    else:
+        print(text(report))
+    return 0 if report.verdict == "consistent" and not report.advice else 1
+
+
+def load(file: Path, system: System, dbc: Path | None) -> Record:
+    """A recording on one even grid; or an excerpt that the service saved."""
+    if file.suffix == ".npz":
+        return load_excerpt(file)
+    return load_record(file, system.channels, system.sample_rate, dbc=dbc)
+
+
+def _diagnose(system: System, record: Record, file: Path) -> Report:
+    from model.diagnosis import diagnose
+
+    with stage_line(errors()) as show:
+        report = diagnose(system, record, progress=show)
+    return replace(report, recording=replace(report.recording, file=file.name))
+
+
+def text(report: Report) -> str:
+    """The report in a few lines."""
+    lines = [f"{report.recording.file}: {report.verdict.replace('_', ' ')}"]
+    if report.summary:
+        lines.append(report.summary)
+    for finding in report.findings:
+        values = ", ".join(f"{p.name} {p.value:.4g} ± {p.std:.2g} {p.unit}" for p in finding.parameters)
+        lines.append(finding.sentence or f"{finding.location}: {finding.effect} ({values})")
+        if finding.advice:
+            lines.append(f"  {finding.advice}")
+    lines.append(
+        f"error on samples that no fit saw: {100 * report.baseline_validation.nrmse:.1f} % before, "
+        f"{100 * report.augmented_validation.nrmse:.1f} % with the findings, "
+        f"{100 * report.noise_floor.nrmse:.1f} % is noise"
+    )
+    return "\n".join([*lines, *report.changes, *report.advice])

@@ -1,0 +1,294 @@
+"""The command line: exit status, one-line errors, JSON lines as in the contract, tables for people."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from model.system import MANCHESTER, System
+from service.cli import describe, main
+from service.cli.bench import parse
+from service.engine import Engine, make_tracker
+from service.errors import UserError
+from service.settings import Settings
+from tests.service_fakes import START, FakeIdentifier
+
+SECONDS = 40
+
+
+@pytest.fixture(autouse=True)
+def fake_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The commands load a fake identifier; the real one has tests and benchmarks of its own."""
+
+    def load(settings: Settings) -> Engine:
+        from model.system import load_system
+
+        system = load_system(settings.system or MANCHESTER)
+        return Engine(system, FakeIdentifier(system), make_tracker(system), settings.dbc)
+
+    monkeypatch.setattr("service.cli.replay.load_engine", load)
+    for name in list(os.environ):
+        if name.startswith("SPRUNG_"):
+            monkeypatch.delenv(name)
+
+
+@pytest.fixture
+def csv_system(tmp_path: Path) -> Path:
+    """The Manchester system with its signals in the columns of a CSV file."""
+    path = tmp_path / "manchester-csv.yaml"
+    path.write_text(MANCHESTER.read_text().replace("can: ", "csv: "))
+    return path
+
+
+def write(path: Path, system: System, level: Any, rows: range | list[int] = range(100 * SECONDS)) -> Path:
+    """A recording in which every channel is `level(row)`."""
+    with open(path, "w", newline="") as target:
+        writer = csv.writer(target)
+        writer.writerow(["time", *(channel.can for channel in system.channels)])
+        for row in rows:
+            writer.writerow([f"{START / 1e9 + row / 100:.3f}", *[level(row)] * len(system.channels)])
+    return path
+
+
+@pytest.fixture
+def healthy(tmp_path: Path, system: System) -> Path:
+    return write(tmp_path / "healthy.csv", system, lambda _: 0.01)
+
+
+def lines(text: str) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text.splitlines()]
+
+
+def test_replay_prints_a_line_per_window_and_a_summary(
+    healthy: Path, csv_system: Path, system: System, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["replay", str(healthy), "--system", str(csv_system), "--json"]) == 0
+    captured = capsys.readouterr()
+    *windows, last = lines(captured.out)
+    assert captured.err == ""
+    assert len(windows) == 2 * SECONDS - 1
+    names = [p.name for p in system.parameters]
+    first = windows[0]
+    assert first["window"] == "2026-09-21T14:13:20.000Z"
+    assert (first["outcome"], first["reason"]) == ("used", None)
+    assert first["fit"]["nrmse"] == 0.03
+    assert list(first["estimate"]) == list(first["posterior"]) == names
+    value, std = first["estimate"]["primary_11l.stiffness"]
+    assert value == pytest.approx(1.22e6 * 1.01005, rel=1e-4)
+    assert std == pytest.approx(0.01 * value)
+    summary = last["summary"]
+    assert summary["vehicle"] == "healthy"
+    assert summary["windows"] == {"used": 79, "repaired": 0, "dropped": 0}
+    assert summary["frames"] == {"used": 4000, "repaired": 0, "dropped": 0, "corrupt": 0, "foreign": 0}
+    assert [p["name"] for p in summary["parameters"]] == names
+    assert {"value", "std", "unit", "nominal", "ratio", "identifiable"} <= set(summary["parameters"][0])
+    assert summary["alarms"] == []
+    assert summary["recorded_seconds"] == pytest.approx(SECONDS)
+    assert summary["wall_seconds"] > 0
+
+
+def test_replay_shows_a_table_for_people(healthy: Path, csv_system: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(healthy), "--system", str(csv_system)]) == 0
+    out = capsys.readouterr().out
+    assert out.count("primary_") == 16 and out.count("secondary_") == 8
+    assert "79 used" in out
+    assert "\x1b" not in out  # no colours in a pipe
+
+
+def test_a_changed_vehicle_is_exit_status_one_with_its_alarms(
+    tmp_path: Path, csv_system: Path, system: System, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write(tmp_path / "worn.csv", system, lambda row: 0.2 if row >= 3500 else 0.0, range(6000))
+    assert main(["replay", str(path), "--system", str(csv_system), "--json"]) == 1
+    alarms = lines(capsys.readouterr().out)[-1]["summary"]["alarms"]
+    assert {a["parameter"] for a in alarms} == {p.name for p in system.parameters}
+    for alarm in alarms:
+        assert set(alarm) >= {"parameter", "onset", "change", "std", "severity"}
+        assert alarm["onset"].startswith("2026-09-21T14:13:5")
+        assert alarm["change"] == pytest.approx(0.2214, abs=0.02)
+
+
+def test_a_recording_with_losses_is_exit_status_one_and_one_line(
+    tmp_path: Path, csv_system: Path, system: System, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [row for row in range(2000) if not 500 <= row < 600]
+    path = write(tmp_path / "lossy.csv", system, lambda _: 0.01, rows)
+    assert main(["replay", str(path), "--system", str(csv_system), "--json"]) == 1
+    captured = capsys.readouterr()
+    summary = lines(captured.out)[-1]["summary"]
+    assert summary["windows"]["dropped"] >= 2
+    assert summary["samples"]["lost"] == pytest.approx(28 * 100, rel=0.02)
+    assert len(captured.err.splitlines()) == 1
+    assert f"{summary['samples']['lost']} of {summary['samples']['expected']} samples lost" in captured.err
+
+
+def test_replaying_into_a_store_twice_gives_the_same_lines_and_stores_nothing_twice(
+    healthy: Path, csv_system: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["replay", str(healthy), "--system", str(csv_system), "--json", "--store", str(tmp_path / "s.db")]
+    assert main(command) == 0
+    first = lines(capsys.readouterr().out)
+    assert main(command) == 0
+    second = lines(capsys.readouterr().out)
+    for one in (first, second):
+        one[-1]["summary"].pop("wall_seconds")
+    assert first == second
+
+
+def test_without_a_store_a_run_depends_on_its_file_alone(
+    healthy: Path, csv_system: Path, tmp_path: Path, system: System, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = write(tmp_path / "other.csv", system, lambda _: 0.3)
+    options = ["--system", str(csv_system), "--json", "--vehicle", "same"]
+    main(["replay", str(healthy), *options])
+    alone = lines(capsys.readouterr().out)[-1]["summary"]["parameters"]
+    main(["replay", str(other), *options])
+    capsys.readouterr()
+    main(["replay", str(healthy), *options])
+    assert lines(capsys.readouterr().out)[-1]["summary"]["parameters"] == alone
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["replay", "no-such-file.blf"],
+        ["replay"],
+        ["replay", "pyproject.toml"],
+        ["replay", "--colour", "x.blf"],
+        ["nonsense"],
+        ["serve", "--port", "99999"],
+        ["serve", "--replay", "no-such-file.blf"],
+        ["serve", "--can", "can0", "--port", "0"],
+        ["system", "no-such-file.yaml"],
+        ["system", "pyproject.toml"],
+        ["diagnose", "no-such-file.blf"],
+        ["bench", "nonsense"],
+        ["replay", "tests/data/drift-600s.blf", "--store", "mysql://x/y"],
+        ["replay", "tests/data/drift-600s.blf", "--system", "no-such-file.yaml"],
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_exit_status_two(
+    arguments: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(Path(__file__).parent.parent)
+    monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path))
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert captured.err.startswith("sprung: ")
+    assert "Traceback" not in captured.err
+
+
+def test_a_setting_that_cannot_be_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPRUNG_BATCH_WINDOWS", "many")
+    assert main(["replay", __file__]) == 2
+    assert "SPRUNG_BATCH_WINDOWS" in capsys.readouterr().err
+
+
+def test_an_unexpected_error_is_one_line_too() -> None:
+    assert describe(RuntimeError("a\nb")) == "unexpected RuntimeError: a b; SPRUNG_DEBUG=1 shows where"
+
+
+def test_help_and_version_are_exit_status_zero(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("sprung 0.")
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    assert all(command in out for command in ("replay", "serve", "train", "diagnose", "system", "bench"))
+    assert "completion" in out
+
+
+def test_bench_without_a_name_lists_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["bench"]) == 0
+    assert {"identify", "replay", "serve", "drift"} <= {
+        line.split()[0] for line in capsys.readouterr().out.splitlines()
+    }
+
+
+def test_options_of_a_benchmark_are_those_of_its_function() -> None:
+    def run(task: str = "x", *, budget: str = "quick", seed: int = 1, data: Path | None = None) -> None: ...
+
+    assert parse("b", run, ["y", "--budget", "full", "--seed=7"]) == (["y"], {"budget": "full", "seed": 7})
+    for wrong in (["--speed", "1"], ["--seed", "x"], ["--seed"], ["a", "b"]):
+        with pytest.raises(UserError, match="bench b"):
+            parse("b", run, wrong)
+
+
+def sprung(*arguments: str, **options: Any) -> subprocess.Popen[str]:
+    """The real command in a process of its own."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "service.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent.parent,
+        **options,
+    )
+
+
+def test_the_service_starts_answers_and_stops_when_told(tmp_path: Path) -> None:
+    with sprung("serve", "--port", "0", "--data-dir", str(tmp_path)) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            address = line.split(" on ")[1].split()[0]
+            deadline = time.monotonic() + 30
+            while True:
+                try:
+                    with urllib.request.urlopen(f"{address}/health/ready", timeout=5) as answer:
+                        assert answer.status == 200
+                    break
+                except OSError:
+                    assert time.monotonic() < deadline
+                    time.sleep(0.1)
+        finally:
+            process.send_signal(signal.SIGTERM)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 0, errors
+    assert errors == ""
+    assert not list(tmp_path.glob("*.db-wal"))
+
+
+def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        with sprung("serve", "--port", port, "--data-dir", str(tmp_path)) as process:
+            _, errors = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert port in errors and len(errors.splitlines()) == 1
+
+
+def test_interrupting_a_replay_keeps_what_was_stored(tmp_path: Path) -> None:
+    store = tmp_path / "kept.db"
+    arguments = ("replay", "tests/data/drift-600s.blf", "--store", str(store), "--json", "--speed", "20")
+    with sprung(*arguments, env=os.environ | {"OMP_NUM_THREADS": "1"}) as process:
+        assert process.stdout is not None
+        first = process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    assert json.loads(first)["outcome"] == "used"
+    assert process.returncode == 130
+    assert errors == "sprung: interrupted\n"
+    import sqlite3
+
+    with sqlite3.connect(store) as connection:
+        assert connection.execute("SELECT count(*) FROM windows").fetchone()[0] >= 1
+    connection.close()
