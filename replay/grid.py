@@ -27,6 +27,8 @@ KAISER_BETA = 7.0  # stop band -70 dB
 NEIGHBOURS = 3  # valid samples on either side that a repair uses
 FEWEST = 4  # samples below which a channel's clock cannot be told
 EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an even clock; they show it clearly
+PUNCTUAL = 0.2  # share of samples with about the least delay, without which it is no delay but disorder
+STEADY = 0.45  # grid periods by which the least delay may change while no sample is lost
 FIRST_STAMPS = 64  # of the search for a jittered clock
 LONGEST_REPAIR = REACH - NEIGHBOURS  # consecutive samples
 
@@ -95,17 +97,46 @@ def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: i
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, False)
     if rate < SLOWEST * (1.0 - 1e-3):
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, True)
+    return _on_rows(even, start, period, rows, longest)
+
+
+def by_count(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled | None:
+    """A channel of the grid's own rate whose time stamps are those of a late and bursty arrival; None when that is
+    not what it is.
+
+    Such stamps are never early: taking one grid period off per sample leaves a constant plus the delay.  When its
+    lowest value from each sample to the end stays the same, no sample was lost, and they can be counted out.
+    `offset` must go on beyond the rows by as much as samples may be late.
+    """
+    order = np.argsort(offset, kind="stable")
+    offset, value = offset[order], value[order]
+    late = offset - np.arange(len(offset))
+    lowest = np.minimum.accumulate(late[::-1])[::-1]
+    needed = int(np.ceil(rows[-1] + 1.0 - lowest[0])) if len(offset) else 1
+    if needed < FEWEST or needed >= len(offset) or lowest[needed] - lowest[0] > STEADY or lowest[0] > rows[0] + 0.5:
+        return None
+    if (late[:needed] - lowest[0] < 0.5).mean() < PUNCTUAL:
+        return None
+    return _on_rows(value[: needed + REACH].copy(), float(lowest[0]), 1.0, rows, longest)
+
+
+def _on_rows(even: FloatArray, start: float, period: float, rows: FloatArray, longest: int) -> Resampled:
+    """An even series at the grid positions `rows`."""
+    rate = 1.0 / period
     missing = np.isnan(even)
     limit = int(np.clip(longest * rate, 1, LONGEST_REPAIR))
     even = fill(even[:, None], limit)[:, 0]
     blocked = np.isnan(even)
     if blocked.all():
-        return Resampled(nothing, blocked[: len(rows)], rate, True)
+        return Resampled(np.full(len(rows), np.nan), np.zeros(len(rows), dtype=bool), rate, True)
     steps = np.arange(len(even))
     even[blocked] = np.interp(steps[blocked], steps[~blocked], even[~blocked])  # what surrounds a gap stays sound
     position = (rows - start) / period
-    result = _sinc(even, position, min(1.0, period))
     nearest = np.clip(np.rint(position).astype(np.int64), 0, len(even) - 1)
+    if np.abs(position - np.rint(position)).max() <= TOLERANCE and abs(period - 1.0) < 1e-3:
+        result = even[nearest]
+    else:
+        result = _sinc(even, position, min(1.0, period))
     result[blocked[nearest] | (np.abs(position - nearest) > 1.0)] = np.nan
     return Resampled(result, missing[nearest] & ~np.isnan(result), rate, True)
 

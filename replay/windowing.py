@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
-from replay.grid import REACH, SLOWEST, Placed, Resampled, fill, place, resample
+from replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample
 from replay.stream import Jump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
@@ -205,7 +205,7 @@ class _Batch:
             gone[:, channel] = resampled.bridged | np.isnan(resampled.value)
             missing[channel] = int(gone[:, channel].sum())
             conflict[channel] = 0
-            if note:
+            if note and note not in notes:
                 notes.append(note)
         absent = (missing == owner.window) & (unfilled == owner.window)
         values[:, absent] = np.nan
@@ -252,6 +252,13 @@ class _Batch:
         near = slice(*np.searchsorted(offset, [rows.start - REACH - 1, rows.stop + REACH + 1]))
         grid = np.arange(rows.start, rows.stop, dtype=np.float64)
         result = resample(offset[near], value[near], grid, self.owner.longest_gap)
+        if not result.even:
+            near = slice(
+                near.start, int(np.searchsorted(offset, rows.stop + REACH + self.owner.delay * self.owner.sample_rate))
+            )
+            counted = by_count(offset[near], value[near], grid, self.owner.longest_gap)
+            if counted is not None:
+                return counted, "arrival times made even"
         name, own = self.owner.channels[channel].name, result.rate * self.owner.sample_rate
         if not result.even:
             return result, f"{name} unevenly sampled"

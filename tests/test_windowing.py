@@ -307,3 +307,40 @@ def test_a_long_recording_takes_little_time_and_memory_stays_bounded():
     assert count == 1199
     assert most < 28 * 400
     assert time.process_time() - begun < 3.0  # 0.6 s measured; the margin is for a busy machine
+
+
+def arriving_late(seconds, rng, stalls):
+    """Arrival times: in order, each some milliseconds late, and nothing at all during the stalls."""
+    arrival = seconds + rng.uniform(0.0, 0.002, len(seconds))
+    for begin, length in stalls:
+        arrival = np.where((arrival > begin) & (arrival < begin + length), begin + length, arrival)
+    return np.maximum.accumulate(arrival + np.arange(len(arrival)) * 1e-6)
+
+
+def test_bursty_arrival_of_an_even_source_is_counted_out_and_marked():
+    rng = np.random.default_rng(6)
+    seconds = even(6.0)
+    stalls = [(t, 0.12) for t in np.arange(0.33, 5.0, 0.25)]
+    values = [truth(s, c) for c, s in enumerate(seconds)]
+    _, windows = windows_of(stream([arriving_late(s, rng, stalls) for s in seconds], values))
+    placed = [w for w in windows if w.outcome == "repaired"]
+    assert len(placed) >= 7
+    for window in placed:
+        assert window.reason == "arrival times made even"
+        row = round((window.start - START) / 1e7)
+        assert np.abs(window.values - np.stack(values, axis=1)[row : row + 100]).max() < 0.03  # the phase: 0.4 ms
+
+
+def test_bursty_arrival_with_a_lost_sample_is_not_counted_out():
+    rng = np.random.default_rng(7)
+    seconds = even(6.0)
+    stalls = [(t, 0.12) for t in np.arange(0.33, 5.0, 0.25)]
+    arrival = [arriving_late(s, rng, stalls) for s in seconds]
+    values = [truth(s, c) for c, s in enumerate(seconds)]
+    arrival[0], values[0] = np.delete(arrival[0], 260), np.delete(values[0], 260)
+    _, windows = windows_of(stream(arrival, values))
+    for window in windows:
+        if window.outcome != "dropped":
+            row = round((window.start - START) / 1e7)
+            kept = np.stack([truth(s, c) for c, s in enumerate(seconds)], axis=1)[row : row + 100]
+            assert np.abs(window.values - kept).max() < 0.03
