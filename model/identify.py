@@ -31,10 +31,14 @@ class StageTimes:
 
 @dataclass(slots=True)
 class Identifier:
-    """Identifies windows of one system.  Stateless but for `times` and cached workspaces; use one per thread."""
+    """Identifies windows of one system.  Stateless but for `times` and cached workspaces; use one per thread.
+
+    workers: threads that share a batch of windows (see `Refiner`).
+    """
 
     system: System
     estimator: Estimator | None = None
+    workers: int = 1
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refiner] = field(default_factory=dict)
 
@@ -63,7 +67,7 @@ class Identifier:
 
     def _refiner(self, samples: int) -> Refiner:
         if samples not in self._refiners:
-            self._refiners[samples] = Refiner(self.system, samples)
+            self._refiners[samples] = Refiner(self.system, samples, self.workers)
         return self._refiners[samples]
 
     def _checked(self, windows: FloatArray) -> FloatArray:
@@ -82,12 +86,13 @@ class Identifier:
         return windows
 
 
-def load_identifier(system: System, model: str | Path | None = None) -> Identifier:
+def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifier:
     """The system's identifier with trained weights from `model` (a directory), or the bundled ones if they fit.
 
     Without weights for the system the refinement starts from the nominal values.
     """
-    return Identifier(system, load_estimator(model, system) if model is not None else bundled_estimator(system))
+    estimator = load_estimator(model, system) if model is not None else bundled_estimator(system)
+    return Identifier(system, estimator, workers)
 
 
 def identifiability(system: System, seed: int = 0) -> FloatArray:

@@ -18,6 +18,7 @@ the old products give a second correction, at a tenth of the price.
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,10 +55,14 @@ class Refined:
 
 
 class Refiner:
-    """Gauss-Newton for one system and one window length."""
+    """Gauss-Newton for one system and one window length.
 
-    def __init__(self, system: System, samples: int | None = None) -> None:
-        self.system = system
+    workers: threads that share the chunks of a batch; with more than one, torch's own threads should be one
+    (`torch.set_num_threads(1)`), since its operations here are too small to be split well.
+    """
+
+    def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
+        self.system, self.workers = system, workers
         self.model = WindowModel(system, samples or system.window)
 
     @property
@@ -73,15 +78,21 @@ class Refiner:
         first = np.zeros((len(windows), len(self.system.parameters))) if start is None else start
         present = ~np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1)
         patterns, which = np.unique(present, axis=0, return_inverse=True)
-        parts, order = [], []
-        with torch.no_grad():
-            for index, pattern in enumerate(patterns):
-                group = np.flatnonzero(which.reshape(-1) == index)
-                for at in np.array_split(group, max(1, -(-len(group) // _CHUNK))):
-                    data = self.model.batch(windows[at], pattern)
-                    parts.append(self._refine_chunk(data, torch.as_tensor(first[at]), iterations, states))
-                    order.append(at)
-        return _in_order(parts, np.concatenate(order))
+        groups = [(pattern, np.flatnonzero(which.reshape(-1) == i)) for i, pattern in enumerate(patterns)]
+        chunks = [(p, at) for p, group in groups for at in np.array_split(group, max(1, -(-len(group) // _CHUNK)))]
+
+        def work(chunk: tuple[BoolArray, np.ndarray]) -> Refined:
+            pattern, at = chunk
+            with torch.no_grad():
+                data = self.model.batch(windows[at], pattern)
+                return self._refine_chunk(data, torch.as_tensor(first[at]), iterations, states)
+
+        if self.workers > 1 and len(chunks) > 1:
+            with ThreadPoolExecutor(self.workers) as pool:
+                parts = list(pool.map(work, chunks))
+        else:
+            parts = [work(chunk) for chunk in chunks]
+        return _in_order(parts, np.concatenate([at for _, at in chunks]))
 
     def misfit(self, windows: FloatArray, log_ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weighted squares of the simulated outputs (B,) at given parameters and their gradient (B, P).

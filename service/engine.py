@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -86,14 +87,18 @@ def load_engine(settings: Settings) -> Engine:
 
     Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
     """
-    from model.identify import load_identifier  # torch takes a second; a bad system file is told before
+    import torch  # takes a second; a bad system file is told before
+
+    from model.identify import load_identifier
+
+    torch.set_num_threads(1)  # batches are shared among workers instead: single operations are too small to split
 
     path = settings.system or MANCHESTER
     system = load_system(path)
     dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
     if not system.parameters:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
-    return Engine(system, load_identifier(system, settings.weights), make_tracker(system), dbc)
+    return Engine(system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc)
 
 
 def make_tracker(system: System) -> Tracker:

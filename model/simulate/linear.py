@@ -183,14 +183,17 @@ class LinearSimulator:
 
     def free_response(self, discrete: Discrete, samples: int) -> Tensor:
         """C Ad^k for k < samples, shape (B, T, S, N), by doubling."""
-        blocks, power = discrete.C.unsqueeze(1), discrete.Ad
-        while blocks.shape[1] < samples:
-            B, t, S, N = blocks.shape
-            moved = (blocks.reshape(B, t * S, N) @ power).reshape(B, t, S, N)
-            blocks = torch.cat([blocks, moved[:, : samples - t]], dim=1)
-            if blocks.shape[1] < samples:
+        B, S, N = discrete.C.shape
+        blocks, power = discrete.C.new_empty(B, samples * S, N), discrete.Ad
+        blocks[:, :S] = discrete.C
+        done = 1
+        while done < samples:
+            more = min(done, samples - done)
+            torch.bmm(blocks[:, : more * S], power, out=blocks[:, done * S : (done + more) * S])
+            done += more
+            if done < samples:
                 power = power @ power
-        return blocks
+        return blocks.reshape(B, samples, S, N)
 
 
 def phi_functions(z: Tensor) -> list[Tensor]:
