@@ -98,7 +98,9 @@ def load_engine(settings: Settings) -> Engine:
     dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
     if not system.parameters:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
-    return Engine(system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc)
+    return Engine(
+        system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc
+    )
 
 
 def make_tracker(system: System) -> Tracker:

@@ -109,7 +109,7 @@ def test_a_missing_input_is_refused_by_name(vehicle):
     system, _, runs = vehicle
     windows = runs.values[:1].copy()
     windows[0, 7, 3] = np.nan
-    with pytest.raises(UnusableWindow, match="wheel_11r.velocity"):
+    with pytest.raises(UnusableWindow, match=r"wheel_11r\.velocity"):
         Identifier(system).identify(windows)
 
 
