@@ -122,7 +122,8 @@ def test_header_stamps_of_a_ros2_recording_are_even_where_its_log_times_are_not(
         outcomes[source] = {w.outcome for w in windows}
         if source == "auto":
             assert abs(np.mean([w.values[:, 2].mean() for w in windows]) - 9.8) < 0.1  # it stands still
-    assert outcomes == {"auto": {"used"}, "log": {"dropped"}}
+    assert outcomes["auto"] == {"used"}
+    assert "used" not in outcomes["log"]
 
 
 def test_a_real_car_log_decodes_as_with_cantools():
