@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from service.feed import OnBatch
@@ -120,10 +120,23 @@ def _state(alarm: str | None, identifiable: bool, drift: float | None) -> str:
 
 
 @contextmanager
-def stage_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """A callback for what is being done now: a spinner on a terminal, else nothing."""
+def stages(console: Console) -> Iterator[Callable[[float, str], None]]:
+    """A callback for the share that is done and what is done now: a bar on a terminal, else a line per stage."""
     if not console.is_terminal:
-        yield lambda _stage: None
+        shown = ""
+
+        def plain(_share: float, stage: str) -> None:
+            nonlocal shown
+            if stage != shown:
+                shown = stage
+                print(stage, file=sys.stderr, flush=True)
+
+        yield plain
         return
-    with console.status("starting") as status:
-        yield status.update
+    with Progress(TextColumn("{task.description}"), BarColumn(), console=console, transient=True) as bar:
+        task = bar.add_task("starting", total=1.0)
+        yield lambda share, stage: bar.update(task, completed=share, description=stage)
+
+
+def silent_stage(_share: float, _stage: str) -> None:
+    """Shows nothing."""

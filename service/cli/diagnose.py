@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 from model.diagnosis.report import Report
 from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from replay.record import Record, load_record
-from service.cli.console import errors, stage_line
+from service.cli.console import errors, silent_stage, stages
 from service.diagnoses import load_excerpt
 
 
@@ -20,7 +19,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, out: Path | None
     record = load(file, system, dbc or (MANCHESTER_DBC if system_file is None else None))
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
-    report = _diagnose(system, record, file)
+    report = _diagnose(system, record, file, quiet=json_lines)
     if out is not None:
         from service.report import write_report
 
@@ -41,12 +40,11 @@ def load(file: Path, system: System, dbc: Path | None) -> Record:
     return load_record(file, system.channels, system.sample_rate, dbc=dbc)
 
 
-def _diagnose(system: System, record: Record, file: Path) -> Report:
-    from model.diagnosis import diagnose
+def _diagnose(system: System, record: Record, file: Path, quiet: bool) -> Report:
+    from model.diagnosis.diagnose import Options, diagnose
 
-    with stage_line(errors()) as show:
-        report = diagnose(system, record, progress=show)
-    return replace(report, recording=replace(report.recording, file=file.name))
+    with stages(errors()) as show:
+        return diagnose(system, record, Options(file=file.name), silent_stage if quiet else show)
 
 
 def text(report: Report) -> str:

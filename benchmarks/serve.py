@@ -1,0 +1,176 @@
+"""`sprung bench serve`: latency of POST /identify against a bare FastAPI echo of the same body.
+
+Both are served by uvicorn in processes of their own and asked in turns over one kept-alive connection each, by the
+same client, so that whatever else the machine does falls on both.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+import multiprocessing
+import os
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.excitation import simulate_runs
+from model.system import System, load_system
+
+TARGET_MS = 15.0
+WARM_UP = 20
+
+
+def run(requests: int = 300, *, clients: int = 8, seconds: float = 5.0) -> Iterator[dict[str, Any]]:
+    """Figures: latencies one request after the other, then throughput with several clients."""
+    system = load_system()
+    body = window_body(system)
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory(prefix="sprung-bench-") as folder:
+        ports = [_free_port(), _free_port()]
+        servers = [
+            context.Process(target=_serve_echo, args=(ports[0],), daemon=True),
+            context.Process(target=_serve_sprung, args=(ports[1], folder), daemon=True),
+        ]
+        for server in servers:
+            server.start()
+        try:
+            echo, identify = Client(ports[0], "/echo", body), Client(ports[1], "/identify", body)
+            echo.wait()
+            identify.wait()
+            times = np.array([(echo.ask(), identify.ask()) for _ in range(WARM_UP + requests)])[WARM_UP:] * 1e3
+            yield from _latencies(times, len(body))
+            yield from _throughput(ports[1], body, clients, seconds)
+        finally:
+            for server in servers:
+                server.terminate()
+                server.join(20)
+
+
+def window_body(system: System) -> bytes:
+    """One simulated window of the nominal vehicle as a client would send it."""
+    truth = np.zeros((1, len(system.parameters)))
+    values = simulate_runs(system, truth, system.window, np.random.default_rng(5)).values[0]
+    channels = {c.name: values[:, i].tolist() for i, c in enumerate(system.channels)}
+    return json.dumps({"vehicle": "bench", "sample_rate": system.sample_rate, "channels": channels}).encode()
+
+
+@dataclass(slots=True)
+class Client:
+    """One kept-alive connection."""
+
+    port: int
+    path: str
+    body: bytes
+    connection: http.client.HTTPConnection | None = None
+
+    def wait(self, seconds: float = 120.0) -> None:
+        """Until the server answers."""
+        deadline = time.monotonic() + seconds
+        while True:
+            try:
+                self.ask()
+                return
+            except OSError:
+                self.connection = None
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.2)
+
+    def ask(self) -> float:
+        """Seconds from the request to the whole answer."""
+        if self.connection is None:
+            self.connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+            self.connection.connect()
+            self.connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        started = time.perf_counter()
+        self.connection.request("POST", self.path, self.body, {"content-type": "application/json"})
+        answer = self.connection.getresponse()
+        text = answer.read()
+        ended = time.perf_counter()
+        if answer.status != 200:
+            raise ValueError(f"{self.path}: status {answer.status}: {text[:200]!r}")
+        return ended - started
+
+
+def _latencies(times: Any, size: int) -> Iterator[dict[str, Any]]:
+    for name, column in (("echo", times[:, 0]), ("identify", times[:, 1])):
+        low, middle, high = np.percentile(column, [50, 95, 99])
+        yield {
+            "figure": f"latency, {name}",
+            "value": round(float(low), 2),
+            "unit": "ms",
+            "p95": round(float(middle), 2),
+            "p99": round(float(high), 2),
+            "requests": len(column),
+            "body_bytes": size,
+        }
+    yield {
+        "figure": "p50 of identify less p50 of echo",
+        "value": round(float(np.median(times[:, 1]) - np.median(times[:, 0])), 2),
+        "unit": "ms",
+        "target": f"<= {TARGET_MS:g}",
+        "cores": os.cpu_count(),
+    }
+
+
+def _throughput(port: int, body: bytes, clients: int, seconds: float) -> Iterator[dict[str, Any]]:
+    counts = [0] * clients
+    end = time.monotonic() + seconds
+
+    def ask(number: int) -> None:
+        client = Client(port, "/identify", body)
+        while time.monotonic() < end:
+            client.ask()
+            counts[number] += 1
+
+    threads = [threading.Thread(target=ask, args=(number,)) for number in range(clients)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    yield {
+        "figure": "windows identified per second over HTTP",
+        "value": round(sum(counts) / seconds, 1),
+        "unit": "1/s",
+        "clients": clients,
+    }
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    return port
+
+
+def _serve_echo(port: int) -> None:
+    import uvicorn
+    from fastapi import FastAPI
+
+    app = FastAPI()
+
+    @app.post("/echo")
+    async def echo(body: dict[str, Any]) -> dict[str, Any]:
+        return body
+
+    uvicorn.run(app, port=port, log_level="error", access_log=False)
+
+
+def _serve_sprung(port: int, folder: str) -> None:
+    import uvicorn
+
+    from service.api.app import create_app
+    from service.core import build_core
+    from service.engine import load_engine
+    from service.settings import Settings
+
+    settings = Settings(data_dir=Path(folder))
+    uvicorn.run(create_app(build_core(settings, load_engine(settings))), port=port, log_level="error", access_log=False)
