@@ -241,7 +241,7 @@ def estimate_force(
     problem = _Evidence(answers.T @ answers, answers.T @ target, float(target @ target), len(target), surface)
     s = noise or problem.noise()
     weights = problem.best(s)
-    mean, covariance = problem.posterior(weights, s)
+    mean, covariance = problem.averaged(weights, s)
     return LatentForce(
         surface=surface,
         coefficients=surface.free @ mean,
@@ -298,8 +298,20 @@ class _Evidence:
         return weights(found.x)
 
     def posterior(self, weights: tuple[float, float, float], s: float) -> tuple[FloatArray, FloatArray]:
-        covariance = np.linalg.inv(self.precision(weights) + self.gram / s**2)
+        covariance = np.asarray(np.linalg.inv(self.precision(weights) + self.gram / s**2), dtype=np.float64)
         return covariance @ (self.product / s**2), covariance
+
+    def averaged(self, best: tuple[float, float, float], s: float) -> tuple[FloatArray, FloatArray]:
+        """Mean and covariance over weights around the best ones: what their choice leaves open belongs to the band."""
+        moves = [np.zeros(3)] + [step * axis for axis in np.eye(3) for step in (-4.0, -2.0, 2.0, 4.0)]
+        trials = [tuple(float(w) for w in np.array(best) * np.exp(move)) for move in moves]
+        evidence = np.array([self.log_evidence(trial, s) for trial in trials])  # type: ignore[arg-type]
+        shares = np.exp(evidence - evidence.max())
+        shares /= shares.sum()
+        parts = [self.posterior(trial, s) for trial in trials]  # type: ignore[arg-type]
+        mean = np.sum([share * m for share, (m, _) in zip(shares, parts, strict=True)], axis=0)
+        spread = [c + np.outer(m - mean, m - mean) for m, c in parts]
+        return mean, np.sum([share * c for share, c in zip(shares, spread, strict=True)], axis=0)
 
 
 def force_series(
