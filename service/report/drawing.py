@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -18,6 +19,7 @@ from service.report import ink
 Point = tuple[float, float]
 
 STOREY = 2.3  # drawn height between a body and what carries it
+WIDTH = 10.5  # in
 THICKNESS = 0.75  # drawn height of a body
 BODY = "#dfe6ec"
 LINE = "#52606d"
@@ -94,24 +96,22 @@ def _body(axes: Axes, layout: Layout, name: str, colour: str, edge: str) -> None
 
 
 def _spring(axes: Axes, foot: Point, head: Point, colour: str, width: float, order: float) -> None:
-    """A zigzag spring with a damper to its right."""
+    """A zigzag to the left of the element's place."""
     (x, low), (_, high) = foot, head
-    turns = np.linspace(low, high, 13)
-    swing = np.r_[0, 0, np.tile([0.13, -0.13], 5)[:9], 0, 0] if len(turns) == 13 else np.zeros(len(turns))
+    swing = np.r_[0.0, 0.0, np.tile([0.13, -0.13], 5)[:9], 0.0, 0.0]
+    turns = np.linspace(low, high, swing.size)
     axes.plot(x - 0.16 + swing, turns, color=colour, lw=width, zorder=order, solid_joinstyle="round")
-    x += 0.2
-    cup, rod = low + 0.35 * (high - low), low + 0.55 * (high - low)
-    wide = 0.11
-    axes.plot([x, x], [low, cup], color=colour, lw=width, zorder=order)
-    axes.plot(
-        [x - wide, x - wide, x + wide, x + wide],
-        [rod + 0.25, cup, cup, rod + 0.25],
-        color=colour,
-        lw=width,
-        zorder=order,
-    )
-    axes.plot([x - wide * 0.7, x + wide * 0.7], [rod, rod], color=colour, lw=width, zorder=order)
-    axes.plot([x, x], [rod, high], color=colour, lw=width, zorder=order)
+
+
+def _damper(axes: Axes, foot: Point, head: Point, colour: str, width: float, order: float) -> None:
+    """A cup and a piston to the right of the element's place."""
+    x, low, high = foot[0] + 0.2, foot[1], head[1]
+    cup, rod, wide = low + 0.35 * (high - low), low + 0.55 * (high - low), 0.11
+    line: dict[str, Any] = {"color": colour, "lw": width, "zorder": order}
+    axes.plot([x, x], [low, cup], **line)
+    axes.plot([x - wide, x - wide, x + wide, x + wide], [rod + 0.25, cup, cup, rod + 0.25], **line)
+    axes.plot([x - wide * 0.7, x + wide * 0.7], [rod, rod], **line)
+    axes.plot([x, x], [rod, high], **line)
 
 
 def _element(axes: Axes, layout: Layout, name: str, colour: str, width: float) -> Point:
@@ -122,7 +122,9 @@ def _element(axes: Axes, layout: Layout, name: str, colour: str, width: float) -
         upper, lower = lower, upper
     foot, head = layout.at(x, y, layout.top(lower)), layout.at(x, y, layout.bottom(upper))
     order = 10 * max(layout.level.get(upper, 0), layout.level.get(lower, 0)) + (-3 if y > 0 else 8)
-    _spring(axes, foot, head, colour, width, order)
+    for value, draw in ((item.stiffness, _spring), (item.damping, _damper)):
+        if value.value or not value.fixed:
+            draw(axes, foot, head, colour, width, order)
     return foot[0], (foot[1] + head[1]) / 2
 
 
@@ -177,14 +179,17 @@ def draw_system(system: System, findings: Mapping[str, str], scores: Mapping[str
     """The drawing; `findings` maps a located element, body, sensor or input to the words beside it."""
     layout = lay_out(system)
     with rc_context(ink.RC):
-        figure = ink.new_figure(10.5, 4.4)
+        figure = ink.new_figure(WIDTH, 4.4)
         axes = figure.add_subplot()
         ink.bare(axes)
         places = _draw_parts(axes, layout, findings, scores)
         axes.autoscale_view()
         axes.set_aspect("equal")
         low, high = axes.get_ylim()
-        axes.set_ylim(low - 0.3, high + 0.4 + 1.5 * bool(findings))
+        axes.set_ylim(low - 0.3, high + 0.4 + (1.5 if findings and layout.slant else 0.0))
+        left, right = axes.get_xlim()
+        low, high = axes.get_ylim()
+        figure.set_size_inches(WIDTH, min(max(WIDTH * (high - low) / (right - left), 2.6), 4.4))
         _call_out(axes, layout, places, findings)
     return figure
 

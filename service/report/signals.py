@@ -52,14 +52,18 @@ def fit_figure(report: Report, sensors: tuple[str, ...], units: tuple[str, ...],
         grid = figure.subplots(len(rows), 2, squeeze=False, gridspec_kw={"width_ratios": [1.45, 1]})
         for row, (left, right) in zip(rows, grid, strict=True):
             columns = [a[:, row] for a in (measured, baseline, augmented)]
-            _time_panel(left, time, columns, f"{sensors[row]}  [{units[row]}]", bool(report.findings))
+            _time_panel(left, time, columns, f"{sensors[row]}  [{_pretty(units[row])}]", bool(report.findings))
             floor = None if noise is None else float(noise[row])
             _spectrum_panel(right, columns, rate, units[row], floor, bool(report.findings))
-        grid[0][0].legend(loc="upper right", ncols=4, fontsize=8)
-        grid[0][1].legend(loc="lower left", fontsize=8)
+        handles, labels = grid[0][1].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=4, fontsize=9)
         grid[-1][0].set_xlabel("time [s]")
         grid[-1][1].set_xlabel("frequency [Hz]")
     return figure
+
+
+def _pretty(unit: str) -> str:
+    return unit.replace("^2", "²").replace("^3", "³")
 
 
 def _time_panel(axes: Axes, time: Array, columns: list[Array], title: str, augmented: bool) -> None:
@@ -101,7 +105,7 @@ def _spectrum_panel(
         axes.loglog(*density(measured - after), color=ink.AFTER, lw=1.2, label="error, with finding")
     if floor is not None and floor > 0:
         axes.axhline(floor * np.sqrt(2 / rate), color=ink.NOISE, lw=1.2, ls=":", label="noise floor")
-    axes.set_title(f"spectrum  [{unit}/√Hz]")
+    axes.set_title(f"spectrum  [{_pretty(unit)}/√Hz]")
     axes.margins(x=0.01)
 
 

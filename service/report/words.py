@@ -62,7 +62,7 @@ def finding_words(finding: Finding) -> str:
 def headline(report: Report) -> str:
     """One sentence: what is where, how much it explains, and what it had falsified."""
     if report.summary:
-        return report.summary
+        return report.summary.replace("+-", "±")
     if not report.findings:
         fit = report.baseline_validation.nrmse
         return f"Nothing is missing: the re-identified structure simulates the held-out part to {fit:.1%} of its rms."
