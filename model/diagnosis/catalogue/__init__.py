@@ -23,6 +23,7 @@ from model.diagnosis.catalogue.damping import (
 )
 from model.diagnosis.catalogue.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
 from model.diagnosis.catalogue.memory import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
+from model.diagnosis.catalogue.own import LawFileError, load_laws
 from model.diagnosis.catalogue.running_gear import ANTI_ROLL_BAR, RAIL_JOINTS, WHEEL_FLAT
 from model.diagnosis.catalogue.sensors import (
     AXLE_DELAY,
@@ -92,6 +93,7 @@ __all__ = [
     "BodyLaw",
     "ElementLaw",
     "Law",
+    "LawFileError",
     "Motion",
     "Observed",
     "ParameterSpec",
@@ -101,6 +103,7 @@ __all__ = [
     "element_laws",
     "find_law",
     "grid",
+    "load_laws",
     "observe",
     "sensor_laws",
 ]
