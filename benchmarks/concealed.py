@@ -38,11 +38,11 @@ Figures = Iterator[dict[str, Any]]
 
 
 def run(
-    count: int = 34,
+    count: int = 36,
     clean: int = 200,
     seed: int = 2026,
-    ablate: int = 34,
-    pysindy: int = 34,
+    ablate: int = 36,
+    pysindy: int = 36,
     seconds: float = 60.0,
     false_alarm_rate: float = 0.003,
     out: Path = Path("concealed-results"),
@@ -94,7 +94,7 @@ def _line(name: str, file: str, truth: dict[str, Any], report: dict[str, Any], s
 
 
 def _recordings(
-    folder: Path, count: int, seed: int, kinds: list[str] | None, weak: float, seconds: float, batch: int = 34
+    folder: Path, count: int, seed: int, kinds: list[str] | None, weak: float, seconds: float, batch: int = 36
 ) -> Path:
     """Makes what is not there yet, a batch at a time; the n-th recording does not depend on the count."""
     vehicle = read_vehicle(MANCHESTER)

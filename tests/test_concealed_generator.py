@@ -89,7 +89,7 @@ def test_a_constant_force_of_friction_decelerates_the_car_by_force_over_mass() -
 
 
 def test_a_seed_draws_the_same_cases_and_whole_rounds_hold_every_kind() -> None:
-    first, again, other = (draw_cases(VEHICLE, 34, seed) for seed in (9, 9, 10))
+    first, again, other = (draw_cases(VEHICLE, 36, seed) for seed in (9, 9, 10))
     assert [c.findings() for c in first] == [c.findings() for c in again]
     assert [c.stiffness for c in first] != [c.stiffness for c in other]
     kinds = {c.kind for c in first}

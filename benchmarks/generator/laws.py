@@ -94,6 +94,16 @@ def speed_stiffness(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, 
     return p[0] * np.abs(v) * d
 
 
+def one_sided_stop(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
+    """A stop that is met in compression only."""
+    return p[1] * np.minimum(d + p[0], 0.0)
+
+
+def saturating(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
+    """A part of the spring slips once its travel is used up, without hysteresis."""
+    return p[1] * k * (p[0] * np.tanh(d / p[0]) - d)
+
+
 def _signed(rng: np.random.Generator, size: float) -> float:
     return float(size * rng.choice([-1.0, 1.0]))
 
@@ -147,6 +157,13 @@ LAWS: dict[str, Law] = {
     "force_ripple": Law(
         ripple, lambda rng, s, k, c, D, R: [s * k * D, rng.uniform(0.2, 0.5) * D], named=False,
         strength=(0.02, 0.2),
+    ),
+    "one_sided_stop": Law(
+        one_sided_stop, lambda rng, s, k, c, D, R: [rng.uniform(0.6, 1.5) * D, 12 * s * k], named=False,
+        strength=(0.02, 0.4),
+    ),
+    "saturating_spring": Law(
+        saturating, lambda rng, s, k, c, D, R: [rng.uniform(0.4, 1.2) * D, s], named=False, strength=(0.03, 0.3)
     ),
     "rate_dependent_stiffness": Law(
         speed_stiffness, lambda rng, s, k, c, D, R: [s * k / R], named=False, strength=(0.03, 0.4)
