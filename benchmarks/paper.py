@@ -1,0 +1,75 @@
+"""`sprung bench paper [TASK]`: every table row and figure of the paper, from nothing, beside the paper's values.
+
+Tasks: the three visual systems, the train with constant and with changing parameters, the kernels of Fig. 3 and the
+experiment on phases.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a command that was
+stopped, or that ran out of `--minutes`, goes on where it was when it is given again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import torch
+
+from benchmarks import paper_analysis, paper_train, paper_visual
+from benchmarks.paper_settings import Settings
+from model.alps.config import Budget
+from model.alps.fit import OutOfTime
+from service.errors import UserError
+
+TASKS: dict[str, tuple[Callable[[Settings], Iterator[dict[str, Any]]], tuple[str, ...]]] = {
+    "pendulum": (paper_visual.rows, paper_visual.METHODS),
+    "mass_spring_damper": (paper_visual.rows, paper_visual.METHODS),
+    "two_body": (paper_visual.rows, paper_visual.METHODS),
+    "train": (paper_train.constant_rows, paper_train.CONSTANT_METHODS),
+    "train_changing": (paper_train.changing_rows, paper_train.CHANGING_METHODS),
+    "kernels": (paper_analysis.kernel_rows, ()),
+    "phase": (paper_analysis.phase_rows, ()),
+}
+
+
+def run(
+    task: str | None = None,
+    *,
+    method: str | None = None,
+    budget: str = "quick",
+    seeds: int = 1,
+    seed: int = 0,
+    out: Path | None = None,
+    device: str = "cpu",
+    minutes: float | None = None,
+) -> Iterator[dict[str, Any]]:
+    """One dict per row: task, method, figures, the paper's values, settings.
+
+    task: one of `TASKS`, all by default; method: one of the task's; seeds: how many, from `seed` on;
+    out: folder of checkpoints and pictures; minutes: stop after this long, to be resumed by the same command.
+    """
+    _check(task, method, budget, device)
+    torch.set_num_threads(1 if device == "cpu" else torch.get_num_threads())
+    until = None if minutes is None else time.monotonic() + 60 * minutes
+    for name in [task] if task else TASKS:
+        rows, _ = TASKS[name]
+        for at in range(seed, seed + seeds):
+            settings = Settings(name, method, cast(Budget, budget), at, out or Path("runs/paper"), device, until)
+            settings.folder.mkdir(parents=True, exist_ok=True)
+            try:
+                yield from rows(settings)
+            except OutOfTime as stop:
+                yield {"task": name, "seed": at, "unfinished": str(stop)}
+                return
+
+
+def _check(task: str | None, method: str | None, budget: str, device: str) -> None:
+    if task is not None and task not in TASKS:
+        raise UserError(f"bench paper: no task {task!r}; known are {', '.join(TASKS)}")
+    if budget not in get_args(Budget):
+        raise UserError(f"bench paper: no budget {budget!r}; known are {', '.join(get_args(Budget))}")
+    if method is not None:
+        known = TASKS[task][1] if task else tuple({m for _, methods in TASKS.values() for m in methods})
+        if method not in known:
+            raise UserError(f"bench paper: no method {method!r}; known are {', '.join(known) or 'none'}")
+    if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
+        raise UserError(f"bench paper: no device {device!r} here; leave --device out for the CPU")

@@ -1,0 +1,41 @@
+"""What one run of the paper's benchmark was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from model.alps.config import Budget
+from model.alps.fit import Clock
+
+
+@dataclass(frozen=True)
+class Settings:
+    """One task, one seed."""
+
+    task: str
+    method: str | None  # None: every method
+    budget: Budget
+    seed: int
+    out: Path
+    device: str
+    until: float | None  # time.monotonic() at which to stop
+
+    @property
+    def folder(self) -> Path:
+        """Where checkpoints of this task and budget lie."""
+        return self.out / self.budget / self.task
+
+    @property
+    def pictures(self) -> Path:
+        """Where figures of this budget go."""
+        folder = self.out / self.budget / "pictures"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    @property
+    def clock(self) -> Clock:
+        return Clock() if self.until is None else Clock(self.until)
+
+    def wants(self, method: str) -> bool:
+        return self.method in (None, method)

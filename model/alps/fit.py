@@ -1,0 +1,169 @@
+"""Training of the visual tasks: first the frame autoencoder, then each method on its embeddings.
+
+Checkpoints, learning-rate schedule and seeding are those of `model.training`: every update draws from (seed, step),
+so that an interrupted run ends in the same weights as one that was not.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from model.alps.config import Method, NetworkConfig, TrainingConfig
+from model.alps.frames import FrameAutoencoder
+from model.alps.losses import loss_of, picture_loss
+from model.alps.network import Network
+from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
+from model.training import _Run as Run
+
+_STREAMS = {"train": 0, "test": 1, "unseen": 2}
+
+
+class OutOfTime(Exception):
+    """The time allowed for this command is over; the checkpoint is saved and the same command goes on from it."""
+
+
+@dataclass(frozen=True)
+class Clock:
+    """Stops long runs between two updates."""
+
+    until: float = float("inf")  # of time.monotonic()
+
+    @classmethod
+    def allowing(cls, seconds: float | None) -> Clock:
+        return cls() if seconds is None else cls(time.monotonic() + seconds)
+
+    def check(self, run: Run) -> None:
+        if time.monotonic() > self.until:
+            run.save()
+            raise OutOfTime(f"stopped at update {run.step}; run the same command again to go on")
+
+
+@dataclass(frozen=True)
+class Split:
+    """Rollouts with the embedding of every frame."""
+
+    rollouts: Rollouts
+    embeddings: Tensor  # (R, T, E) float32
+
+
+class VisualModel(nn.Module):
+    """Frame autoencoder and the method's network: trained together where the budget allows."""
+
+    def __init__(self, frames: FrameAutoencoder, network: Network) -> None:
+        super().__init__()
+        self.frames, self.network = frames, network
+
+
+def draw_rollouts(task: Task, config: TrainingConfig, split: str) -> Rollouts:
+    """The rollouts of a split; the same for every method and seed of training."""
+    rng = np.random.default_rng([7, _STREAMS[split]])
+    count = config.trajectories if split == "train" else config.test_trajectories
+    return task.sample(count, rng, task.unseen if split == "unseen" else task.seen)
+
+
+def pick_windows(config: TrainingConfig, step: int) -> tuple[Tensor, Tensor]:
+    """Rows and starts (B,) of the windows of an update."""
+    rng = np.random.default_rng([config.seed, 3, step])
+    rows = rng.integers(config.trajectories, size=config.batch)
+    starts = rng.integers(ROLLOUT - WINDOW + 1, size=config.batch)
+    return torch.from_numpy(rows), torch.from_numpy(starts)
+
+
+def train_frames(
+    task: Task, config: TrainingConfig, sizes: NetworkConfig, folder: Path, clock: Clock, device: str = "cpu"
+) -> FrameAutoencoder:
+    """The frame autoencoder of a task, trained or from its checkpoint."""
+    assert task.render is not None
+    torch.manual_seed(config.seed)
+    frames = FrameAutoencoder(sizes).to(device)
+    states = draw_rollouts(task, config, "train").states.reshape(-1, len(task.states))
+
+    def draw(count: int, *key: int) -> Tensor:
+        pick = np.random.default_rng([config.seed, *key]).integers(len(states), size=count)
+        return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]
+
+    frames.standardise(draw(1000, 5), before=True)
+    run = Run(frames, folder / "frames", config, _name(task, config, "frames"))  # type: ignore[arg-type]
+    run.resume()
+    while run.step < config.frame_updates:
+        clock.check(run)
+        pictures = draw(config.frame_batch, 4, run.step)
+        run.rate(config.frame_updates)
+        run.update(picture_loss(frames(pictures), pictures))
+        if run.step == config.frame_updates:
+            frames.standardise(draw(1000, 5), before=False)
+            run.save()
+    return frames
+
+
+def embedded(
+    task: Task, config: TrainingConfig, frames: FrameAutoencoder, split: str, folder: Path, device: str = "cpu"
+) -> Split:
+    """A split with its embeddings, computed once and kept beside the checkpoints."""
+    rollouts = draw_rollouts(task, config, split)
+    path = folder / f"embeddings-{split}.safetensors"
+    if path.is_file():
+        found = load_file(path)["embeddings"]
+        if len(found) == len(rollouts.states):
+            return Split(rollouts, found)
+    embeddings = frames.encode_rollouts(task, rollouts.states.to(device)).cpu()
+    save_file({"embeddings": embeddings.contiguous()}, path)
+    return Split(rollouts, embeddings)
+
+
+def train_method(
+    task: Task,
+    method: Method,
+    data: Split,
+    frames: FrameAutoencoder,
+    config: TrainingConfig,
+    sizes: NetworkConfig,
+    folder: Path,
+    clock: Clock,
+    device: str = "cpu",
+) -> VisualModel:
+    """One method of one task, trained or from its checkpoint."""
+    torch.manual_seed(config.seed)
+    model = VisualModel(frames, Network(task, method, sizes)).to(device)
+    trained = model if config.end_to_end else model.network
+    run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))  # type: ignore[arg-type]
+    run.resume()
+    model.train()
+    while run.step < config.updates:
+        clock.check(run)
+        run.rate(config.updates)
+        run.update(_update_loss(task, model, data, config, run.step, device))
+        if run.step == config.updates:
+            run.save()
+    return model.eval()
+
+
+def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingConfig, step: int, device: str) -> Tensor:
+    rows, starts = pick_windows(config, step)
+    torch.manual_seed(config.seed * 1_000_003 + step)
+    inputs = windows(data.rollouts.inputs, starts, rows).to(device)
+    pictures = None
+    if config.end_to_end:
+        assert task.render is not None
+        states = windows(data.rollouts.states, starts, rows).to(device)
+        pictures = task.render(states.flatten(0, 1))
+        embeddings = model.frames.encode(pictures).unflatten(0, (config.batch, WINDOW))
+    else:
+        embeddings = windows(data.embeddings, starts, rows).to(device)
+    passed = model.network(embeddings, inputs, config.horizon(step), warm_up=step < config.warm_up * config.updates)
+    loss = loss_of(task, passed, embeddings, config, config.divergence(step)).total
+    if pictures is not None:
+        loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
+    return loss
+
+
+def _name(task: Task, config: TrainingConfig, what: str) -> str:
+    return f"{task.name} {what} " + json.dumps(asdict(config), sort_keys=True)
