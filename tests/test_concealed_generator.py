@@ -69,8 +69,8 @@ def test_a_law_acts_on_its_own_element_and_column_alone(name: str) -> None:
     p = law.draw(rng, 0.1, 4.3e5, 2e4, 2.5e-3, 0.026)
     slots = [Slot(1, 8, name, p)]
     plain, hidden = Motion(VEHICLE, plant([], 2)), Motion(VEHICLE, plant(slots, 2))
-    state = 8e-3 * rng.normal(size=(20, 1)).repeat(2, 1)
-    state[10:] *= 20
+    state = np.zeros((20, 2))
+    state[0], state[10] = -8e-3, 0.1  # the car lies low and rises
     memory = np.full(1, 2e-4 if name == "bouc_wen" else 0.0)
     support = np.zeros((16, 2))
     difference = hidden(state, memory, support, 20.0)[0] - plain(state, np.zeros(0), support, 20.0)[0]
