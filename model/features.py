@@ -55,6 +55,11 @@ class ForceBalance:
         spectrum = _spectrum_operator(samples, self.bins)
         self.operators = torch.as_tensor(np.stack([spectrum @ operator for operator in by_order]))  # (3, 2F, T)
         self.plain = torch.as_tensor(spectrum)
+        one = torch.ones(len(system.parameters), dtype=torch.float64)
+        s = self.simulator
+        self.fixed_k, self.fixed_c, self.fixed_m = (  # 1 where a value is not estimated
+            1.0 - one @ of for of in (s.k_of, s.c_of, s.m_of)
+        )
         self.use = mechanics.sensor_kind == self.kind
         self.noise = np.array([c.noise for c in system.channels])[len(system.inputs) :]
 
@@ -64,21 +69,24 @@ class ForceBalance:
 
     def __call__(self, windows: FloatArray) -> tuple[Tensor, Tensor]:
         """target (B, R) and regressors (B, R, P) of windows (B, T, C)."""
-        s, mechanics = self.simulator, self.system.mechanics
+        s = self.simulator
         knots = torch.as_tensor(s.knots(windows[:, :, : len(self.system.inputs)]))
         motion = self._motion(windows[:, :, len(self.system.inputs) :])  # (B, T, n)
         q, v, a = (operator @ motion for operator in self.operators)  # each (B, 2F, n)
         drive = self.plain @ knots  # (B, 2F, W)
-        d = q @ s.H.T + drive[:, :, s.supports] @ s.G.T  # (B, 2F, E)
-        r = v @ s.H.T + drive[:, :, s.supports + 1] @ s.G.T
-        k_terms = (d * s.nominal_k).unsqueeze(1) * s.H.T[:, None, :]  # (B, n, 2F, E)
-        c_terms = (r * s.nominal_c).unsqueeze(1) * s.H.T[:, None, :]
-        inertia = (a * s.nominal_m).mT.unsqueeze(3) * torch.eye(mechanics.n, dtype=a.dtype)[:, None, :]
-        regressors = k_terms @ s.k_of.T + c_terms @ s.c_of.T + inertia @ s.m_of.T
-        everything = k_terms.sum(dim=3) + c_terms.sum(dim=3) + inertia.sum(dim=3)
-        known = everything - regressors.sum(dim=3)  # terms whose values are not estimated
-        load = (drive[:, :, s.forces] @ s.F.T).mT if len(s.forces) else torch.zeros_like(known)
-        return (load - known).flatten(1), regressors.flatten(1, 2)
+        spring = (q @ s.H.T + drive[:, :, s.supports] @ s.G.T) * s.nominal_k  # nominal forces, (B, 2F, E)
+        damper = (v @ s.H.T + drive[:, :, s.supports + 1] @ s.G.T) * s.nominal_c
+        inertia = a * s.nominal_m
+        k_at, c_at = s.estimated_elements
+        unknown = torch.cat([spring[:, :, k_at], damper[:, :, c_at]], dim=2).unsqueeze(1)  # (B, 1, 2F, P')
+        regressors = unknown * torch.cat([s.H[k_at], s.H[c_at]]).T[:, None, :]  # (B, n, 2F, P')
+        known = (spring * self.fixed_k + damper * self.fixed_c) @ s.H + inertia * self.fixed_m  # (B, 2F, n)
+        if s.estimates_mass:
+            by_mass = inertia.mT.unsqueeze(3) * s.m_of[-s.estimated_masses :].T[:, None, :]
+            regressors = torch.cat([regressors, by_mass], dim=3)
+        if len(s.forces):
+            known = known - drive[:, :, s.forces] @ s.F.T
+        return -known.mT.flatten(1), regressors.flatten(1, 2)
 
     def _motion(self, sensors: FloatArray) -> Tensor:
         """Motion of the degrees of freedom, weighted least squares over the sensors that are present."""

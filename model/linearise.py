@@ -6,7 +6,7 @@ lost carries no information on the parameters), which also takes absent sensors 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from model.signals import BoolArray, FloatArray
 from model.simulate.linear import Discrete, ElementValues, LinearSimulator
 from model.system import System
 
-BAND = 0.36  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
+BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
 _RIDGE = 1e-11  # relative, on the normalised free responses
 
@@ -54,6 +54,16 @@ class Linearisation:
     def state_after(self, step: Tensor) -> Tensor:
         """Best initial state when the log-ratios move by `step`."""
         return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.column_scale
+
+
+@dataclass(frozen=True, slots=True)
+class Chord:
+    """A second step of Gauss-Newton with the products of the first."""
+
+    cost: Tensor  # weighted squares before the step, shape (B,)
+    step: Tensor  # shape (B, P)
+    x0: Tensor  # best initial state after it, shape (B, N)
+    error: Tensor  # rms of measured minus simulated before it, shape (B, S')
 
 
 class WindowModel:
@@ -140,13 +150,13 @@ class WindowModel:
         step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
         return Linearisation(whiten, columns, column_scale, factor, across, covariance, x, x0, cost, gradient, step)
 
-    def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """One more step from (x, x0) with the products of `at`: cost there, step (B, P), best state after it."""
+    def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
+        """One more step from (x, x0) with the products of `at`."""
         s = self.simulator
-        discrete = self._compressed(s.discretise(s.element_values(x)), data)
+        discrete = self._present(s.discretise(s.element_values(x)), data)
         states = s.states(discrete, data.w, x0)
-        residual = self._signals(data) - states @ discrete.C.mT - data.w @ discrete.D.mT
-        spectra = torch.fft.rfft(residual, dim=1)[:, : self.bins].unsqueeze(3)
+        error = data.measured - states @ discrete.C.mT - data.w @ discrete.D.mT
+        spectra = torch.fft.rfft(error @ self.compression(data.present).mT, dim=1)[:, : self.bins].unsqueeze(3)
         r = _rows(at.whiten @ spectra)  # (B, 1, K)
         N = x0.shape[1]
         along = at.columns @ r.mT  # (B, N + P, 1)
@@ -155,15 +165,12 @@ class WindowModel:
         step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
         cost = r.square().sum(dim=(1, 2)) - (along[:, :N] * free_part).sum(dim=(1, 2))
         x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.column_scale
-        return cost, step.squeeze(2), x0
+        return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt())
 
-    def simulate(self, x: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
-        """Sensors present (B, T, S') and states (B, T, N)."""
+    def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
+        """Simulated states, (B, T, N)."""
         s = self.simulator
-        discrete = s.discretise(s.element_values(x))
-        states = s.states(discrete, data.w, x0)
-        at = torch.as_tensor(data.present)
-        return states @ discrete.C[:, at].mT + data.w @ discrete.D[:, at].mT, states
+        return s.states(s.discretise(s.element_values(x)), data.w, x0)
 
     def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
         """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
@@ -206,9 +213,15 @@ class WindowModel:
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression(data.present).mT
 
+    def _present(self, discrete: Discrete, data: WindowBatch) -> Discrete:
+        if data.present.all():
+            return discrete
+        at = torch.as_tensor(data.present)
+        return replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
+
     def _compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
-        Q, at = self.compression(data.present), torch.as_tensor(data.present)
-        return Discrete(discrete.Ad, discrete.G0, discrete.G1, Q @ discrete.C[:, at], Q @ discrete.D[:, at])
+        Q, discrete = self.compression(data.present), self._present(discrete, data)
+        return replace(discrete, C=Q @ discrete.C, D=Q @ discrete.D)
 
     def _transfer(self, values: ElementValues, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Compliance (B, F, n, n); compressed signals per element force (B, F, R, E) and per unit drive noise."""

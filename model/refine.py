@@ -26,7 +26,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.linearise import PRIOR_STD, Linearisation, WindowBatch, WindowModel
+from model.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
 from model.signals import BoolArray, FloatArray
 from model.system import System
 
@@ -51,7 +51,7 @@ class Refined:
     freedom: np.ndarray  # degrees of freedom, shape (B,)
     error: FloatArray  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
     rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
-    states: FloatArray  # simulated, shape (B, T, N); empty T unless asked for
+    states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
 
 
 class Refiner:
@@ -110,40 +110,40 @@ class Refiner:
         x0 = torch.zeros(B, 2 * self.model.simulator.H.shape[1], dtype=torch.float64)
         covariance = torch.zeros(B, P, P, dtype=torch.float64)
         cost = torch.full((B,), torch.inf, dtype=torch.float64)
-        best, steps = x.clone(), torch.zeros_like(x)
+        best = x.clone()
         converged = torch.zeros(B, dtype=torch.bool)
         taken = torch.zeros(B, dtype=torch.long)
+        error = torch.zeros(B, data.measured.shape[2], dtype=torch.float64)
         active = torch.arange(B)
         for iteration in range(1, iterations + 1):
             chosen = data.take(active)
             at = self.model.linearise(x[active], chosen)
             worse = at.cost > cost[active] * (1 + 1e-6) + 1e-9
-            step, final, state, small, reached = self._iterate(at, chosen)
+            step, second = self._iterate(at, chosen)
+            std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
+            held = second.cost <= at.cost * (1 + 1e-6) + 1e-9
+            small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
+            final = at.x + step + _limited(second.step)
             # A step that made things worse is taken back to a third.
             retreat = best[active] + (x[active] - best[active]) / 3
-            forward = torch.where(small[:, None] | (reached < at.cost)[:, None], final, at.x + step / 3)
+            forward = torch.where(held[:, None], final, at.x + step / 3)
             x[active] = torch.where(worse[:, None], retreat, forward)
             better = active[~worse]
             best[better], cost[better] = at.x[~worse], at.cost[~worse]
-            steps[better] = step[~worse]
             done = small & ~worse
             taken[active] = iteration
-            x0[active], covariance[active] = state, at.covariance
-            cost[active[done]] = reached[done]
+            x0[active], covariance[active], error[active] = second.x0, at.covariance, second.error
+            cost[active[done]] = second.cost[done]
             converged[active[done]] = True
             active = active[~done]
             if len(active) == 0:
                 break
-        return self._result(data, x, x0, covariance, cost, converged, taken, states)
+        return self._result(data, x, x0, covariance, cost, converged, taken, error, states)
 
-    def _iterate(self, at: Linearisation, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """First step, point and state after the chord step, whether that was small, cost reached."""
-        step = at.step * (_STEP_LIMIT / at.step.abs().amax(dim=1, keepdim=True).clamp_min(_STEP_LIMIT))
-        reached, second, state = self.model.chord(at, at.x + step, at.state_after(step), data)
-        std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
-        small = ((second.abs() / std).amax(dim=1) < _CONVERGED) & (reached <= at.cost * (1 + 1e-6) + 1e-9)
-        second = second * (_STEP_LIMIT / second.abs().amax(dim=1, keepdim=True).clamp_min(_STEP_LIMIT))
-        return step, at.x + step + second, state, small, reached
+    def _iterate(self, at: Linearisation, data: WindowBatch) -> tuple[Tensor, Chord]:
+        """The first step and the chord step from where it leads."""
+        step = _limited(at.step)
+        return step, self.model.chord(at, at.x + step, at.state_after(step), data)
 
     def _result(
         self,
@@ -154,9 +154,9 @@ class Refiner:
         cost: Tensor,
         converged: Tensor,
         taken: Tensor,
+        error: Tensor,
         states: bool,
     ) -> Refined:
-        simulated, path = self.model.simulate(x, x0, data)
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
         weak = (std > _WEAK_STD).any(dim=1).nonzero().squeeze(1)
@@ -171,10 +171,11 @@ class Refiner:
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]
         prior = torch.eye(x.shape[1], dtype=torch.float64) * PRIOR_STD**2
-        error = np.full((len(x), len(data.present)), np.nan)
-        rms = error.copy()
-        error[:, data.present] = (data.measured - simulated).square().mean(dim=1).sqrt()
+        wrong = np.full((len(x), len(data.present)), np.nan)
+        rms = wrong.copy()
+        wrong[:, data.present] = error
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
+        path = self.model.states(x, x0, data) if states else x0.new_zeros(len(x), 0, x0.shape[1])
         return Refined(
             log_ratio=torch.where(identifiable, x, torch.zeros_like(x)).numpy(),
             covariance=torch.where(both, covariance, prior).numpy(),
@@ -183,10 +184,16 @@ class Refiner:
             iterations=taken.numpy(),
             chi_square=chi_square.numpy(),
             freedom=freedom.numpy(),
-            error=error,
+            error=wrong,
             rms=rms,
-            states=(path if states else path[:, :0]).numpy(),
+            states=(
+                self.model.states(x, x0, data) if states else data.w[:, :0, :1].expand(-1, -1, x0.shape[1])
+            ).numpy(),
         )
+
+
+def _limited(step: Tensor) -> Tensor:
+    return step * (_STEP_LIMIT / step.abs().amax(dim=1, keepdim=True).clamp_min(_STEP_LIMIT))
 
 
 def _in_order(parts: list[Refined], order: np.ndarray) -> Refined:

@@ -67,8 +67,8 @@ def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle):
             direction = torch.zeros(2, 24, dtype=torch.float64)
             direction[:, p] = 1e-3
             # Moving away from the truth by a known step, the chord must lead back.
-            here = model.chord(at, x, at.x0, data)[1]
-            back = model.chord(at, x + direction, at.state_after(direction), data)[1] - here
+            here = model.chord(at, x, at.x0, data).step
+            back = model.chord(at, x + direction, at.state_after(direction), data).step - here
             assert torch.allclose(back, -direction, atol=3e-5)
 
 
