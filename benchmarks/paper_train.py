@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, cast
 
@@ -35,7 +35,7 @@ CHANGING_METHODS = (
 )
 PAPER = {"alps": {"SE": 3.02, "PE": 0.44e4, "PE_relative": 0.0042}, "cdm": {"SE": 56.04}}
 UPDATES = {
-    "quick": {"alps": 800, "no_fourier": 800, "cdm": 1500, "alps_from_sensors": 600},
+    "quick": {"alps": 300, "no_fourier": 300, "cdm": 600, "alps_from_sensors": 400},
     "full": {"alps": 5000, "no_fourier": 5000, "cdm": 20_000, "alps_from_sensors": 20_000},
 }
 
@@ -152,7 +152,7 @@ def _refine(settings: Settings, data: TrainData, method: str, case: _Case, first
     error = (found.states - case.states) / data.size.numpy()
     return _row(
         settings, "train_changing", method,
-        {"SE": float((error**2).sum((1, 2)).mean())} | _figures(found.log_ratio, case.truth),
+        {"SE": float((error**2).sum((1, 2)).mean()), **_figures(found.log_ratio, case.truth)},
         windows=len(case.truth), samples=case.measured.shape[1], converged=float(found.converged.mean()),
         iterations=float(found.iterations.mean()), milliseconds_per_window=round(1e3 * seconds / len(case.truth), 1),
         error_at_bound=_bound(found.covariance),
@@ -178,7 +178,7 @@ def _sensor_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]
             continue  # no trained weights for this system here
         found = Refiner(system).refine(measured, first)
         yield _row(
-            settings, "train_changing", method, {"SE": None} | _figures(found.log_ratio, truth), windows=len(truth),
+            settings, "train_changing", method, _figures(found.log_ratio, truth), windows=len(truth),
             converged=float(found.converged.mean()), iterations=float(found.iterations.mean()),
             error_at_bound=_bound(found.covariance),
             start_PE_relative=None if first is None else _figures(first, truth)["PE_relative"],
@@ -201,7 +201,7 @@ def _mean_guess(data: TrainData) -> dict[str, float | None]:
 
 
 def _row(
-    settings: Settings, task: str, method: str, figures: dict[str, float | None], /, **more: Any
+    settings: Settings, task: str, method: str, figures: Mapping[str, float | None], /, **more: Any
 ) -> dict[str, Any]:
     rounded = {key: None if value is None else float(f"{value:.4g}") for key, value in figures.items()}
     return {"task": task, "method": method, **rounded, "seed": settings.seed, "budget": settings.budget, **more}

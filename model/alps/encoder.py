@@ -36,18 +36,50 @@ class Encoded:
 class PosteriorHead(nn.Module):
     """Features (..., W) -> posterior of chosen states: two numbers and log k for an angle, else mean and log std."""
 
-    def __init__(self, task: Task, states: tuple[int, ...], width: int) -> None:
+    def __init__(self, task: Task, states: tuple[int, ...], width: int, embedding: int) -> None:
         super().__init__()
+        self.opening = task.opening
         self.states, self.angles = states, set(task.angles)
         self.scales = [task.state_scale[index] for index in states]
         columns = sum(3 if index in self.angles else 2 for index in states)
         self.out = nn.Linear(width, columns)
         with torch.no_grad():
-            self.out.weight *= 3  # states of about unit size from the start: bodies on one spot pull without bound
+            self.out.weight *= 3  # states of about unit size from the start
+        self.direct = nn.Linear(embedding, columns)  # feature points are nearly affine in positions
+        nn.init.zeros_(self.direct.weight)
+        nn.init.zeros_(self.direct.bias)
 
-    def forward(self, features: Tensor) -> Encoded:
-        """(B, T, W) -> posterior of `states`, in their order."""
-        raw = self.out(features)
+    @torch.no_grad()
+    def open_with_components(self, embeddings: Tensor) -> None:
+        """Start the means of the positions from principal components of embeddings (M, E), where the task says how.
+
+        Row i of `Task.opening` holds the weights of the whitened components in position i.  Feature points are nearly
+        affine in positions, so that components span what the picture shows; only their turn is left to find.
+        """
+        if self.opening is None:
+            return
+        weights = torch.tensor(self.opening, device=embeddings.device)  # (positions, components)
+        mean = embeddings.mean(0)
+        _, size, directions = torch.linalg.svd(embeddings - mean, full_matrices=False)
+        count = weights.shape[1]
+        whiten = directions[:count] / (size[:count, None] / len(embeddings) ** 0.5)
+        rows = weights @ whiten  # (positions, E)
+        for row, column in enumerate(self._mean_columns()[: len(rows)]):
+            self.out.weight[column] *= 0.1
+            self.direct.weight[column] = rows[row]
+            self.direct.bias[column] = -rows[row] @ mean
+
+    def _mean_columns(self) -> list[int]:
+        """Column of each translation's mean in the output."""
+        columns, at = [], 0
+        for index in self.states:
+            columns.append(at)
+            at += 3 if index in self.angles else 2
+        return columns
+
+    def forward(self, features: Tensor, embeddings: Tensor) -> Encoded:
+        """(B, T, W) and (B, T, E) -> posterior of `states`, in their order."""
+        raw = self.out(features) + self.direct(embeddings)
         means, draws, divergence, at = [], [], torch.zeros_like(raw[..., 0]), 0
         for index, scale in zip(self.states, self.scales, strict=True):
             if index in self.angles:
@@ -96,11 +128,11 @@ class AttentionEncoder(nn.Module):
         self.lift = nn.Linear(config.embedding, config.width)
         self.register_buffer("place", positions(WINDOW, config.width))
         self.blocks = nn.Sequential(*[_Block(config.width, config.heads) for _ in range(config.layers)])
-        self.head = PosteriorHead(task, tuple(range(len(task.states))), config.width)
+        self.head = PosteriorHead(task, tuple(range(len(task.states))), config.width, config.embedding)
 
     def forward(self, embeddings: Tensor) -> Encoded:
         """(B, T, E) -> posteriors."""
-        return self.head(self.blocks(self.lift(embeddings) + self.place))
+        return self.head(self.blocks(self.lift(embeddings) + self.place), embeddings)
 
 
 class DifferenceEncoder(nn.Module):
@@ -115,11 +147,11 @@ class DifferenceEncoder(nn.Module):
             nn.Linear(config.embedding, width), nn.ELU(), nn.Linear(width, width), nn.ELU(),
             nn.Linear(width, width), nn.ELU(),
         )  # fmt: skip
-        self.head = PosteriorHead(task, self.placed, width)
+        self.head = PosteriorHead(task, self.placed, width, config.embedding)
 
     def forward(self, embeddings: Tensor) -> Encoded:
         """(B, T, E) -> posteriors; the divergence counts positions only, rates follow from them."""
-        found = self.head(self.net(embeddings))
+        found = self.head(self.net(embeddings), embeddings)
         return Encoded(self._with_rates(found.mean), self._with_rates(found.draw), found.divergence)
 
     def _with_rates(self, placed: Tensor) -> Tensor:

@@ -133,6 +133,8 @@ def train_method(
     """One method of one task, trained or from its checkpoint."""
     torch.manual_seed(config.seed)
     model = VisualModel(frames, Network(task, method, sizes)).to(device)
+    if model.network.estimator is not None:  # methods without physics have no positions to start with
+        model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1)[::7].to(device))
     trained = model if config.end_to_end else model.network
     run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))  # type: ignore[arg-type]
     run.resume()

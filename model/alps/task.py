@@ -60,6 +60,7 @@ class Task:
     align: Callable[[Tensor, Tensor], Callable[[Tensor], Tensor]]  # see `metrics.py`
     render: Callable[[Tensor], Tensor] | None = None  # (M, N) -> (M, 3, 64, 64) in [0, 1]
     curved: bool = False  # positions are no affine image of what a picture shows (see `decoder.StateDecoder`)
+    opening: tuple[tuple[float, ...], ...] | None = None  # see `encoder.PosteriorHead.open_with_components`
     read_off: Callable[[Tensor], Tensor] | None = None  # (B, N) -> (B, P): parameters that a state implies, if it does
     pixel_scale: float = 255.0  # of the observation error (1 or 255), as the paper's printed values imply
 

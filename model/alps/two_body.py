@@ -130,5 +130,6 @@ TASK = Task(
     sample=sample,
     align=align,
     render=render,
+    opening=((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)),  # bodies opposite each other about the middle
     read_off=lambda states: energy(states)[..., None],
 )
