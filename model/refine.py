@@ -31,7 +31,7 @@ from model.signals import BoolArray, FloatArray
 from model.system import System
 
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
-_WEAK_STD = 0.05  # beyond this the excitation of a window is held against its noise
+_WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 _NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
