@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.signal import firwin, upfirdn
 
 from model.diagnosis.catalogue.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from model.mechanics import ACCELERATION, FORCE, Mechanics
@@ -30,6 +31,7 @@ from model.simulate.stepping import (
 _STEPS_PER_RADIAN = 5  # of the fastest mode
 _STIFF = 0.5  # largest step times rate at which a law's slope pulls; explicit stages are stable up to 2.8
 _MOST_PARTS = 64
+_FILTER_REACH = 24  # samples to each side
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,7 @@ class Model:
 class Run:
     """One simulated recording."""
 
-    outputs: FloatArray  # what the sensors show, without noise, (T, S)
+    outputs: FloatArray  # what sensors show behind their anti-alias filter, without noise, (T, S)
     states: FloatArray  # (T, N)
     deflection: FloatArray  # of every element, m, (T, E)
     rate: FloatArray  # m/s, (T, E)
@@ -177,18 +179,36 @@ class NonlinearSimulator:
 def _assemble(model: Model, knots: FloatArray, linear: FloatArray, solution: Solution, start: float) -> Run:
     m = model.mechanics
     states = linear + solution.states[..., 0]
-    u, force = drive_vector(m, knots), solution.force[:: model.parts, :, 0]
+    u, fine = drive_vector(m, knots), solution.force[..., 0]
+    shown = band_limited(fine, model.parts)
     return Run(
-        outputs=states @ model.C.T + u @ model.D.T + force @ model.force_outputs.T,
+        outputs=states @ model.C.T + u @ model.D.T + shown @ model.force_outputs.T,
         states=states,
         deflection=states[:, : m.n] @ m.H.T + u[:, m.support_drive] @ m.G.T,
         rate=states[:, m.n :] @ m.H.T + u[:, m.support_drive + 1] @ m.G.T,
-        force=force,
+        force=fine[:: model.parts],
         model=model,
         knots=knots,
         solution=solution,
         start=start,
     )
+
+
+def band_limited(fine: FloatArray, parts: int) -> FloatArray:
+    """A signal on the fine grid, ((T-1) parts + 1, L), behind an anti-alias filter, at the samples (T, L).
+
+    Forces with jumps and kinks reach beyond half the sample rate; sampled as they are, that part would fold back.
+    Of what the sensors show only the forces' direct share needs it: the states' share falls off faster by 1 / omega.
+    Zero phase (the delay of real filters is common to all channels), -6 dB at half the sample rate.
+    """
+    if parts == 1 or not fine.shape[1]:
+        return fine[::parts]
+    reach = _FILTER_REACH * parts
+    taps = firwin(2 * reach + 1, 1 / parts, window=("kaiser", 8.0))
+    padded = np.concatenate([np.repeat(fine[:1], reach, axis=0), fine, np.repeat(fine[-1:], reach, axis=0)])
+    return np.stack([upfirdn(taps, column, down=parts)[2 * _FILTER_REACH :] for column in padded.T], axis=1)[
+        : (len(fine) - 1) // parts + 1
+    ]
 
 
 def _parts_for_modes(mechanics: Mechanics, sample_rate: float) -> int:
