@@ -10,6 +10,7 @@ attenuation bias that noisy regressors cause (Soderstrom 2007).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +26,9 @@ from model.diagnosis.unknown import StaticLaw
 from model.system import System
 
 PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
+_SLACK = 5e-4  # of the objective: inputs are smoothed again and loops solved again in every round
+_PRELOADS = 4  # rounds of equivalent law and motion
+_KRYLOV, _KRYLOV_TOLERANCE = 16, 3e-3
 _RELATIVE_STEP = 1e-4  # of finite differences
 
 
@@ -264,7 +268,7 @@ class Problem:
             self.smooth(lin.spectrum, lin.residual)
             proposal = self.linearise(trial, _start(lin.forces))
             value = _objective(proposal.residual, trial)
-            if value <= best + 0.5:
+            if value <= best * (1 + _SLACK) + 0.5:
                 gained = best - value
                 point, lin, best = trial, proposal, value
                 damping = max(damping / 10, 1e-9)
@@ -400,30 +404,56 @@ def _port_motions(
     return result
 
 
-def _tangent(forward: Forward, forces: LawForces, motions: FloatArray, rounds: int = 6) -> ComplexArray:
+def _tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> ComplexArray:
     """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
 
-    The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant by
-    Neumann's series.  Laws with memory have no tangent in one instant; for them the preload stands.
+    The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant:
+    f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no tangent
+    in one instant; for them the preload stands.
     """
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
     ports = np.array([_wide(forward, w) for w in forces.ports])
     compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
-    answer = np.zeros((len(grid.omega), *motions.shape[2:]), dtype=complex)
-    d, v = motions
-    last = np.inf
-    for _ in range(rounds):
-        force = slopes[0, :, :, None] * d + slopes[1, :, :, None] * v
-        proposal = grid.forward(force)
-        change = float(np.linalg.norm(proposal - answer))
-        if change > 2 * last:
+    jw = 1j * grid.omega[:, None, None]
+    along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
+
+    def close(force: FloatArray) -> FloatArray:
+        moved = compliance @ grid.forward(force)
+        return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
+
+    return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]))
+
+
+def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
+    """x with apply(x) = right, one Krylov space per last-axis column, all at once (Saad and Schultz 1986)."""
+    size = np.sqrt(np.sum(right**2, axis=(0, 1)))
+    used = size > 0
+    if not used.any():
+        return right
+    scale = np.where(used, size, 1.0)
+    basis = [right / scale]
+    columns = len(scale)
+    hessenberg = np.zeros((columns, _KRYLOV + 1, _KRYLOV))
+    target = np.zeros((columns, _KRYLOV + 1, 1))
+    target[:, 0, 0] = size
+    for k in range(_KRYLOV):
+        w = apply(basis[k])
+        for j, v in enumerate(basis):
+            h = np.einsum("nmc,nmc->c", w, v)
+            hessenberg[:, j, k] = h
+            w = w - h * v
+        length = np.sqrt(np.sum(w**2, axis=(0, 1)))
+        hessenberg[:, k + 1, k] = length
+        solved = np.linalg.pinv(hessenberg[:, : k + 2, : k + 1]) @ target[:, : k + 2]
+        left = target[:, : k + 2] - hessenberg[:, : k + 2, : k + 1] @ solved
+        if np.max(np.linalg.norm(left[:, :, 0], axis=1)[used] / size[used]) < _KRYLOV_TOLERANCE:
             break
-        answer, last = proposal, change
-        moved = compliance @ answer
-        d = motions[0] + grid.inverse(moved)
-        v = motions[1] + grid.inverse(1j * grid.omega[:, None, None] * moved)
-    return answer
+        basis.append(w / np.where(length > 1e-12, length, 1.0))
+    result = np.zeros_like(right)
+    for j in range(solved.shape[1]):
+        result += basis[j] * solved[:, j, 0]
+    return result
 
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
@@ -493,26 +523,51 @@ def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> M
 
 
 def _preloaded(problem: Problem, point: Point) -> Point:
-    """The point with the laws' equivalent stiffness and damping moved into the plant."""
-    if not any(is_waveform(t) and "|" not in t.location for t in point.terms):
-        return point
-    bare = replace(point, terms=tuple(replace(t, preload=(0.0, 0.0)) for t in point.terms))
-    forward = problem.forward(point)
-    forces = forward.law_forces(point.state)
-    assert forces is not None
-    terms = []
-    for term in bare.terms:
-        if is_waveform(term) and "|" not in term.location:
-            i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
-            thin = slice(None, None, OVERSAMPLING)
-            regressors = np.column_stack([forces.deflection[thin, i], forces.rate[thin, i]])
-            f = _force(forward, term, forces)[thin]
-            element = forward.element_of(term)
-            k, c = np.linalg.lstsq(regressors, f, rcond=None)[0]
-            k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0
-            term = replace(term, preload=(float(k), float(max(c, -0.9 * element.damping))))
-        terms.append(term)
-    return replace(point, terms=tuple(terms))
+    """The point with the laws' equivalent stiffness and damping moved into the plant.
+
+    The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges.
+    """
+    for _ in range(_PRELOADS):
+        if not any(is_waveform(t) and "|" not in t.location for t in point.terms):
+            return point
+        forward = problem.forward(point)
+        forces = forward.law_forces(point.state)
+        assert forces is not None
+        terms, change = [], 0.0
+        for term in point.terms:
+            if is_waveform(term) and "|" not in term.location:
+                k, c = _equivalent(forward, forces, term)
+                element = forward.element_of(term)
+                size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
+                change = max(
+                    change,
+                    abs(k - term.preload[0]) / (size[0] + abs(k)),
+                    abs(c - term.preload[1]) / (size[1] + abs(c)),
+                )
+                term = replace(term, preload=(k, c))
+            terms.append(term)
+        point = replace(point, terms=tuple(terms))
+        if forces.converged and change < 0.2:
+            break
+    return point
+
+
+def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float, float]:
+    """Stiffness and damping that are nearest to a law along its motion."""
+    i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    thin = slice(None, None, OVERSAMPLING)
+    regressors = np.column_stack([forces.deflection[thin, i], forces.rate[thin, i]])
+    sizes = np.maximum(np.std(regressors, axis=0), 1e-300)
+    reach = 4.0 * sizes
+    f = _force(forward, term, forces)[thin]
+    inside = np.all(np.abs(regressors) < reach, axis=1)
+    k, c = np.linalg.lstsq(regressors[inside] / sizes, f[inside], rcond=None)[0] / sizes
+    element = forward.element_of(term)
+    k = max(k, -0.9 * element.stiffness) if element.stiffness else max(k, 0.0)
+    c = max(c, -0.9 * element.damping) if element.damping else max(c, 0.0)
+    if not forces.converged:
+        k, c = (k + term.preload[0]) / 2, (c + term.preload[1]) / 2
+    return float(k), float(c)
 
 
 def _start(forces: LawForces | None) -> tuple[FloatArray, ...]:

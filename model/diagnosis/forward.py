@@ -16,6 +16,7 @@ from functools import cached_property
 from math import comb
 
 import numpy as np
+from scipy.fft import irfft, rfft
 from scipy.linalg import expm
 
 from model.diagnosis.catalogue import BodyLaw, SensorLaw, SpringDamper
@@ -260,7 +261,8 @@ def _solve(forward: Forward, terms: list[Term], state: FloatArray) -> LawForces:
     start = np.column_stack(forward.start_force) if forward.start_force else law(loop.d0, loop.v0)
     force, converged = _fixed_point(lambda f: law(*loop.motion(f)), start)
     d, v = loop.motion(force)
-    spectrum, line = loop.decompose(force)
+    fine_spectrum, line = loop.decompose(force)
+    spectrum = fine_spectrum[: len(grid.omega)] / (OVERSAMPLING * np.sqrt(grid.samples))
     motion = np.einsum("bkpn,kb->pn", loop.lines, line[:2])
     sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ wide.T, spectrum)
     q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (wide @ structure.H))
@@ -272,10 +274,30 @@ class _Loop:
 
     def __init__(self, plant: Plant, ports: FloatArray, d0: FloatArray, v0: FloatArray) -> None:
         self.plant, self.grid, self.d0, self.v0 = plant, plant.grid, d0, v0
-        self.compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
+        self.compliance = self._compliance(ports)  # (4N / 2 + 1, m, m)
+        self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(d0), plant.grid.step / OVERSAMPLING)
         self.lines = np.array([self._line_motion(port) for port in ports])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, ports @ plant.structure.H)
         self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+
+    def _compliance(self, ports: FloatArray) -> ComplexArray:
+        """Deflection along the ports per force along them, also above the record's Nyquist frequency.
+
+        A law with a kink answers its own harmonics there: below from the plant, above from the state equations,
+        D = rows (j w - A)^-1 B by modes.
+        """
+        plant = self.plant
+        s = plant.structure
+        n = len(s.mass)
+        known = ports @ plant.deflection_of_force @ ports.T
+        fine = 2 * np.pi * np.fft.rfftfreq(OVERSAMPLING * self.grid.samples, self.grid.step / OVERSAMPLING)
+        values, vectors = np.linalg.eig(s.state_matrix())
+        rows = np.hstack([ports @ s.H, np.zeros((len(ports), n))]) @ vectors
+        loads = np.vstack([np.zeros((n, len(ports))), -(ports @ s.H).T / s.mass[:, None]])
+        columns = np.linalg.lstsq(vectors, loads.astype(complex), rcond=None)[0]
+        high = fine[len(known) :]
+        above = (rows / (1j * high[:, None] - values)[:, None, :]) @ columns
+        return np.concatenate([known, above])
 
     def _line_motion(self, port: FloatArray) -> FloatArray:
         """Polynomial motions under a constant unit force and under one that rises to 1, (2, DEGREE + 1, n)."""
@@ -285,20 +307,21 @@ class _Loop:
         return np.array([self.plant.polynomial_response(one) for one in load])
 
     def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Periodic spectrum (F, m) and polynomial (DEGREE + 1, m): a line that joins the ends, and the mean."""
+        """Periodic spectrum on the oversampled axis' bins (4N / 2 + 1, m) and polynomial (DEGREE + 1, m): a line that joins the ends, and the mean."""
         line = np.zeros((DEGREE + 1, force.shape[1]))
         line[1] = force[-1] - force[0]
         rest = force - self.powers[:, 1:2] * line[1]
         line[0] = rest.mean(axis=0)
-        return self.grid.coarse_spectrum(rest - line[0]), line
+        return rfft(rest - line[0], axis=0), line
 
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate, 2 x (4N, m)."""
         spectrum, line = self.decompose(force)
         answer = np.einsum("fab,fb->fa", self.compliance, spectrum)
         polynomial = np.einsum("kpab,kb->pa", self.line_d, line[:2])
-        d = self.d0 + self.grid.fine(answer) + self.powers @ polynomial
-        v = self.v0 + self.grid.fine(1j * self.grid.omega[:, None] * answer)
+        count = len(self.d0)
+        d = self.d0 + irfft(answer, count, axis=0) + self.powers @ polynomial
+        v = self.v0 + irfft(1j * self.fine_omega[:, None] * answer, count, axis=0)
         return d, v + self.powers @ self.plant.derivative(polynomial)
 
 

@@ -81,15 +81,15 @@ class HeldOut:
         per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
         return FreeRun(simulated, measured, float(residual @ residual), len(residual), per_sensor)
 
-    def noise_rms(self, fit: Fit) -> FloatArray:
+    def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""
         plant, grid = fit.forward.plant, fit.forward.part.grid
-        variance = self.noise.support_variance(grid.omega)
+        variance = noise.support_variance(grid.omega)
         power = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support) ** 2, variance)
         if fit.forward.part.force.shape[1]:
             F = plant.structure.F[:, : fit.forward.part.force.shape[1]]
-            power = power + np.abs(plant.sensor_of_load @ F) ** 2 @ self.noise.force**2
-        return np.sqrt(power.mean(axis=0) + self.noise.sensors**2)
+            power = power + np.abs(plant.sensor_of_load @ F) ** 2 @ noise.force**2
+        return np.sqrt(power.mean(axis=0) + noise.sensors**2)
 
 
 def _normal(free: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:

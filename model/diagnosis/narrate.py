@@ -42,7 +42,7 @@ def narrate(course: Course, record: Recorded) -> Report:
     after = course.held.run(course.fit.point) if course.found else before
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
-    floor = course.held.noise_rms(course.fit)
+    floor = course.held.noise_rms(course.fit, course.problem.noise)
     floor_figures = floor / np.where(size > 0, size, 1.0)
     findings = [_input_finding(f) for f in course.input_faults]
     findings += [_stuck_finding(course, name, at) for name, at in course.prepared.stuck]
