@@ -1,0 +1,207 @@
+"""Training of the paper's networks: resume, the train system, the benchmark's door."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks import paper
+from benchmarks.physics_overhead import _stepwise
+from model.alps import fit, mass_spring_damper, train_fit, two_body
+from model.alps.config import NetworkConfig, TrainingConfig, training_config
+from model.alps.evaluate import every_window, predict, state_figures
+from model.alps.fit import Clock, OutOfTime, Split
+from model.alps.frames import FrameAutoencoder
+from model.alps.train_system import full_state_system, generate, to_points, to_states, train_task
+from model.refine import Refiner
+from model.system import load_system
+from service.errors import UserError
+
+SIZES = NetworkConfig()
+TINY = TrainingConfig(
+    trajectories=6, test_trajectories=3, updates=6, batch=2, checkpoint_every=2, frame_updates=4, frame_batch=8
+)
+
+
+@pytest.fixture(scope="module")
+def train_data():
+    return generate(True, np.random.default_rng(0), 4)
+
+
+def fake_split() -> Split:
+    """Embeddings that are an affine image of the positions, as feature points nearly are."""
+    task = two_body.TASK
+    rollouts = fit.draw_rollouts(task, TINY, "train")
+    mix = torch.randn(4, SIZES.embedding, generator=torch.Generator().manual_seed(0))
+    return Split(rollouts, task.to_chart(rollouts.states, task.placed).float() @ mix)
+
+
+def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
+    task, data = two_body.TASK, fake_split()
+
+    def trained(folder: Path) -> list[torch.Tensor]:
+        folder.mkdir(exist_ok=True)
+        frames = FrameAutoencoder(SIZES)
+        model = fit.train_method(task, "alps", data, frames, TINY, SIZES, folder, Clock())
+        return [p.detach().clone() for p in model.network.parameters()]
+
+    straight = trained(tmp_path / "straight")
+    folder = tmp_path / "broken"
+    folder.mkdir()
+
+    class Stops(Clock):
+        def check(self, run) -> None:  # type: ignore[no-untyped-def]
+            if run.step == 3:
+                run.save()
+                raise OutOfTime("stopped")
+
+    with pytest.raises(OutOfTime):
+        fit.train_method(task, "alps", data, FrameAutoencoder(SIZES), TINY, SIZES, folder, Stops())
+    for left, right in zip(straight, trained(folder), strict=True):
+        torch.testing.assert_close(left, right)
+
+
+def test_the_frame_autoencoder_learns_and_is_kept(tmp_path: Path) -> None:
+    task = mass_spring_damper.TASK
+    config = replace(TINY, frame_updates=12, learning_rate=5e-3)
+    frames = fit.train_frames(task, config, SIZES, tmp_path, Clock())
+    assert task.render is not None
+    pictures = task.render(fit.draw_rollouts(task, config, "test").states[:, 60])
+    untrained = FrameAutoencoder(SIZES)
+    with torch.no_grad():
+        error = (frames(pictures) - pictures).square().mean()
+        assert float(error) < 0.9 * float((untrained(pictures) - pictures).square().mean())
+        embeddings = frames.encode(task.render(fit.draw_rollouts(task, config, "train").states[:, ::5].flatten(0, 1)))
+        assert float((embeddings.std(0) - 1).abs().max()) < 0.3
+        torch.testing.assert_close(frames.decode(frames.encode(pictures)), frames(pictures), atol=1e-4, rtol=1e-3)
+    again = fit.train_frames(task, config, SIZES, tmp_path, Clock(until=0.0))  # no time left, none needed
+    torch.testing.assert_close(again.outer, frames.outer)
+
+
+def test_end_to_end_training_reaches_the_convolutions(tmp_path: Path) -> None:
+    task, data = mass_spring_damper.TASK, fake_split()
+    config = replace(TINY, updates=1, end_to_end=True)
+    frames = FrameAutoencoder(SIZES)
+    before = frames.embed.maps[0].weight.detach().clone()  # type: ignore[union-attr,operator]
+    rollouts = fit.draw_rollouts(task, config, "train")
+    fit.train_method(
+        task, "alps", Split(rollouts, data.embeddings), frames, config, SIZES, tmp_path, Clock()
+    )  # fmt: skip
+    assert not torch.equal(before, frames.embed.maps[0].weight)  # type: ignore[arg-type]
+
+
+def test_opening_with_components_finds_the_orbits_up_to_their_turn() -> None:
+    task = two_body.TASK
+    torch.manual_seed(0)
+    data = fake_split()
+    model = fit.VisualModel(FrameAutoencoder(SIZES), fit.Network(task, "alps", SIZES)).eval()
+    rows, starts = every_window(data)
+    model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1))
+    opened = predict(task, model, data, rows[:20], starts[:20], data)
+    error = (opened.encoded - opened.true)[..., :4].square().mean().sqrt()
+    assert float(error) < 0.6 * float(opened.true[..., :4].square().mean().sqrt())
+    figures = state_figures(task, opened)
+    assert figures["PE"] is not None and figures["SE"] is not None
+
+
+def test_schedules_go_from_short_to_the_whole_window_and_the_prior_fades() -> None:
+    for name in ("pendulum", "mass_spring_damper", "two_body"):
+        config = training_config(name, "quick", 0)
+        assert sum(config.shares) == pytest.approx(1)
+        assert all(99 % horizon == 0 for horizon in config.horizons)
+        assert config.horizon(config.updates - 1) == 99
+        assert config.divergence(config.updates) == pytest.approx(config.divergence_weight)
+        assert training_config(name, "full", 0).end_to_end
+
+
+def test_train_trajectories_have_the_papers_sizes(train_data) -> None:
+    assert train_data.measured.shape == (4, 500, 18)
+    assert train_data.observations.shape == (4, 500, 12)
+    assert train_data.known.shape == (4, 500, 16)
+    assert train_data.log_ratio.shape == (4, 24)
+    constant = generate(False, np.random.default_rng(0), 3).log_ratio
+    assert bool((constant == constant[0]).all()) and not bool(
+        (train_data.log_ratio[0] == train_data.log_ratio[1]).all()
+    )
+
+
+def test_true_states_are_what_the_simulator_gives_from_their_first(train_data) -> None:
+    task = train_task(train_data)
+    path = task.simulate(train_data.states[:, 0], train_data.log_ratio, train_data.known)
+    error = (path - train_data.states).square().mean((0, 1)).sqrt() / train_data.size
+    assert float(error.max()) < 0.01
+
+
+def test_measured_states_have_one_percent_noise(train_data) -> None:
+    ratio = (train_data.measured - train_data.states).std((0, 1)) / train_data.size
+    np.testing.assert_allclose(ratio.numpy(), 0.01, rtol=0.1)
+
+
+def test_points_and_states_are_two_views_of_the_same_motion(train_data) -> None:
+    states = train_data.states.numpy()
+    np.testing.assert_allclose(to_states(to_points(states)), states, atol=1e-12)
+
+
+def test_refinement_from_states_reaches_its_bound_from_the_nominal_values(train_data) -> None:
+    system = full_state_system(load_system(), train_data.noise.numpy())
+    measured = np.concatenate([train_data.known.numpy(), to_points(train_data.measured.numpy())], axis=2)[:, :100]
+    found = Refiner(system).refine(measured)
+    error = found.log_ratio - train_data.log_ratio.numpy()
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    assert bool(found.converged.all())
+    assert 0.7 < float(np.sqrt(((error / std) ** 2).mean())) < 1.4
+    assert float(np.abs(error).mean()) < 0.006
+
+
+def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path: Path) -> None:
+    data = generate(False, np.random.default_rng(1), 6)
+    config = train_fit.TrainConfig(updates=25, batch=8, checkpoint_every=50)
+    model = train_fit.fit("alps", data, config, tmp_path, Clock(), "test")
+    figures = train_fit.figures(model, data, hop=100)
+    untrained = train_fit.figures(train_fit.build("alps", data), data, hop=100)
+    assert figures["PE_relative"] < 0.35 * untrained["PE_relative"]
+    assert figures["SE"] < 0.2 * untrained["SE"]
+
+
+@pytest.mark.parametrize("method", ["cdm", "alps_from_sensors", "no_fourier"])
+def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> None:
+    config = train_fit.TrainConfig(updates=2, batch=2, checkpoint_every=50)
+    model = train_fit.fit(method, train_data, config, tmp_path, Clock(), "test")
+    figures = train_fit.figures(model, train_data, hop=200)
+    assert np.isfinite(figures["SE"])
+
+
+def test_torchdiffeq_and_the_exact_solution_agree() -> None:
+    task = mass_spring_damper.TASK
+    drawn = task.sample(2, np.random.default_rng(0), task.seen)
+    args = drawn.states[:, 0], drawn.parameters, drawn.inputs[:, :30]
+    exact = task.simulate(*args)
+    for method, tolerance in (("dopri5", 1e-3), ("rk4", 0.03)):
+        error = (_stepwise(method).simulate(*args) - exact) / torch.tensor(task.state_scale)
+        assert float(error.abs().max()) < tolerance
+
+
+def test_the_bench_says_what_it_does_not_know() -> None:
+    for arguments, word in (
+        ({"task": "penduluum"}, "penduluum"),
+        ({"task": "pendulum", "method": "greybox"}, "greybox"),
+        ({"task": "pendulum", "budget": "huge"}, "huge"),
+        ({"task": "pendulum", "device": "cuda:9" if not torch.cuda.is_available() else "tpu"}, "device"),
+    ):
+        with pytest.raises(UserError, match=word):
+            next(paper.run(**arguments))
+
+
+def test_the_bench_gives_the_kernels_and_their_picture(tmp_path: Path) -> None:
+    rows = list(paper.run("kernels", out=tmp_path))
+    assert [row["method"] for row in rows] == ["none", "k_DFT", "k_MAG", "k_PHA"]
+    assert (tmp_path / "quick" / "pictures" / "kernels.png").is_file()
+
+
+def test_a_bench_without_time_says_how_to_go_on(tmp_path: Path) -> None:
+    (row,) = list(paper.run("pendulum", method="alps", out=tmp_path, minutes=0.0))
+    assert "run the same command again" in row["unfinished"]
