@@ -12,9 +12,11 @@ from scipy import signal
 
 from benchmarks.generator import draw_cases, make_recordings, read_vehicle, track, write_set
 from benchmarks.generator.draw import FAULTS
+from benchmarks.generator.exact import exact_response
 from benchmarks.generator.files import WRITERS
-from benchmarks.generator.integrate import STEP_RATE, Motion, Plant, Slot
+from benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, Motion, Plant, Slot
 from benchmarks.generator.laws import LAWS
+from benchmarks.generator.make import _integrated
 from model.system import MANCHESTER, MANCHESTER_DBC, load_system
 from replay.record import load_record
 
@@ -135,3 +137,14 @@ def test_the_oracle_sees_nothing_on_clean_recordings_and_counts_strength_linearl
     made = [r.snr or 0.0 for r in make_recordings(VEHICLE, cases, seconds=40.0)]
     assert max(made[:2]) < 1.5
     assert made[2] / made[3] == pytest.approx(2.0, rel=0.05)
+
+
+@pytest.mark.slow
+def test_the_integrator_agrees_with_the_exact_response_of_a_linear_vehicle() -> None:
+    case = draw_cases(VEHICLE, 1, 23, ["clean"])[0]
+    integrated, _ = next(_integrated(VEHICLE, [case], 20.0, None))
+    exact = exact_response(VEHICLE, case, 30.0)[int(WARM_UP * SAMPLE_RATE) :]
+    settled = slice(1200, 1900)
+    error = np.abs(integrated[settled] - exact[settled]).max(axis=0)
+    noise = np.concatenate([VEHICLE.input_noise.ravel(), VEHICLE.sensor_noise])
+    assert (error < 0.05 * noise).all()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from benchmarks.generator import track
 from benchmarks.generator.draw import Case
+from benchmarks.generator.exact import exact_response, is_linear
 from benchmarks.generator.files import WRITERS
 from benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
 from benchmarks.generator.oracle import SETTLE, oracle_snr
@@ -103,27 +104,37 @@ def make_recordings(
     batch: int = 32,
     progress: Callable[[str], None] | None = None,
 ) -> Iterator[Recording]:
-    """The recordings of the cases, in their order."""
+    """The recordings of the cases, in their order; linear vehicles by their exact response, the others integrated."""
     samples = round(seconds * SAMPLE_RATE)
     for first in range(0, len(cases), batch):
         group = cases[first : first + batch]
-        tables = [
-            track.wheels(
-                np.random.default_rng(case.seed + 2), WARM_UP + seconds + SLACK + 2, case.speed, case.level,
-                vehicle.input_position, vehicle.input_side, joint_spacing=case.joints,
-            )
-            for case in group
-        ]
-        displacement = np.stack([t[0] for t in tables], axis=2)
-        velocity = np.stack([t[1] for t in tables], axis=2)
-        plant = _plant(vehicle, group)
+        hidden = [case for case in group if not is_linear(case)]
         said = (lambda part, n=first: progress(f"{n}+{part:.0%} of {len(cases)}")) if progress else None
-        clean, strength = simulate(vehicle, plant, displacement, velocity, seconds + SLACK / 2, said)
-        for column, case in enumerate(group):
-            own = [float(s) for s, slot in zip(strength, plant.slots, strict=True) if slot.column == column]
-            faulty = _faulty(vehicle, case, clean[:, :, column], samples)
-            snr = oracle_snr(vehicle, case, clean[:samples, :, column], faulty) if seconds > 2 * SETTLE else None
+        integrated = iter(_integrated(vehicle, hidden, seconds, said) if hidden else [])
+        for case in group:
+            clean, own = (exact_response(vehicle, case, seconds + 2), []) if is_linear(case) else next(integrated)
+            faulty = _faulty(vehicle, case, clean, samples)
+            snr = oracle_snr(vehicle, case, clean[:samples], faulty) if seconds > 2 * SETTLE else None
             yield Recording(case, _noisy(vehicle, case, faulty), own, snr)
+
+
+def _integrated(
+    vehicle: Vehicle, group: list[Case], seconds: float, said: Callable[[float], None] | None
+) -> Iterator[tuple[Array, list[float]]]:
+    """True filtered signals and strengths of each case, integrated together."""
+    tables = [
+        track.wheels(
+            np.random.default_rng(case.seed + 2), WARM_UP + seconds + SLACK + 2, case.speed, case.level,
+            vehicle.input_position, vehicle.input_side, joint_spacing=case.joints,
+        )
+        for case in group
+    ]
+    displacement, velocity = (np.stack([t[i] for t in tables], axis=2) for i in (0, 1))
+    plant = _plant(vehicle, group)
+    clean, strength = simulate(vehicle, plant, displacement, velocity, seconds + SLACK / 2, said)
+    for column in range(len(group)):
+        own = [float(s) for s, slot in zip(strength, plant.slots, strict=True) if slot.column == column]
+        yield clean[:, :, column], own
 
 
 def label(made: Recording, seconds: float) -> dict[str, Any]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.generator.draw import Case
+from benchmarks.generator.exact import Transfer
 from benchmarks.generator.integrate import SAMPLE_RATE
 from benchmarks.generator.vehicle import Vehicle
 
@@ -38,29 +39,6 @@ def _periodic(x: Array) -> Array:
         + x[0] * (3 * u**2 - 2 * u**3) + slope_start * (u**3 - u**2)
     )
     return np.vstack([x, bridge])
-
-
-class Transfer:
-    """Frequency responses of one vehicle from the wheels to the sensors, and to element motions."""
-
-    def __init__(self, vehicle: Vehicle, stiffness: Array, damping: Array, omega: Array) -> None:
-        jw = 1j * omega[:, None]
-        impedance = stiffness + jw * damping  # (F, E)
-        geometry = vehicle.geometry
-        stands = np.zeros((len(vehicle.elements), len(vehicle.inputs)))
-        for row, wheel in enumerate(vehicle.support):
-            if wheel >= 0:
-                stands[row, wheel] = 1.0
-        dynamic = np.einsum("ei,fe,ej->fij", geometry, impedance, geometry) - np.einsum(
-            "f,ij->fij", omega**2, np.diag(vehicle.inertia)
-        )
-        self.compliance = np.linalg.inv(dynamic)  # displacement per generalised force, (F, D, D)
-        drive = np.einsum("ei,fe,ew->fiw", geometry, impedance, stands)
-        motion = self.compliance @ drive  # (F, D, wheels)
-        felt = -(omega**2)[:, None, None] * vehicle.pickup
-        self.to_sensors = felt @ motion
-        self.stretch = geometry @ motion - stands  # deflection per wheel displacement, (F, E, wheels)
-        self.load_to_sensors = felt @ self.compliance @ (-geometry.T)  # per element force, (F, S, E)
 
 
 def _sensitivities(transfer: Transfer, wheels: Complex, omega: Array) -> Complex:

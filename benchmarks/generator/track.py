@@ -46,6 +46,36 @@ def _joints(rng: np.random.Generator, samples: int, speed: float, spacing: float
     return dip / np.sqrt(1 + (frequency / 25.0) ** 12) * (frequency < 49.0)
 
 
+def wheel_spectra(
+    rng: np.random.Generator,
+    seconds: float,
+    speed: float,
+    level: float,
+    position: Array,
+    side: Array,
+    correlation: float = 0.5,
+    joint_spacing: float | None = None,
+) -> tuple[NDArray[np.complex128], Array, int]:
+    """Displacement of every wheel as harmonics of a period that is longer than `seconds`.
+
+    Returns `irfft` coefficients on the grid of 1 kHz (F, wheels), angular frequencies (F,) and the period's samples.
+    """
+    samples = int(2 ** np.ceil(np.log2(seconds * RATE + 2000)))
+    common, left, right = (_rail_spectrum(rng, samples, speed, level) for _ in range(3))
+    own = np.sqrt(1 - correlation)
+    shared = np.sqrt(correlation)
+    rails = {1.0: shared * common + own * left, -1.0: shared * common + own * right}
+    if joint_spacing is not None:
+        dips = _joints(rng, samples, speed, joint_spacing)
+        rails = {key: value + dips for key, value in rails.items()}
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(samples, 1 / RATE), dtype=np.float64)
+    delayed = [
+        rails[float(y)] * np.exp(-1j * omega * (position.max() - x) / speed)
+        for x, y in zip(position, side, strict=True)
+    ]
+    return np.stack(delayed, axis=1), omega, samples
+
+
 def wheels(
     rng: np.random.Generator,
     seconds: float,
@@ -57,20 +87,10 @@ def wheels(
     joint_spacing: float | None = None,
 ) -> tuple[Array, Array]:
     """Displacement (m) and velocity (m/s) under every wheel on a grid of 1 kHz, each of shape (N, wheels)."""
-    samples = int(2 ** np.ceil(np.log2(seconds * RATE + 2000)))
-    common, left, right = (_rail_spectrum(rng, samples, speed, level) for _ in range(3))
-    own = np.sqrt(1 - correlation)
-    shared = np.sqrt(correlation)
-    rails = {1.0: shared * common + own * left, -1.0: shared * common + own * right}
-    if joint_spacing is not None:
-        dips = _joints(rng, samples, speed, joint_spacing)
-        rails = {key: value + dips for key, value in rails.items()}
-    omega = 2 * np.pi * np.fft.rfftfreq(samples, 1 / RATE)
+    spectra, omega, samples = wheel_spectra(
+        rng, seconds, speed, level, position, side, correlation, joint_spacing
+    )
     count = int(np.ceil(seconds * RATE)) + 2
-    displacement = np.empty((count, position.size))
-    velocity = np.empty_like(displacement)
-    for wheel, (x, y) in enumerate(zip(position, side, strict=True)):
-        delayed = rails[float(y)] * np.exp(-1j * omega * (position.max() - x) / speed)
-        displacement[:, wheel] = np.fft.irfft(delayed, samples)[:count]
-        velocity[:, wheel] = np.fft.irfft(1j * omega * delayed, samples)[:count]
+    displacement = np.fft.irfft(spectra, samples, axis=0)[:count]
+    velocity = np.fft.irfft(1j * omega[:, None] * spectra, samples, axis=0)[:count]
     return displacement, velocity
