@@ -7,6 +7,7 @@ stopped, or that ran out of `--minutes`, goes on where it was when it is given a
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -56,10 +57,21 @@ def run(
             settings = Settings(name, method, cast(Budget, budget), at, out or Path("runs/paper"), device, until)
             settings.folder.mkdir(parents=True, exist_ok=True)
             try:
-                yield from rows(settings)
+                for row in rows(settings):
+                    _keep(settings, row)
+                    yield row
             except OutOfTime as stop:
                 yield {"task": name, "seed": at, "unfinished": str(stop)}
                 return
+
+
+def _keep(settings: Settings, row: dict[str, Any]) -> None:
+    """Write a row beside the checkpoints, for `benchmarks.paper_report`."""
+    folder = settings.out / settings.budget / "rows"
+    folder.mkdir(parents=True, exist_ok=True)
+    what = row.get("method") or f"{row.get('inputs')}-inputs"
+    path = folder / f"{row['task']}-{what}-s{settings.seed}.json"
+    path.write_text(json.dumps(row, indent=1) + "\n")
 
 
 def _check(task: str | None, method: str | None, budget: str, device: str) -> None:

@@ -71,7 +71,7 @@ def rows(settings: Settings) -> Iterator[dict[str, Any]]:
             "weights": sum(p.numel() for p in model.network.parameters()),
             "settings": asdict(config),
         }
-    if settings.seed == 0:
+    if settings.seed == 0 and settings.method is None:  # a picture shows all methods side by side
         paper_pictures.states(task, shown, settings.pictures / f"{task.name}-states.png")
         paper_pictures.frames(task, models, shown, settings.pictures / f"{task.name}-frames.png")
 

@@ -54,7 +54,8 @@ def test_one_input_needs_no_phases_and_several_do() -> None:
     torch.set_num_threads(1)
     single = phase.network_error("magnitude", 1, windows=2000, updates=150)
     several = phase.network_error("magnitude", 4, windows=2000, updates=150)
-    assert single < 0.08 < 0.2 < several
+    assert single < 0.08
+    assert several > 0.2
     assert phase.balance_error(4) < 0.03
 
 
