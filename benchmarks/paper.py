@@ -22,6 +22,7 @@ from model.alps.fit import OutOfTime
 from service.errors import UserError
 
 TASKS: dict[str, tuple[Callable[[Settings], Iterator[dict[str, Any]]], tuple[str, ...]]] = {
+    "systems": (paper_visual.system_rows, ()),
     "pendulum": (paper_visual.rows, paper_visual.METHODS),
     "mass_spring_damper": (paper_visual.rows, paper_visual.METHODS),
     "two_body": (paper_visual.rows, paper_visual.METHODS),

@@ -29,7 +29,7 @@ def kernel_rows(settings: Settings) -> Iterator[dict[str, Any]]:
 
 def phase_rows(settings: Settings) -> Iterator[dict[str, Any]]:
     """Mean relative error of the spring constants over the number of independent inputs."""
-    windows, updates = (20_000, 1000) if settings.budget == "quick" else (100_000, 10_000)
+    windows, updates = (10_000, 600) if settings.budget == "quick" else (100_000, 10_000)
     rows = []
     for inputs in INPUTS:
         row = {

@@ -84,6 +84,17 @@ def frames(task: Task, models: dict[str, VisualModel], shown: dict[str, Predicte
     _save(figure, path)
 
 
+def systems(drawn: dict[str, torch.Tensor], path: Path) -> None:
+    """A strip of frames of each system."""
+    figure, axes = plt.subplots(len(drawn), 9, figsize=(9, 1.05 * len(drawn)))
+    for line, (name, pictures) in zip(axes, drawn.items(), strict=True):
+        for ax, picture in zip(line, pictures, strict=True):
+            ax.imshow(picture.permute(1, 2, 0).numpy())
+            ax.set(xticks=[], yticks=[])
+        line[0].set_ylabel(name.replace("_", " "), fontsize=6)
+    _save(figure, path)
+
+
 def kernels(views: dict[str, KernelView], path: Path) -> None:
     """Fig. 3: the signal, rows of the kernels over distance, their spectra, eigenvalues, the matrices."""
     figure, axes = plt.subplots(2, 4, figsize=(11, 5))

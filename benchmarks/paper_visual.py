@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any, cast
 
+import numpy as np
 import torch
 
 from benchmarks import paper_pictures
@@ -38,6 +39,25 @@ PAPER: dict[tuple[str, str], tuple[float, float, float | None]] = {  # (SE, OE, 
     ("two_body", "no_fourier"): (1.86, 2.56e8, 0.02),
     ("two_body", "no_attention"): (511.49, 2.72e8, 0.27),
 }
+
+
+def system_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+    """What the three systems look like, and how long a picture takes."""
+    drawn = {}
+    for name, task in TASKS.items():
+        assert task.render is not None
+        states = task.sample(8, np.random.default_rng(settings.seed), task.seen).states
+        begin = time.perf_counter()
+        task.render(states.flatten(0, 1))
+        milliseconds = 1e3 * (time.perf_counter() - begin) / states[..., 0].numel()
+        drawn[name] = task.render(states[0, ::14])
+        yield {
+            "task": "systems",
+            "method": name,
+            "milliseconds_per_picture": round(milliseconds, 3),
+            "state_spread": [float(f"{v:.3g}") for v in states.std((0, 1))],
+        }
+    paper_pictures.systems(drawn, settings.pictures / "systems.png")
 
 
 def rows(settings: Settings) -> Iterator[dict[str, Any]]:
