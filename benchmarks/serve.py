@@ -23,6 +23,7 @@ import numpy as np
 
 from model.excitation import simulate_runs
 from model.system import System, load_system
+from service.threads import one_thread_each
 
 TARGET_MS = 15.0
 WARM_UP = 20
@@ -30,6 +31,7 @@ WARM_UP = 20
 
 def run(requests: int = 300, *, clients: int = 8, seconds: float = 5.0) -> Iterator[dict[str, Any]]:
     """Figures: latencies one request after the other, then throughput with several clients."""
+    one_thread_each()  # as the command does; the servers inherit it
     system = load_system()
     body = window_body(system)
     context = multiprocessing.get_context("spawn")
@@ -45,6 +47,7 @@ def run(requests: int = 300, *, clients: int = 8, seconds: float = 5.0) -> Itera
             echo, identify = Client(ports[0], "/echo", body), Client(ports[1], "/identify", body)
             echo.wait()
             identify.wait()
+            echo.connection = None  # idle while the other server started: it may have been closed
             times = np.array([(echo.ask(), identify.ask()) for _ in range(WARM_UP + requests)])[WARM_UP:] * 1e3
             yield from _latencies(times, len(body))
             yield from _throughput(ports[1], body, clients, seconds)
@@ -78,7 +81,7 @@ class Client:
             try:
                 self.ask()
                 return
-            except OSError:
+            except (OSError, http.client.HTTPException):
                 self.connection = None
                 if time.monotonic() > deadline:
                     raise

@@ -48,7 +48,6 @@ class Settings(BaseSettings):
     compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503
     job_queue: int = Field(default=16, gt=0)  # uploads and diagnoses waiting before 503
     batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction
-    torch_threads: int = Field(default=0, ge=0)  # 0: as many as torch chooses
 
     parameter_series_vehicles: int = Field(default=20, ge=0)  # vehicles with per-parameter metrics
     vehicles_in_memory: int = Field(default=256, gt=0)  # tracker states held between windows

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from service.threads import one_thread_each
+
 app = typer.Typer(
     name="sprung",
     help="Springs and dampers of rail vehicles, identified from running recordings.",
@@ -63,6 +65,7 @@ def replay(
 
     Without --store nothing is kept: every run then depends on its files alone.
     """
+    one_thread_each()
     from service.cli.replay import run
 
     return run(
@@ -101,6 +104,7 @@ def serve(
     vehicle: Vehicle = None,
 ) -> int:
     """REST, metrics and pages, on an embedded store unless --store says otherwise."""
+    one_thread_each()
     from service.cli.serve import run
 
     options = {
