@@ -8,14 +8,17 @@ weak), `limit` (laws from weak down to hidden in the noise), `clean` (healthy ve
 
 from __future__ import annotations
 
+import hashlib
 import json
 import sys
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
+import model
 from benchmarks.concealed_score import Score, explained, rate, score, summary
 from benchmarks.generator import draw_cases, read_vehicle, write_set
 from benchmarks.generator.laws import LAWS
@@ -124,16 +127,26 @@ def _progress(what: str) -> Callable[[str], None]:
     return show
 
 
+@cache
+def engine_digest() -> str:
+    """Tells one state of the diagnosis from another, so that results of an older one are not taken for new."""
+    hashed = hashlib.sha256()
+    for source in sorted((Path(model.__file__).parent / "diagnosis").rglob("*.py")):
+        hashed.update(source.read_bytes())
+    return hashed.hexdigest()[:12]
+
+
 def _diagnosed(system: System, file: Path, variant: str) -> dict[str, Any]:
-    """The report's JSON, from the cache beside the recording where it is there."""
+    """The report's JSON, from the cache beside the recording where the present engine has put it there."""
     kept = file.with_suffix(f".{variant.replace(' ', '-')}.json")
     if kept.exists():
         report: dict[str, Any] = json.loads(kept.read_text(encoding="utf-8"))
-        return report
+        if report.get("engine") == engine_digest():
+            return report
     begun = time.perf_counter()
     record = load_record(file, system.channels, system.sample_rate)
     report = diagnose(system, record, options=replace(ABLATIONS[variant], file=file.name)).to_dict()
-    report["wall_seconds"] = time.perf_counter() - begun
+    report |= {"wall_seconds": time.perf_counter() - begun, "engine": engine_digest()}
     partial = kept.with_suffix(".part")
     partial.write_text(json.dumps(report), encoding="utf-8")
     partial.replace(kept)
