@@ -1,6 +1,11 @@
 """Which candidate, if any: full fits of the best screened ones, compared by evidence, one finding after the other.
 
-Evidence of a model, up to constants:   chi^2 + sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
+Gain of a candidate:   sum over blocks (sensor, band) of  n log(chi^2 before / chi^2 after),
+
+twice the log-likelihood ratio with the noise level of every block profiled out, so that coloured noise of unknown
+level does not count as evidence; where the noise is white and known it equals the fall of chi^2.
+
+Evidence of a model, up to constants:   gain - sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
 
 (Laplace's approximation with a flat prior of `width`, MacKay 2003, chapter 28): a parameter costs what the recording
 tells about it, so a shape that does not matter costs nothing, where BIC would charge log n for it.
@@ -12,12 +17,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
-from model.diagnosis.catalogue import SensorLaw
 from model.diagnosis.fit import Fit, Point, Problem
 from model.diagnosis.screen import Hit, Screening
-from model.diagnosis.terms import Term, is_waveform
+from model.diagnosis.terms import Term
 from model.diagnosis.unknown import SMALL, UNKNOWN
+from model.signals import FloatArray
 
 _LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
 _WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
@@ -25,6 +31,7 @@ _UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
+_BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST = 3  # that are fitted to the end
 
 
@@ -34,7 +41,7 @@ class Trial:
 
     hit: Hit
     fit: Fit
-    gain: float  # chi-square of the model without it, less that with it
+    gain: float  # twice the log-likelihood ratio against the model without it
     evidence: float  # gain less what its parameters cost
     finished: bool = True
 
@@ -45,6 +52,11 @@ class Trial:
     @property
     def named(self) -> bool:
         return self.term.law.name != UNKNOWN
+
+    def p_value(self, tests: int) -> float:
+        """Chance of such a gain among so many candidates, noise levels unknown."""
+        count = max(1, len(self.term.parameters))
+        return float(min(1.0, tests * stats.chi2.sf(max(self.gain, 0.0), count)))
 
     def delta_bic(self) -> float:
         """BIC with the candidate less BIC without."""
@@ -133,8 +145,19 @@ def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -
         return None
     if not np.isfinite(fit.chi_square):
         return None
-    gain = base.chi_square - fit.chi_square
+    gain = profile_gain(base.residual, fit.residual, len(problem.sensors))
     return Trial(hit, fit, gain, gain - cost(fit, len(hit.term.parameters)) - _prior_cost(hit))
+
+
+def profile_gain(before: FloatArray, after: FloatArray, sensors: int) -> float:
+    """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out."""
+    power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
+    bins = len(power[0])
+    edges = np.unique(np.round(np.geomspace(_FIRST_BLOCK, bins, _BLOCKS)).astype(int))
+    edges = np.concatenate([[0], edges[edges > 0]])
+    sums = [np.add.reduceat(p, edges[:-1], axis=0) for p in power]
+    counts = 2.0 * np.diff(edges)[:, None]
+    return float(np.sum(counts * np.log(np.maximum(sums[0], 1e-300) / np.maximum(sums[1], 1e-300))))
 
 
 def cost(fit: Fit, count: int) -> float:
@@ -154,10 +177,3 @@ def _prior_cost(hit: Hit) -> float:
         return 0.0
     return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))
 
-
-def is_sensor(term: Term) -> bool:
-    return isinstance(term.law, SensorLaw)
-
-
-def uses_trajectory(term: Term) -> bool:
-    return is_waveform(term)

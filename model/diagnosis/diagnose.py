@@ -171,7 +171,10 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     for trial in trials[:1]:
         if options.held_out and not _holds(course, trial):
             return False
-        p_value = course.last.p_value(trial.hit) if options.multiplicity else trial.hit.p_single
+        tests = course.last.tests[trial.hit.family] * len(course.last.tests) if options.multiplicity else 1
+        p_value = max(trial.p_value(tests), min(1.0, trial.hit.p_single * tests))
+        if p_value > options.alpha:
+            return False
         rivals = [t for t in trials if t is not trial]
         course.found.append(Found(trial, rivals, p_value))
         course.problem, course.fit = refreshed(course.problem, trial.fit)

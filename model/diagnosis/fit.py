@@ -21,8 +21,8 @@ from model.diagnosis.hysteresis import force_along
 from model.diagnosis.measured import Noise, Part
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, is_waveform
-from model.signals import FloatArray
 from model.diagnosis.unknown import StaticLaw
+from model.signals import FloatArray
 from model.system import System
 
 PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
@@ -513,7 +513,7 @@ def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> M
     v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n:] @ s.H.T)
     load = -((part.support @ s.G.T) * plant.impedance) @ s.H
     if part.force.shape[1]:
-        load = load + part.force @ s.F[:, : part.force.shape[1]].T
+        load = load + forward.force @ s.F[:, : part.force.shape[1]].T
     q = np.einsum("fnm,fm->fn", plant.receptance, load)
     if forces is not None:
         q += forces.q

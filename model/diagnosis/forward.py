@@ -31,6 +31,7 @@ from model.system import System
 _TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
 _HISTORY = 8
+DELAY = "delay"  # variant of a sensor's lag: a pure delay; else a first-order lag
 _REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
 
 
@@ -102,7 +103,7 @@ class Forward:
         support = self.part.support_polynomial
         moved = support @ s.G.T
         load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
-        load = load + self.part.force_polynomial @ s.F.T[: self.part.force_polynomial.shape[1]]
+        load = load + self.force_polynomial @ s.F.T[: self.force_polynomial.shape[1]]
         q = plant.polynomial_response(load)
         return q, q @ s.H.T + moved
 
@@ -113,21 +114,49 @@ class Forward:
         result = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support)
         if part.force.shape[1]:
             F = plant.structure.F[:, : part.force.shape[1]]
-            result += np.einsum("fsi,fi->fs", plant.sensor_of_load @ F, part.force)
+            result += np.einsum("fsi,fi->fs", plant.sensor_of_load @ F, self.force)
         return result
+
+    @cached_property
+    def force_faults(self) -> tuple[FloatArray, FloatArray]:
+        """Gain and offset of every measured force, each (forces,)."""
+        names = [n for n, source in self.system.file.inputs.items() if source.kind == "force"]
+        gain, offset = np.ones(len(names)), np.zeros(len(names))
+        for term in self.terms:
+            if isinstance(term.law, SensorLaw) and term.location in names:
+                i = names.index(term.location)
+                if term.law.name == "sensor_gain":
+                    gain[i] *= term.parameters[0]
+                elif term.law.name == "sensor_bias":
+                    offset[i] += term.parameters[0]
+        return gain, offset
+
+    @property
+    def force(self) -> ComplexArray:
+        """Measured forces with their faults taken out, periodic part, (F, forces)."""
+        return self.part.force / self.force_faults[0]
+
+    @property
+    def force_polynomial(self) -> FloatArray:
+        """The same, polynomial part, (DEGREE + 1, forces)."""
+        gain, offset = self.force_faults
+        result = self.part.force_polynomial.copy()
+        result[:1] -= offset
+        return result / gain
 
     def shown(self, periodic: ComplexArray, polynomial: FloatArray) -> ComplexArray:
         """What the sensors show of true signals (F, S) + polynomial (DEGREE + 1, S), faults in place."""
         grid = self.part.grid
-        gain, lag, offset = self.faults
-        shown = periodic * self.sensor_factor + grid.monomial_spectra @ (_later(polynomial, lag / grid.length) * gain)
+        gain, lag, delay, offset = self.faults
+        late = _lagged(_later(polynomial, delay / grid.length), lag / grid.length)
+        shown = periodic * self.sensor_factor + grid.monomial_spectra @ (late * gain)
         shown[0] += offset * np.sqrt(grid.samples)
         return shown
 
     @cached_property
-    def faults(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Gain, lag (s) and offset of every present sensor, each (S,)."""
-        gain, lag, offset = (np.full(len(self.sensors), value) for value in (1.0, 0.0, 0.0))
+    def faults(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Gain, time constant of a lag (s), pure delay (s) and offset of every present sensor, each (S,)."""
+        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in (1.0, 0.0, 0.0, 0.0))
         names = [self.system.sensors[i] for i in self.sensors]
         for term in self.terms:
             if not isinstance(term.law, SensorLaw) or term.location not in names:
@@ -136,16 +165,17 @@ class Forward:
             if term.law.name == "sensor_gain":
                 gain[i] *= term.parameters[0]
             elif term.law.name == "sensor_lag":
-                lag[i] += term.parameters[0]
+                (delay if term.variant == DELAY else lag)[i] += term.parameters[0]
             elif term.law.name == "sensor_bias":
                 offset[i] += term.parameters[0]
-        return gain, lag, offset
+        return gain, lag, delay, offset
 
     @cached_property
     def sensor_factor(self) -> ComplexArray:
         """Shown over true signal of every sensor, (F, S)."""
-        gain, lag, _ = self.faults
-        return gain * np.exp(-1j * self.part.grid.omega[:, None] * lag)
+        gain, lag, delay, _ = self.faults
+        s = 1j * self.part.grid.omega[:, None]
+        return gain * np.exp(-s * delay) / (1 + s * lag)
 
     @cached_property
     def linear_deflection(self) -> ComplexArray:
@@ -154,7 +184,7 @@ class Forward:
         result = np.einsum("fei,fi->fe", plant.deflection_of_support, part.support)
         if part.force.shape[1]:
             F = plant.structure.F[:, : part.force.shape[1]]
-            result += np.einsum("fei,fi->fe", plant.deflection_of_load @ F, part.force)
+            result += np.einsum("fei,fi->fe", plant.deflection_of_load @ F, self.force)
         return result
 
     def free_rows(self) -> FloatArray:
@@ -165,9 +195,10 @@ class Forward:
     def free_rows_at_start(self) -> FloatArray:
         """What the sensors show of the state at the first sample, (S, 2n)."""
         rows = self.plant.structure.sensor_rows()
-        gain, lag, _ = self.faults
-        for i in np.flatnonzero(lag):
-            rows[i] = rows[i] @ expm(-self.plant.structure.state_matrix() * lag[i])
+        gain, lag, delay, _ = self.faults
+        A = self.plant.structure.state_matrix()
+        for i in np.flatnonzero((lag != 0) | (delay != 0)):
+            rows[i] = rows[i] @ expm(-A * delay[i]) @ np.linalg.inv(np.eye(len(A)) + A * lag[i])
         return rows * gain[:, None]
 
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -220,6 +251,20 @@ def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
     for k in range(len(polynomial)):
         for j in range(k + 1):
             result[j] += polynomial[k] * comb(k, j) * (-delay) ** (k - j)
+    return result
+
+
+def _lagged(polynomial: FloatArray, lag: FloatArray) -> FloatArray:
+    """Coefficients of p behind a first-order lag, p - lag p' + lag^2 p'' ..., one lag per column."""
+    if not np.any(lag):
+        return polynomial
+    result, derivative = polynomial.copy(), polynomial
+    orders = np.arange(1, len(polynomial))[:, None]
+    for k in range(1, len(polynomial)):
+        following = np.zeros_like(derivative)
+        following[:-1] = derivative[1:] * orders
+        derivative = following
+        result = result + (-lag) ** k * derivative
     return result
 
 

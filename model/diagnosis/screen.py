@@ -257,7 +257,7 @@ def _unnamed(
 ) -> Iterator[tuple[Hit, int]]:
     """Static forces without a name at one element."""
     grid = projector.grid
-    seen, element = _seen(projector, location, d, v)
+    seen, _ = _seen(projector, location, d, v)
     for name, basis in trials().items():
         law = static_law(basis, seen)
         count = len(law.parameters)

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from model.diagnosis.catalogue import Law, SensorLaw
+from model.diagnosis.forward import DELAY
 from model.diagnosis.screen import Hit, Projector
 from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.terms import Term
@@ -49,6 +50,9 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
             scale = {"sensor_gain": 0.1, "sensor_lag": 0.1 * grid.step}.get(effect, max(abs(amplitude), 1e-9))
             term = Term(laws[effect], name, (float(start),), scales=(scale,))
             yield Hit(term, score, 1, "sensor", float(stats.chi2.sf(score, 1))), 1
+            if effect == "sensor_lag":
+                delayed = Term(laws[effect], name, (float(start),), DELAY, scales=(scale,))
+                yield Hit(delayed, 0.999 * score, 1, "sensor", float(stats.chi2.sf(0.999 * score, 1))), 1
 
 
 def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
@@ -64,10 +68,9 @@ def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
         precision_d = 1 / noise.displacement[support] ** 2
         precision_v = (omega / noise.velocity[support]) ** 2
         share_d = precision_d / (precision_d + precision_v)
-        spread = np.sqrt(noise.displacement[support] ** 2 + (noise.velocity[support] / np.maximum(omega, omega[1])) ** 2)
-        moved = part.support[band, support] + grid.monomial_spectra[band] @ part.support_polynomial[:, support]
+        integrated = noise.velocity[support] / np.maximum(omega, omega[1])
+        spread = np.hypot(noise.displacement[support], integrated)
         periodic = part.support[band, support]
-        del moved
         witness = part.redundancy[band, at]
         for channel, share, sign in (("displacement", share_d, -1.0), ("velocity", 1 - share_d, 1.0)):
             for effect, signal in (("sensor_gain", periodic), ("sensor_lag", -1j * omega * periodic)):
@@ -98,7 +101,7 @@ def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
             effects.append(("sensor_gain", projector.pack(-response * part.force[band, i, None])))
         if "sensor_bias" in laws:
             load = np.zeros((part.force_polynomial.shape[0], len(direction)))
-            load[0] = -direction
+            load[0] = -direction  # the true force is the measured one less the offset
             q = plant.polynomial_response(load)
             shown = plant.polynomial_sensors(q, np.zeros_like(part.support_polynomial))
             spectrum = (grid.monomial_spectra @ shown)[band] * fit.forward.sensor_factor[band]
@@ -107,7 +110,7 @@ def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
             score, amplitude = projector.score(column)
             start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
             term = Term(laws[effect], name, (float(start),), scales=(max(abs(amplitude), 1e-9),))
-            yield Hit(term, score, 1, "input", float(stats.chi2.sf(score, 1))), 1
+            yield Hit(term, score, 1, "force", float(stats.chi2.sf(score, 1))), 1
 
 
 def _pack(spectrum: ComplexArray, weight: FloatArray) -> FloatArray:

@@ -23,7 +23,7 @@ ComplexArray = NDArray[np.complex128]
 
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
-BAND = 0.36  # of the sample rate: above it anti-alias filters are on their way down, laws' harmonics with them
+BAND = 0.30  # of the sample rate: above it anti-alias filters are on their way down, laws' harmonics with them
 
 
 @dataclass(frozen=True)
