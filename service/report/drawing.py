@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -186,11 +187,11 @@ def draw_system(system: System, findings: Mapping[str, str], scores: Mapping[str
         axes.autoscale_view()
         axes.set_aspect("equal")
         low, high = axes.get_ylim()
-        axes.set_ylim(low - 0.3, high + 0.4 + (1.5 if findings and layout.slant else 0.0))
+        axes.set_ylim(low - 0.3, high + 0.5 + (1.5 if findings and layout.slant else 0.0))
+        _call_out(axes, layout, places, findings)
         left, right = axes.get_xlim()
         low, high = axes.get_ylim()
-        figure.set_size_inches(WIDTH, min(max(WIDTH * (high - low) / (right - left), 2.6), 4.4))
-        _call_out(axes, layout, places, findings)
+        figure.set_size_inches(WIDTH, min(max(WIDTH * (high - low) / (right - left), 2.6), 5.6))
     return figure
 
 
@@ -240,21 +241,25 @@ def _ground(axes: Axes, layout: Layout) -> None:
 
 
 def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings: Mapping[str, str]) -> None:
-    """Words in a row above the vehicle, in the order of their places so that no arrows cross."""
-    high = axes.get_ylim()[1]
+    """Words above the vehicle in the order of their places, so that no arrows cross; several in staggered rows."""
+    low, high = axes.get_ylim()
     left, right = axes.get_xlim()
     found = {name: places.get(name) or places.get(name.split(".")[0]) for name in findings}
     known = sorted((place, name) for name, place in found.items() if place is not None)
+    levels = 1 if len(known) <= 2 else 2 if len(known) <= 4 else 3
+    axes.set_ylim(low, high + 1.5 * (levels - 1))
     for number, (place, name) in enumerate(known):
         margin = 0.22 * (right - left)
         x = float(np.clip(place[0], left + margin, right - margin))
         if len(known) > 1:
             x = left + (right - left) * (number + 0.5) / len(known)
-        beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, high - 0.25)
+        y = high - 0.25 + 1.5 * (levels - 1 - number % levels)
+        beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, y)
+        words = "\n".join(textwrap.wrap(findings[name], 44 if len(known) <= 2 else 26)[:3])
         axes.annotate(
-            f"{name}\n{findings[name]}", xy=place, xytext=beside, fontsize=10, color=ink.HIGHLIGHT,
+            f"{name}\n{words}", xy=place, xytext=beside, fontsize=10 if len(known) <= 2 else 8.5, color=ink.HIGHLIGHT,
             ha="left" if layout.slant == 0 else "center", va="center" if layout.slant == 0 else "top",
-            fontweight="bold", zorder=200,
+            fontweight="bold", zorder=200, annotation_clip=False,
             bbox={"boxstyle": "round,pad=0.35", "fc": "white", "ec": ink.HIGHLIGHT, "lw": 1.2},
             arrowprops={"arrowstyle": "-|>", "color": ink.HIGHLIGHT, "lw": 1.4, "shrinkB": 6},
         )

@@ -35,7 +35,7 @@ MINOR = {"smoothing", "n"}
 
 def quantity(p: LawParameter) -> str:
     """ "395 ± 6 N": rounded to the standard deviation; small lengths and speeds in millimetres."""
-    value, std, unit = p.value, p.std, "" if p.unit in {"", "-"} else p.unit
+    value, std, unit = p.value, p.std, "" if p.unit in {"", "-", "1"} else p.unit
     if unit in {"m", "m/s"} and max(abs(value), std) < 0.1:
         value, std, unit = 1e3 * value, 1e3 * std, "m" + unit
     if not math.isfinite(std) or std <= 0:
