@@ -59,9 +59,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         stack.callback(core.close)
         buses = [_bus(core, name) for name in feeds.buses]
         threads = [threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)]
-        threads += [
-            threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), daemon=True) for bus in buses
-        ]
+        threads += [threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), daemon=True) for bus in buses]
 
         def start() -> None:
             for thread in threads:
@@ -95,9 +93,7 @@ def _exit(_number: int, _frame: FrameType | None) -> NoReturn:
 def _listen(settings: Settings) -> socket.socket:
     """The socket, before anything else is started, so that a port in use is a plain error."""
     try:
-        found = socket.getaddrinfo(
-            settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )
+        found = socket.getaddrinfo(settings.host, settings.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, _, _, _, address = found[0]
         return socket.create_server(address[:2], family=family, backlog=1024)
     except OSError as error:
