@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from functools import cache
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
 
+LITERAL = re.compile(r"`([^`]*)`")
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
 
@@ -20,13 +23,18 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"quantity": quantity, "percent": percent}
+    environment.filters |= {"quantity": quantity, "percent": percent, "code": code}
     return environment
 
 
 def render(template: str, **values: Any) -> str:
     """A page from a template of this package."""
     return _environment().get_template(template).render(**values)
+
+
+def code(text: str) -> Markup:
+    """Plain text with its `literals` set as code."""
+    return Markup(LITERAL.sub(r"<code>\1</code>", str(escape(text))))
 
 
 def quantity(value: float, unit: str) -> str:
