@@ -28,6 +28,7 @@ from model.signals import FloatArray
 _LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
 _WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
 _UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
+_UNNAMED_RATIO = 1.3  # and explain this many times as much
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
@@ -147,6 +148,16 @@ def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -
         return None
     gain = profile_gain(base.residual, fit.residual, len(problem.sensors))
     return Trial(hit, fit, gain, gain - cost(fit, len(hit.term.parameters)) - _prior_cost(hit))
+
+
+def preferred(trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence, but an unnamed force leads only if it explains far more than every named candidate."""
+    if not trials or trials[0].named:
+        return trials
+    named = [t for t in trials if t.named]
+    if named and trials[0].gain < _UNNAMED_RATIO * named[0].gain:
+        return [named[0], *[t for t in trials if t is not named[0]]]
+    return trials
 
 
 def profile_gain(before: FloatArray, after: FloatArray, sensors: int) -> float:

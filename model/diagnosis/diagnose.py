@@ -10,7 +10,7 @@ import numpy as np
 
 from model.diagnosis.catalogue import CATALOGUE, Law
 from model.diagnosis.channels import Prepared, prepare
-from model.diagnosis.choose import Trial, compete, shortlist
+from model.diagnosis.choose import Trial, compete, preferred, shortlist
 from model.diagnosis.fit import Fit, Point, Problem
 from model.diagnosis.heldout import HeldOut
 from model.diagnosis.inputs import InputFault, best_input_fault, input_faults_of
@@ -101,7 +101,7 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     """Baseline, then finding after finding until the rest is noise."""
     tell(0.02, "channels and noise")
     prepared = prepare(system, record.values, record.sample_rate)
-    signals = prepared.signals
+    signals = prepared.signals.part(0, fast_length(prepared.signals.samples))
     declared = declared_noise(system, signals)
     tell(0.05, "nominal structure identified again")
     problem, base = baseline(system, signals, declared, options)
@@ -121,7 +121,7 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
 
 def baseline(system: System, signals: Signals, declared: Noise, options: Options) -> tuple[Problem, Fit]:
     """The nominal structure on the first part, with noise levels estimated on the way."""
-    split = int(round(options.train_share * signals.samples))
+    split = fast_length(round(options.train_share * signals.samples))
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise)
@@ -130,6 +130,18 @@ def baseline(system: System, signals: Signals, declared: Noise, options: Options
     start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
     fit = problem.fit(start, iterations=12)
     return refreshed(problem, fit)
+
+
+def fast_length(samples: int) -> int:
+    """The longest length up to `samples` that transforms quickly: no prime factor above 7."""
+    for length in range(samples, samples // 2, -1):
+        rest = length
+        for prime in (2, 3, 5, 7):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return length
+    return samples
 
 
 def refreshed(problem: Problem, fit: Fit, iterations: int = 6) -> tuple[Problem, Fit]:
@@ -167,7 +179,7 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
         return False
     share = 0.25 + 0.17 * number
     trials = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
-    trials = [t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)]
+    trials = preferred([t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)])
     for trial in trials[:1]:
         if options.held_out and not _holds(course, trial):
             return False
@@ -199,6 +211,8 @@ def _minor(course: Course, trial: Trial) -> bool:
     for found in course.found:
         same = found.trial.term.location == trial.term.location
         if trial.gain < (0.05 if same else 0.002) * found.trial.gain:
+            return True
+        if same and not trial.named:
             return True
     return False
 

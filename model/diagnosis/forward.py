@@ -31,7 +31,7 @@ from model.system import System
 _TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
 _HISTORY = 8
-DELAY = "delay"  # variant of a sensor's lag: a pure delay; else a first-order lag
+DELAY, BOTH = "delay", "lag and delay"  # variants of a sensor's lag, which is else of first order
 _REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
 
 
@@ -166,6 +166,8 @@ class Forward:
                 gain[i] *= term.parameters[0]
             elif term.law.name == "sensor_lag":
                 (delay if term.variant == DELAY else lag)[i] += term.parameters[0]
+                if term.variant == BOTH:
+                    delay[i] += term.parameters[1]
             elif term.law.name == "sensor_bias":
                 offset[i] += term.parameters[0]
         return gain, lag, delay, offset

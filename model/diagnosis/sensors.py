@@ -9,12 +9,13 @@ same support (`measured`).
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy import stats
 
-from model.diagnosis.catalogue import Law, SensorLaw
-from model.diagnosis.forward import DELAY
+from model.diagnosis.catalogue import Law, ParameterSpec, SensorLaw
+from model.diagnosis.forward import BOTH, DELAY
 from model.diagnosis.screen import Hit, Projector
 from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.terms import Term
@@ -51,8 +52,17 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
             term = Term(laws[effect], name, (float(start),), scales=(scale,))
             yield Hit(term, score, 1, "sensor", float(stats.chi2.sf(score, 1))), 1
             if effect == "sensor_lag":
-                delayed = Term(laws[effect], name, (float(start),), DELAY, scales=(scale,))
-                yield Hit(delayed, 0.999 * score, 1, "sensor", float(stats.chi2.sf(0.999 * score, 1))), 1
+                for other in (
+                    Term(laws[effect], name, (float(start),), DELAY, scales=(scale,)),
+                    Term(_with_delay(laws[effect]), name, (float(start), 0.0), BOTH, scales=(scale, scale)),
+                ):
+                    yield Hit(other, 0.999 * score, 1, "sensor", float(stats.chi2.sf(0.999 * score, 1))), 1
+
+
+def _with_delay(law: SensorLaw) -> SensorLaw:
+    """A first-order lag with a transport delay besides."""
+    delay = ParameterSpec("delay", "s", -1.0, 1.0, "transport delay besides the lag", lambda seen: 0.001)
+    return replace(law, parameters=(*law.parameters, delay))
 
 
 def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
