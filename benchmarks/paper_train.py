@@ -22,7 +22,7 @@ from model.identify import load_identifier
 from model.refine import Refiner
 from model.system import System, load_system
 
-CONSTANT_METHODS = ("alps", "no_fourier", "cdm", "alps_from_sensors")
+CONSTANT_METHODS = ("alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors")
 CHANGING_METHODS = (
     "alps",
     "force_balance",
@@ -35,8 +35,8 @@ CHANGING_METHODS = (
 )
 PAPER = {"alps": {"SE": 3.02, "PE": 0.44e4, "PE_relative": 0.0042}, "cdm": {"SE": 56.04}}
 UPDATES = {
-    "quick": {"alps": 300, "no_fourier": 300, "cdm": 600, "alps_from_sensors": 400},
-    "full": {"alps": 5000, "no_fourier": 5000, "cdm": 20_000, "alps_from_sensors": 20_000},
+    "quick": {"alps": 300, "alps_smoothed": 300, "no_fourier": 300, "cdm": 600, "alps_from_sensors": 400},
+    "full": {"alps": 5000, "alps_smoothed": 5000, "no_fourier": 5000, "cdm": 20_000, "alps_from_sensors": 20_000},
 }
 
 

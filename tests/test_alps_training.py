@@ -16,8 +16,9 @@ from model.alps.config import NetworkConfig, TrainingConfig, training_config
 from model.alps.evaluate import every_window, predict, state_figures
 from model.alps.fit import Clock, OutOfTime, Split
 from model.alps.frames import FrameAutoencoder
-from model.alps.train_system import full_state_system, generate, to_points, to_states, train_task
+from model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
 from model.refine import Refiner
+from model.simulate.linear import LinearSimulator
 from model.system import load_system
 from service.errors import UserError
 
@@ -157,6 +158,30 @@ def test_refinement_from_states_reaches_its_bound_from_the_nominal_values(train_
     assert float(np.abs(error).mean()) < 0.006
 
 
+def test_a_start_from_the_whole_window_carries_less_noise_than_its_first_sample(train_data) -> None:
+    system = load_system()
+    simulator = LinearSimulator(system)
+    measured, known = train_data.measured[:, :100], train_data.known[:, :100]
+    truth = train_data.log_ratio.clone().requires_grad_()
+    best = smoothed(simulator, truth, measured, known, train_data.noise)
+    first = simulator.simulate(train_data.log_ratio, known, measured[:, 0])[1]
+
+    def error(path: torch.Tensor) -> float:
+        return float(((path - train_data.states[:, :100]) / train_data.size).detach().square().mean().sqrt())
+
+    assert error(best) < 0.3 * error(first)
+    misfit = ((best - measured) / train_data.noise).square().sum()
+    (slope,) = torch.autograd.grad(misfit, truth)
+    step = torch.zeros_like(train_data.log_ratio)
+    step[:, 3] = 1e-4
+
+    def moved(sign: int) -> torch.Tensor:
+        path = smoothed(simulator, train_data.log_ratio + sign * step, measured, known, train_data.noise)
+        return ((path - measured) / train_data.noise).square().sum((1, 2))
+
+    torch.testing.assert_close(slope[:, 3], (moved(1) - moved(-1)) / 2e-4, rtol=1e-3, atol=0.1)
+
+
 def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path: Path) -> None:
     data = generate(False, np.random.default_rng(1), 6)
     config = train_fit.TrainConfig(updates=25, batch=8, checkpoint_every=50)
@@ -167,7 +192,7 @@ def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path:
     assert figures["SE"] < 0.2 * untrained["SE"]
 
 
-@pytest.mark.parametrize("method", ["cdm", "alps_from_sensors", "no_fourier"])
+@pytest.mark.parametrize("method", ["cdm", "alps_smoothed", "alps_from_sensors", "no_fourier"])
 def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> None:
     config = train_fit.TrainConfig(updates=2, batch=2, checkpoint_every=50)
     model = train_fit.fit(method, train_data, config, tmp_path, Clock(), "test")

@@ -31,7 +31,7 @@ class TrainingConfig:
     seed: int = 0
     trajectories: int = 150  # for training
     test_trajectories: int = 60
-    updates: int = 500
+    updates: int = 400
     batch: int = 16
     learning_rate: float = 2e-3
     checkpoint_every: int = 100

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors import safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.alps.config import Method, NetworkConfig, TrainingConfig
@@ -91,7 +92,7 @@ def train_frames(
         return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]
 
     frames.standardise(draw(1000, 5), before=True)
-    run = Run(frames, folder / "frames", config, _name(task, config, "frames"))  # type: ignore[arg-type]
+    run = Run(frames, folder / "frames", config, _frames_name(task, config))  # type: ignore[arg-type]
     run.resume()
     while run.step < config.frame_updates:
         clock.check(run)
@@ -110,12 +111,13 @@ def embedded(
     """A split with its embeddings, computed once and kept beside the checkpoints."""
     rollouts = draw_rollouts(task, config, split)
     path = folder / f"embeddings-{split}.safetensors"
+    made_by = f"{_frames_name(task, config)} {len(rollouts.states)}"
     if path.is_file():
-        found = load_file(path)["embeddings"]
-        if len(found) == len(rollouts.states):
-            return Split(rollouts, found)
+        with safe_open(path, framework="pt") as file:
+            if (file.metadata() or {}).get("made_by") == made_by:
+                return Split(rollouts, file.get_tensor("embeddings"))
     embeddings = frames.encode_rollouts(task, rollouts.states.to(device)).cpu()
-    save_file({"embeddings": embeddings.contiguous()}, path)
+    save_file({"embeddings": embeddings.contiguous()}, path, metadata={"made_by": made_by})
     return Split(rollouts, embeddings)
 
 
@@ -165,6 +167,12 @@ def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingCo
     if pictures is not None:
         loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
     return loss
+
+
+def _frames_name(task: Task, config: TrainingConfig) -> str:
+    """What the frame autoencoder depends on; the methods' settings are none of it."""
+    used = (config.seed, config.trajectories, config.learning_rate, config.frame_updates, config.frame_batch)
+    return f"{task.name} frames {used}"
 
 
 def _name(task: Task, config: TrainingConfig, what: str) -> str:

@@ -20,11 +20,13 @@ from model.alps.encoder import AttentionEncoder
 from model.alps.fit import Clock
 from model.alps.task import WINDOW, Task, windows
 from model.alps.train_estimator import LogRatioEstimator
-from model.alps.train_system import STEPS, TrainData, train_task
+from model.alps.train_system import STEPS, TrainData, smoothed, train_task
 from model.features import magnitudes
+from model.simulate.linear import LinearSimulator
+from model.system import load_system
 from model.training import _Run as Run
 
-TrainMethod = Literal["alps", "no_fourier", "cdm", "alps_from_sensors"]
+TrainMethod = Literal["alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors"]
 
 
 @dataclass(frozen=True)
@@ -42,10 +44,15 @@ class TrainConfig:
 
 
 class StateEstimator(nn.Module):
-    """The paper's setting: measured states -> features -> parameters -> simulated states."""
+    """The paper's setting: measured states -> features -> parameters -> simulated states.
 
-    def __init__(self, task: Task, fourier: bool) -> None:
+    `smooth` holds the noise of the states where the simulation starts from the window's best start rather than, as in
+    the paper, from its first measured sample.
+    """
+
+    def __init__(self, task: Task, fourier: bool, smooth: Tensor | None = None) -> None:
         super().__init__()
+        self.smooth, self.simulator = smooth, LinearSimulator(load_system())
         self.task, self.fourier = task, fourier
         rows = WINDOW // 2 + 1 if fourier else WINDOW
         self.estimator = LogRatioEstimator(rows * len(task.states), len(task.parameters))
@@ -55,6 +62,8 @@ class StateEstimator(nn.Module):
         chart = self.task.to_chart(states).float()
         features = torch.log1p(magnitudes(chart)) if self.fourier else chart.flatten(1)
         log_ratio = self.estimator(features).double()
+        if self.smooth is not None:
+            return log_ratio, smoothed(self.simulator, log_ratio, states, knots, self.smooth)
         return log_ratio, self.task.simulate(states[:, 0], log_ratio, knots)
 
 
@@ -121,7 +130,8 @@ def build(method: TrainMethod, data: TrainData) -> nn.Module:
         return StateContext(task, data)
     if method == "alps_from_sensors":
         return SensorAutoencoder(task, data)
-    return StateEstimator(task, fourier=method == "alps")
+    smooth = data.noise if method == "alps_smoothed" else None
+    return StateEstimator(task, fourier=method != "no_fourier", smooth=smooth)
 
 
 def fit(method: TrainMethod, data: TrainData, config: TrainConfig, folder: Path, clock: Clock, what: str) -> nn.Module:
@@ -201,8 +211,6 @@ def figures(model: nn.Module, data: TrainData, hop: int = 10) -> dict[str, float
 
 def parameter_figures(log_ratio: Tensor, true: Tensor) -> dict[str, float | None]:
     """PE in SI units and the mean relative error, from log-ratios (B, 24)."""
-    from model.system import load_system
-
     nominal = torch.from_numpy(load_system().nominal)
     estimated, truth = nominal * torch.exp(log_ratio), nominal * torch.exp(true)
     return {

@@ -9,7 +9,7 @@ they and the inputs have the noise of the system file.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -110,6 +110,26 @@ def generate(changing: bool, rng: np.random.Generator, trajectories: int = TRAJE
         noise=torch.from_numpy(noise),
         size=torch.from_numpy(size),
     )
+
+
+def smoothed(simulator: LinearSimulator, log_ratio: Tensor, measured: Tensor, inputs: Tensor, noise: Tensor) -> Tensor:
+    """Simulated states (B, T, 18) from the start that fits the measured window best, given the parameters.
+
+    The start enters linearly, x = free(start) + forced(inputs), so that it is found by least squares of the whole
+    window (weights 1 / noise) where the first measured sample alone would bring its noise into every later one.  At
+    that optimum the misfit does not change with the start, so gradients need not go through the least squares.
+    """
+    discrete = simulator.discretise(simulator.element_values(log_ratio))
+    with torch.no_grad():
+        batch, samples, size = measured.shape
+        forced = simulator.states(discrete, inputs, measured.new_zeros(batch, size))
+        eye = torch.eye(size, dtype=measured.dtype, device=measured.device).expand(batch, size, size)
+        free = simulator.free_response(replace(discrete, C=eye), samples)  # (B, T, 18, 18)
+        weighted = (free / noise[:, None]).flatten(1, 2) * noise  # columns in units of the noise of their start
+        residual = ((measured - forced) / noise).flatten(1)
+        normal = weighted.mT @ weighted
+        start = torch.linalg.solve(normal, weighted.mT @ residual[..., None])[..., 0] * noise
+    return simulator.states(discrete, inputs, start)
 
 
 def train_task(data: TrainData) -> Task:
