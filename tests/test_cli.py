@@ -292,3 +292,28 @@ def test_interrupting_a_replay_keeps_what_was_stored(tmp_path: Path) -> None:
     with sqlite3.connect(store) as connection:
         assert connection.execute("SELECT count(*) FROM windows").fetchone()[0] >= 1
     connection.close()
+
+
+def test_train_takes_several_recordings_and_tells_how_far_it_is(
+    healthy: Path, csv_system: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: dict[str, Any] = {}
+
+    def train(system: System, out: Path, *, recordings: Any, settings: Any, progress: Any) -> None:
+        progress("simulate", 1, 2, float("nan"))
+        asked.update(windows=recordings.shape, records=settings.records, out=out)
+
+    monkeypatch.setattr("model.training.train", train)
+    arguments = ["train", "--system", str(csv_system), "--out", str(tmp_path), "--records", "5"]
+    assert main([*arguments, "--recordings", str(healthy), str(healthy)]) == 0
+    assert asked == {"windows": (2 * 79, 100, 28), "records": 5, "out": tmp_path}
+    captured = capsys.readouterr()
+    assert captured.err == "simulate: 1 of 2\n"
+    assert json.loads(captured.out)["out"] == str(tmp_path)
+
+
+def test_system_tells_what_the_sensors_identify(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["system", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["parameters"]) == 24 and all(p["identifiable"] for p in told["parameters"])
+    assert told["modes"][0]["frequency"] == pytest.approx(0.81, abs=0.01)

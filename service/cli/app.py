@@ -121,9 +121,12 @@ def serve(
 
 @app.command()
 def train(
+    more: Annotated[
+        list[Path] | None, typer.Argument(help="Further recordings, after --recordings.", metavar="[FILE...]")
+    ] = None,
     system: System = None,
     recordings: Annotated[
-        list[Path] | None, typer.Option("--recordings", help="Train on from these, without labels; repeatable.")
+        list[Path] | None, typer.Option("--recordings", metavar="FILE...", help="Train on from these, without labels.")
     ] = None,
     dbc: Dbc = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for the weights.")] = Path("weights"),
@@ -134,7 +137,9 @@ def train(
     """Train the estimator for a system; goes on after an interrupt when called again."""
     from service.cli.train import run
 
-    return run(system, recordings or [], dbc, out, {"seed": seed, "records": records, "steps": steps})
+    return run(
+        system, [*(recordings or []), *(more or [])], dbc, out, {"seed": seed, "records": records, "steps": steps}
+    )
 
 
 @app.command()

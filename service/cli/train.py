@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -69,14 +70,15 @@ class Shown:
             self._bars.stop()
 
     def show(self, stage: str, done: int, total: int, loss: float) -> None:
-        """Called by the training."""
+        """Called by the training; `loss` is NaN in stages that have none."""
+        shown = f", loss {loss:.4g}" if math.isfinite(loss) else ""
         if self._bars is not None:
             task = self._tasks.get(stage)
             if task is None:
                 task = self._tasks[stage] = self._bars.add_task(stage, total=total)
-            self._bars.update(task, completed=done, description=f"{stage} (loss {loss:.4g})")
+            self._bars.update(task, completed=done, description=stage + shown)
             return
         tenth = (stage, 10 * done // max(total, 1))
         if tenth != self._tenth:
             self._tenth = tenth
-            print(f"{stage}: {done} of {total}, loss {loss:.4g}", file=sys.stderr, flush=True)
+            print(f"{stage}: {done} of {total}{shown}", file=sys.stderr, flush=True)
