@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.diagnosis.catalogue.base import Motion, SpringDamper
+from model.diagnosis.catalogue.base import Motion, SpringDamper, Values
 from model.mechanics import ACCELERATION, FORCE
 from model.signals import FloatArray
-from model.simulate.etd import force_gains
+from model.simulate.etd import Site, force_gains
 from model.simulate.nonlinear import Model, Run, band_limited
 from model.simulate.stepping import cubic_chain, drive_positions, drive_vector, exact_steps, hermite_chain, propagate
 
@@ -144,52 +144,73 @@ def _direct(run: Run, acceleration: FloatArray) -> FloatArray:
 
 def _tangent(run: Run, plain: int) -> _Tangent:
     """Derivatives of all laws by finite differences on the fine grid; `plain` changes come before the laws' own."""
-    model, m = run.model, run.model.mechanics
-    sites = model.sites()
-    L, E = len(sites), len(m.stiffness)
-    nodes = len(run.solution.force)
-    M = sum(site.law.memory for site in sites)
+    model, E = run.model, len(run.model.mechanics.stiffness)
+    sites, nodes = model.sites(), len(run.solution.force)
+    L, M = len(sites), sum(site.law.memory for site in sites)
     V = plain + sum(len(placement.p) for placement in model.placements)
     whole, rest = np.zeros((nodes, L + M, 2 * L + M)), np.zeros((nodes, L + M, V))
-    time = run.start + np.arange(nodes) * (model.dt / model.parts)
-    at, column, i = 0, plain, 0
-    for placement in model.placements:
-        for _ in placement.weights(E):
-            law, p, element = sites[i].law, placement.p, sites[i].element
-            d, v = run.solution.motion[:, i, 0], run.solution.motion[:, L + i, 0]
-            z = run.solution.memories[i][:, :, 0].T
-            own = [i, *range(L + at, L + at + law.memory)]
-
-            def answer(motion: Motion, p: tuple[float, ...], element: SpringDamper, law=law) -> FloatArray:  # type: ignore[no-untyped-def]
-                force = np.broadcast_to(law.force(motion, p, element), (1, nodes))
-                return np.concatenate([force, law.memory_rate(motion, p, element)]).T if law.memory else force.T
-
-            base = Motion(d, v, time, z)
-            for target, name in ((i, "deflection"), (L + i, "rate")):
-                step = _STEP * max(float(np.abs(getattr(base, name)).max()), 1e-12)
-                up, down = (base._replace(**{name: getattr(base, name) + sign * step}) for sign in (1, -1))
-                whole[:, own, target] = (answer(up, p, element) - answer(down, p, element)) / (2 * step)
-            for j in range(law.memory):
-                step = _STEP * max(float(np.abs(z[j]).max()), 1e-12)
-                shift = np.zeros((law.memory, 1))
-                shift[j] = step
-                up, down = (base._replace(memory=z + sign * shift) for sign in (1, -1))
-                whole[:, own, 2 * L + at + j] = (answer(up, p, element) - answer(down, p, element)) / (2 * step)
-            for j, value in enumerate(p):
-                step = _STEP * (abs(value) or 1.0)
-                up_p, down_p = (tuple(x + sign * step * (q == j) for q, x in enumerate(p)) for sign in (1, -1))
-                rest[:, own, column + j] += (answer(base, up_p, element) - answer(base, down_p, element)) / (2 * step)
-            share = np.abs(model.weights[i]) / np.abs(model.weights[i]).sum()  # a pair's element is its mean
-            for offset, field in ((0, "stiffness"), (E, "damping")):
-                size = getattr(element, field)
-                up_e, down_e = (element._replace(**{field: size * (1 + sign * _STEP)}) for sign in (1, -1))
-                change = (answer(base, p, up_e) - answer(base, p, down_e)) / (2 * _STEP * max(size, 1e-300))
-                values = m.stiffness if field == "stiffness" else m.damping
-                for e in np.flatnonzero(share):
-                    rest[:, own, offset + e] += change * (share[e] * values[e])
-            at, i = at + law.memory, i + 1
-        column += len(placement.p)
+    owners = [number for number, placement in enumerate(model.placements) for _ in placement.weights(E)]
+    columns = plain + np.cumsum([0, *(len(placement.p) for placement in model.placements)])
+    at = 0
+    for i, (site, owner) in enumerate(zip(sites, owners, strict=True)):
+        own = [i, *range(L + at, L + at + site.law.memory)]  # its force and its memory's rates
+        answer = _Answer(run, i, site)
+        whole[:, own, i], whole[:, own, L + i] = answer.by_motion("deflection"), answer.by_motion("rate")
+        for j in range(site.law.memory):
+            whole[:, own, 2 * L + at + j] = answer.by_memory(j)
+        for j in range(len(site.p)):
+            rest[:, own, columns[owner] + j] += answer.by_parameter(j)
+        share = np.abs(model.weights[i]) / np.abs(model.weights[i]).sum()  # a pair's element is its mean
+        for first, field in ((0, "stiffness"), (E, "damping")):
+            rest[:, own, first : first + E] += answer.by_element(field)[:, :, None] * share
+        at += site.law.memory
     return _Tangent(whole, rest)
+
+
+class _Answer:
+    """Force and memory rates of one site along the run, (nodes, 1 + memory), and their derivatives."""
+
+    def __init__(self, run: Run, i: int, site: Site) -> None:
+        L, solution = len(run.model.weights), run.solution
+        self.site, self.nodes = site, len(solution.force)
+        time = run.start + np.arange(self.nodes) * (run.model.dt / run.model.parts)
+        d, v = solution.motion[:, i, 0], solution.motion[:, L + i, 0]
+        self.motion = Motion(d, v, time, solution.memories[i][:, :, 0].T)
+
+    def __call__(self, motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+        law = self.site.law
+        force = np.broadcast_to(law.force(motion, p, element), (1, self.nodes))
+        return np.concatenate([force, law.memory_rate(motion, p, element)]).T if law.memory else force.T
+
+    def by_motion(self, field: str) -> FloatArray:
+        value = getattr(self.motion, field)
+        step = _STEP * max(float(np.abs(value).max()), 1e-12)
+        up, down = (self._at(self.motion._replace(**{field: value + s * step})) for s in (1, -1))
+        return (up - down) / (2 * step)
+
+    def by_memory(self, j: int) -> FloatArray:
+        z = self.motion.memory
+        shift = np.zeros((len(z), 1))
+        shift[j] = _STEP * max(float(np.abs(z[j]).max()), 1e-12)
+        up, down = (self._at(self.motion._replace(memory=z + s * shift)) for s in (1, -1))
+        return (up - down) / (2 * shift[j, 0])
+
+    def by_parameter(self, j: int) -> FloatArray:
+        p = self.site.p
+        step = _STEP * (abs(p[j]) or 1.0)
+        moved = [tuple(x + s * step * (q == j) for q, x in enumerate(p)) for s in (1, -1)]
+        up, down = (self(self.motion, values, self.site.element) for values in moved)
+        return (up - down) / (2 * step)
+
+    def by_element(self, field: str) -> FloatArray:
+        """By the logarithm of the element's stiffness or damping."""
+        value = getattr(self.site.element, field)
+        moved = [self.site.element._replace(**{field: value * (1 + s * _STEP)}) for s in (1, -1)]
+        up, down = (self(self.motion, self.site.p, element) for element in moved)
+        return (up - down) / (2 * _STEP)
+
+    def _at(self, motion: Motion) -> FloatArray:
+        return self(motion, self.site.p, self.site.element)
 
 
 def _memory_start(run: Run, V: int) -> FloatArray:
