@@ -3,8 +3,9 @@
 The record is that of nonlinearbenchmark.org; DIR holds train.csv, test_multisine.csv and arrow.csv with the columns
 time, V1 (drive) and V2 (position).  The tool sees the training file and a linear system file.  The model that it
 reports is then run freely on the two test files by an integrator of its own (Runge-Kutta of order 4, the drive
-interpolated by its band limit); only the two starting values are taken from the first 50 samples, which are not
-scored.  Root mean squares in mV.
+interpolated by its band limit).  Two starting values are taken from the first 50 samples of each file, which are not
+scored, and one constant force from the training file: the record's drive has an offset of some mV that every model
+needs, and that a report may or may not carry as a finding.  Root mean squares in mV.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from model.system import load_system
 from replay.record import load_record
 
 Array = NDArray[np.float64]
+Model = tuple[float, float, float, Callable[[float, float], float]]  # mass, damping, stiffness, force of the laws
 
 SYSTEM = Path(__file__).parent / "systems" / "silverbox.yaml"
 UNSCORED = 50  # samples
 FINER = 8  # steps per sample
+LEVELLED = 3000  # samples of the training file that give the constant force
 TARGETS = {"test_multisine.csv": 0.40, "arrow.csv": 0.57}  # mV
 
 
@@ -53,7 +56,9 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         line: dict[str, Any] = {"file": name, "target_mv": target}
         for key in ("baseline", "augmented"):
             findings = said["findings"] if key == "augmented" else []
-            error = free_run_error(oscillator(said[key]["parameters"], findings), test.values, system.sample_rate)
+            model = oscillator(said[key]["parameters"], findings)
+            offset = constant_force(model, record.values[:LEVELLED], system.sample_rate)
+            error = free_run_error(model, test.values, system.sample_rate, offset)
             line[f"rmse_{key}_mv"] = 1e3 * error
         yield {**line, "met": line["rmse_augmented_mv"] <= target}
 
@@ -65,9 +70,7 @@ def data_file(data: Path, name: str) -> Path:
     return path
 
 
-def oscillator(
-    parameters: list[dict[str, Any]], findings: list[dict[str, Any]]
-) -> tuple[float, float, float, Callable[[float, float], float]]:
+def oscillator(parameters: list[dict[str, Any]], findings: list[dict[str, Any]]) -> Model:
     """Mass, damping, stiffness and the force of the reported laws without memory, from a report's JSON."""
     values = {p["name"].rpartition(".")[2]: float(p["value"]) for p in parameters}
     k, c = values["stiffness"], values["damping"]
@@ -83,9 +86,7 @@ def oscillator(
     return values["mass"], c, k, extra
 
 
-def free_run(
-    model: tuple[float, float, float, Callable[[float, float], float]], drive: Array, rate: float, start: Array
-) -> Array:
+def free_run(model: Model, drive: Array, rate: float, start: Array) -> Array:
     """Position at every sample, from position and velocity at the first; `drive` has FINER * 2 points a sample."""
     mass, c, k, extra = model
     h = 1 / (rate * FINER)
@@ -115,11 +116,9 @@ def free_run(
     return out
 
 
-def free_run_error(
-    model: tuple[float, float, float, Callable[[float, float], float]], values: Array, rate: float
-) -> float:
-    """Root mean square error of the free run beyond the first UNSCORED samples, V."""
-    drive, measured = values[:, 0], values[:, 1]
+def _free_error(model: Model, values: Array, rate: float, offset: float) -> Array:
+    """Simulated less measured position, starting values fitted to the first UNSCORED samples, V."""
+    drive, measured = values[:, 0] + offset, values[:, 1]
     fine = signal.resample(np.concatenate([drive, drive[::-1]]), 4 * FINER * len(drive))[: 2 * FINER * len(drive)]
     head = fine[: 2 * FINER * UNSCORED]
 
@@ -128,5 +127,18 @@ def free_run_error(
 
     slope = (measured[1] - measured[0]) * rate
     start = optimize.least_squares(early, [measured[0], slope], x_scale=[0.1, 40.0], diff_step=1e-4).x
-    error = free_run(model, fine, rate, start) - measured
-    return float(np.sqrt(np.mean(error[UNSCORED:] ** 2)))
+    error: Array = free_run(model, fine, rate, start) - measured
+    return error
+
+
+def constant_force(model: Model, values: Array, rate: float) -> float:
+    """Force that removes the mean error of the free run, V."""
+    offset = 0.0
+    for _ in range(2):
+        offset -= model[2] * float(np.mean(_free_error(model, values, rate, offset)[UNSCORED:]))
+    return offset
+
+
+def free_run_error(model: Model, values: Array, rate: float, offset: float = 0.0) -> float:
+    """Root mean square error of the free run beyond the first UNSCORED samples, V."""
+    return float(np.sqrt(np.mean(_free_error(model, values, rate, offset)[UNSCORED:] ** 2)))
