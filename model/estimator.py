@@ -73,7 +73,7 @@ class EstimatorNet(nn.Module):
         P = self.architecture.parameters
         weight = torch.exp(self.log_weight)
         rows = torch.cat([regressors, target.unsqueeze(2)], dim=2) * weight[:, None]
-        taken = torch.einsum("r,rij->ij", weight.square(), self.noise) * torch.sigmoid(self.compensation)
+        taken = (weight.square() @ self.noise.flatten(1)).reshape(P + 1, P + 1) * torch.sigmoid(self.compensation)
         products = rows.mT @ rows
         raw = products[:, :P, :P]
         diagonal = torch.diagonal(raw, dim1=1, dim2=2)

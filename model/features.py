@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
-from model.signals import FloatArray, IntArray
+from model.signals import BoolArray, FloatArray, IntArray
 from model.simulate.linear import LinearSimulator
 from model.system import System
 
@@ -60,6 +60,7 @@ class ForceBalance:
         self.fixed_k, self.fixed_c, self.fixed_m = (  # 1 where a value is not estimated
             1.0 - one @ of for of in (s.k_of, s.c_of, s.m_of)
         )
+        self._inverses: dict[bytes, FloatArray] = {}
         self.use = mechanics.sensor_kind == self.kind
         self.noise = np.array([c.noise for c in system.channels])[len(system.inputs) :]
 
@@ -90,17 +91,22 @@ class ForceBalance:
 
     def _motion(self, sensors: FloatArray) -> Tensor:
         """Motion of the degrees of freedom, weighted least squares over the sensors that are present."""
-        S = self.system.mechanics.S
         present = ~np.isnan(sensors).any(axis=1) & self.use
-        weight = np.where(self.noise > 0, 1 / np.maximum(self.noise, 1e-300), 1.0)
-        out = np.zeros((len(sensors), sensors.shape[1], S.shape[1]))
+        out = np.zeros((len(sensors), sensors.shape[1], self.system.mechanics.n))
         patterns, which = np.unique(present, axis=0, return_inverse=True)
         for i, pattern in enumerate(patterns):
-            chosen = np.flatnonzero(pattern)
-            inverse = np.linalg.pinv(S[chosen] * weight[chosen, None]) * weight[chosen]
             at = which.reshape(-1) == i
-            out[at] = sensors[at][:, :, chosen] @ inverse.T
+            out[at] = sensors[at][:, :, pattern] @ self._inverse(pattern).T
         return torch.as_tensor(out)
+
+    def _inverse(self, present: BoolArray) -> FloatArray:
+        """Weighted pseudo-inverse of the sensors present, (n, S')."""
+        key = present.tobytes()
+        if key not in self._inverses:
+            weight = np.where(self.noise > 0, 1 / np.maximum(self.noise, 1e-300), 1.0)[present]
+            S = self.system.mechanics.S[present]
+            self._inverses[key] = np.linalg.pinv(S * weight[:, None]) * weight
+        return self._inverses[key]
 
 
 def motion_kind(system: System) -> int | None:

@@ -186,9 +186,7 @@ class Refiner:
             freedom=freedom.numpy(),
             error=wrong,
             rms=rms,
-            states=(
-                self.model.states(x, x0, data) if states else data.w[:, :0, :1].expand(-1, -1, x0.shape[1])
-            ).numpy(),
+            states=path.numpy(),
         )
 
 

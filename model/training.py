@@ -112,8 +112,9 @@ def _simulated_rows(features: ForceBalance, settings: TrainingSettings, report: 
     rng = np.random.default_rng([settings.seed, 0])
     noise = np.array([channel.noise for channel in system.channels])
     clean, truth = [], []
-    count, per = settings.windows_per_record, 100
-    for done in range(0, settings.records, per):
+    count = settings.windows_per_record
+    for done in range(0, settings.records, 100):
+        per = min(100, settings.records - done)
         log_ratio = draw_log_ratios(system, per, settings.spread, rng)
         runs = simulate_runs(
             system, log_ratio, count * system.window, rng, speed=settings.speed, roughness=settings.roughness

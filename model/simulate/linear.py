@@ -251,15 +251,18 @@ def knots(system: System, windows: FloatArray) -> FloatArray:
     values, slopes = knot_columns(system)
     out = np.empty((*windows.shape[:2], 2 * len(values)))
     derived = [i for i, column in enumerate(slopes) if column is None]
+    alike: dict[tuple[float, float], list[int]] = {}  # supports to fuse, by the noises of their two signals
     for i, (value, slope) in enumerate(zip(values, slopes, strict=True)):
         out[:, :, 2 * i] = windows[:, :, value]
         if slope is not None:
             out[:, :, 2 * i + 1] = windows[:, :, slope]
             noise = system.inputs[value].noise, system.inputs[slope].noise
             if min(noise) > 0:
-                out[:, :, 2 * i], out[:, :, 2 * i + 1] = fuse(
-                    out[:, :, 2 * i], out[:, :, 2 * i + 1], 1 / system.sample_rate, noise
-                )
+                alike.setdefault(noise, []).append(2 * i)
+    for noise, at in alike.items():
+        d, v = (np.moveaxis(out[:, :, [i + part for i in at]], 1, 2) for part in (0, 1))
+        d, v = fuse(d, v, 1 / system.sample_rate, noise)
+        out[:, :, at], out[:, :, [i + 1 for i in at]] = np.moveaxis(d, 2, 1), np.moveaxis(v, 2, 1)
     if derived:
         samples = out[:, :, [2 * i for i in derived]]
         time = np.arange(windows.shape[1]) / system.sample_rate
