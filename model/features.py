@@ -105,7 +105,7 @@ class ForceBalance:
         if key not in self._inverses:
             weight = np.where(self.noise > 0, 1 / np.maximum(self.noise, 1e-300), 1.0)[present]
             S = self.system.mechanics.S[present]
-            self._inverses[key] = np.linalg.pinv(S * weight[:, None]) * weight
+            self._inverses[key] = np.asarray(np.linalg.pinv(S * weight[:, None]) * weight, dtype=np.float64)
         return self._inverses[key]
 
 
