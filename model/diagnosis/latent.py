@@ -28,6 +28,9 @@ from model.signals import FloatArray
 ComplexArray = NDArray[np.complex128]
 
 _INTERVALS = (10, 8)  # of the splines over deflection and rate
+# Least weights of roughness and size over 1 / force^2: a surface that bends by more than thrice the force's rms from
+# one knot to the next is the model's error elsewhere, not a force
+_LEAST = (0.1, 0.1, 1e-3)
 _MARGIN = 1.02  # range of the surface over the largest motion seen
 
 
@@ -233,12 +236,14 @@ def estimate_force(
     the whole new one, so that estimate and refit can take turns.  `noise` is s; estimated if left out.
     """
     basis, _ = np.linalg.qr(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
-    answers = respond(surface.forces(*motion) @ surface.free)
+    forces = surface.forces(*motion) @ surface.free
+    power = float(np.sum(forces**2)) / len(forces)
+    answers = respond(forces)
     answers = answers - basis @ (basis.T @ answers)
     target = residual - basis @ (basis.T @ residual)
     if current is not None:
         target = target + answers @ (surface.free.T @ current.coefficients)
-    problem = _Evidence(answers.T @ answers, answers.T @ target, float(target @ target), len(target), surface)
+    problem = _Evidence(answers.T @ answers, answers.T @ target, float(target @ target), len(target), surface, power)
     s = noise or problem.noise()
     weights = problem.best(s)
     mean, covariance = problem.averaged(weights, s)
@@ -255,12 +260,26 @@ def estimate_force(
 class _Evidence:
     """Evidence and posterior from the normal equations."""
 
-    def __init__(self, gram: FloatArray, product: FloatArray, power: float, count: int, surface: Surface) -> None:
+    def __init__(
+        self,
+        gram: FloatArray,
+        product: FloatArray,
+        power: float,
+        count: int,
+        surface: Surface,
+        force_power: float,
+    ) -> None:
         self.gram, self.product, self.power, self.count = gram, product, power, count
         self.along_d, self.along_v = surface.roughness
-        # Typical size of a coefficient, N: it scales the search for the weights
-        step = product / max(np.trace(gram) / len(gram), 1e-300)
-        self.size = max(float(np.sqrt(np.mean(step**2))), 1e-12)
+        # Size of the force, N: what is explained over what a force of 1 N rms would show
+        gain = float(np.trace(gram)) / max(force_power, 1e-300)
+        self.size = max(float(np.sqrt(self._explained()[0] / max(gain, 1e-300))), 1e-12)
+
+    def _explained(self) -> tuple[float, int]:
+        """Power that the unpenalised surface explains, and with how many coefficients."""
+        values, vectors = np.linalg.eigh(self.gram)
+        good = values > 1e-9 * values[-1]
+        return float(np.sum((vectors[:, good].T @ self.product) ** 2 / values[good])), int(good.sum())
 
     def precision(self, weights: tuple[float, float, float]) -> FloatArray:
         rough_d, rough_v, plain = weights
@@ -268,10 +287,8 @@ class _Evidence:
 
     def noise(self) -> float:
         """s from what even the unpenalised surface leaves over, never below 1."""
-        values, vectors = np.linalg.eigh(self.gram)
-        good = values > 1e-9 * values[-1]
-        explained = np.sum((vectors[:, good].T @ self.product) ** 2 / values[good])
-        return float(np.sqrt(max(1.0, (self.power - explained) / max(1, self.count - good.sum()))))
+        explained, count = self._explained()
+        return float(np.sqrt(max(1.0, (self.power - explained) / max(1, self.count - count))))
 
     def log_evidence(self, weights: tuple[float, float, float], s: float) -> float:
         """Log Bayes factor against no force."""
@@ -284,13 +301,14 @@ class _Evidence:
     def best(self, s: float) -> tuple[float, float, float]:
         """Weights of most evidence."""
         unit = 1 / self.size**2
+        least = np.log(_LEAST)
 
         def weights(x: FloatArray) -> tuple[float, float, float]:
-            a, b, c = unit * np.exp(np.clip(x, -18, 18))
+            a, b, c = unit * np.exp(np.clip(x, least, 18))
             return float(a), float(b), float(c)
 
         def cost(x: FloatArray) -> float:
-            return -self.log_evidence(weights(x), s) + 1e-3 * float(np.sum(np.maximum(np.abs(x) - 16, 0) ** 2))
+            return -self.log_evidence(weights(x), s) + 1e-3 * float(np.sum((x - np.clip(x, least, 18)) ** 2))
 
         starts = [np.array(x, dtype=float) for x in ((0, 0, -6), (6, 6, -6), (0, 8, -6), (8, 0, -6))]
         first = min(starts, key=cost)
