@@ -54,7 +54,7 @@ def detection_panel(axes: Axes, scores: list[Score], false_alarm_rate: float) ->
     """Found and placed, against the oracle's signal-to-noise ratio."""
     single = [s for s in scores if s.snr and s.truth != "consistent" and s.kind != "two"]
     snr = np.array([s.snr for s in single])
-    hit = np.array([s.detected and bool(s.located) for s in single], float)
+    hit = np.array([s.found for s in single], float)
     edges = np.geomspace(max(snr.min(), 0.5), snr.max() * 1.01, 9)
     shares = [(np.sqrt(a * b), hit[(snr >= a) & (snr < b)]) for a, b in itertools.pairwise(edges)]
     jitter = 0.03 * np.random.default_rng(0).normal(size=hit.size)

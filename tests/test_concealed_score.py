@@ -63,7 +63,8 @@ def test_a_right_place_with_a_wrong_name_is_located_and_not_named() -> None:
 
 def test_one_finding_too_many_or_too_few_is_not_located() -> None:
     other = ("primary_11l", "cubic_stiffness", [("k3", 1.0, 1.0)])
-    assert not score(truth("missing_physics", FRICTION), report("missing_physics", SAID, other), LAWS).located
+    more = score(truth("missing_physics", FRICTION), report("missing_physics", SAID, other), LAWS)
+    assert not more.located and more.found
     two = truth("missing_physics", FRICTION, ("primary_11l", "cubic_stiffness", [1.0]))
     assert not score(two, report("missing_physics", SAID), LAWS).located
     assert score(two, report("missing_physics", SAID, other), LAWS).located
