@@ -14,6 +14,7 @@ from scipy import stats
 from model.diagnosis.catalogue import CLOCK_LEAD, BodyLaw, Law
 from model.diagnosis.forward import structure_of
 from model.diagnosis.screen import Channel, Hit, Projector
+from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.terms import Term
 from model.mechanics import ACCELERATION, VELOCITY
 from model.signals import FloatArray
@@ -65,7 +66,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
     kinds = bare.sensor_kind
     frequencies, ratios = _mode_grid(1 / grid.step)
     w0 = 2 * np.pi * frequencies[:, None]
-    h = 1 / (w0**2 - omega**2 + 2j * ratios[:, None] * w0 * omega)  # (trials, F)
+    h = np.reciprocal(w0**2 - omega**2 + 2j * ratios[:, None] * w0 * omega)  # (trials, F)
     for variant in law.variants(system.mechanics, index):
         extended = law.modify(system.mechanics, index, (10.0, 0.02, 1.0), variant)
         shape_e = extended.H[: fit.forward.elements, -1]
@@ -73,7 +74,8 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
         if not np.any(shape_e) and not np.any(extended.F[-1]):
             continue
         g = -(element_force @ shape_e) / extended.mass[-1]
-        kinematic = np.where(kinds == ACCELERATION, -(omega[:, None] ** 2), np.where(kinds == VELOCITY, 1j * omega[:, None], 1.0))
+        jw = 1j * omega[:, None]
+        kinematic = np.where(kinds == ACCELERATION, jw**2, np.where(kinds == VELOCITY, jw, 1.0))
         direct = (kinematic * shape_s * fit.forward.sensor_factor[band])[:, :, None]
         answer = (projector.factor @ direct)[:, :, 0]
         impedance = plant.impedance[band, : fit.forward.elements] * shape_e

@@ -20,6 +20,7 @@ import numpy as np
 from scipy import stats
 
 from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.forward import BOTH
 from model.diagnosis.screen import Hit, Screening
 from model.diagnosis.terms import Term
 from model.diagnosis.unknown import SMALL, UNKNOWN
@@ -141,7 +142,8 @@ def start_of(base: Fit, hit: Hit) -> Point:
 def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
     own = replace(problem, smoothed=None)
     try:
-        fit = own.fit(start, iterations=iterations)
+        with np.errstate(all="ignore"):  # a candidate that diverges is judged by its chi-square
+            fit = own.fit(start, iterations=iterations)
     except (np.linalg.LinAlgError, FloatingPointError, ValueError):
         return None
     if not np.isfinite(fit.chi_square):
@@ -184,6 +186,8 @@ def cost(fit: Fit, count: int) -> float:
 
 
 def _prior_cost(hit: Hit) -> float:
+    if hit.term.variant == BOTH:
+        return _UNNAMED_COST
     if hit.family != "unnamed":
         return 0.0
     return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))

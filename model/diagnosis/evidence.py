@@ -13,6 +13,7 @@ from model.diagnosis.heldout import FreeRun
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.screen import Projector, element_motion
 from model.diagnosis.terms import Term, is_waveform
+from model.diagnosis.unknown import StaticLaw
 from model.signals import FloatArray
 
 if TYPE_CHECKING:
@@ -22,8 +23,10 @@ _MOST = 4000  # samples of a scatter
 _BINS = 41
 
 
-def evidence_arrays(course: Course, before: FreeRun, after: FreeRun, floor: FloatArray) -> dict[str, NDArray[Any]]:
-    """Everything that a picture may need."""
+def evidence_arrays(
+    course: Course, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
+) -> dict[str, NDArray[Any]]:
+    """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
     rate = course.signals.sample_rate
     start = course.held.split + course.prepared.first_sample
     arrays: dict[str, NDArray[Any]] = {
@@ -36,10 +39,10 @@ def evidence_arrays(course: Course, before: FreeRun, after: FreeRun, floor: Floa
     scores = course.first.localization()
     arrays["localization.names"] = np.array(list(scores), dtype=str)
     arrays["localization.score"] = np.array(list(scores.values()))
-    offset = len(course.input_faults)
-    for index, term in enumerate(course.fit.point.terms):
-        if isinstance(term.law, ElementLaw):
-            arrays.update(_of_element(course, term, f"finding.{offset + index}"))
+    for term in course.fit.point.terms:
+        place = (term.location, term.law.name)
+        if isinstance(term.law, ElementLaw) and place in order:
+            arrays.update(_of_element(course, term, f"finding.{order.index(place)}"))
     return arrays
 
 
@@ -59,7 +62,7 @@ def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]
     before, _ = latent_force(course, course.base, port)
     by_rate = abs(_share(law, v)) > abs(_share(law, d)) if np.any(law) else False
     x = v if by_rate else d
-    grid_x = np.linspace(*np.quantile(x, [0.002, 0.998]), _BINS)
+    grid_x = _axis(x, 0.002)
     mean, std, drawn = _binned(x, after + law, law, deviation, grid_x)
     result: dict[str, NDArray[Any]] = {
         f"{key}.time": time[thin],
@@ -72,12 +75,36 @@ def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]
         f"{key}.curve_mean": mean,
         f"{key}.curve_std": std,
     }
-    if term.law.name != "unknown":
+    if isinstance(term.law, StaticLaw):
+        result.update(_surface(course, term, term.law, key, d, v))
+    else:
         result[f"{key}.curve_law"] = drawn
-    if term.law.memory and np.any(law):
+    if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):
         part = slice(len(d) // 2, len(d) // 2 + int(3 / grid.step))
         result[f"{key}.loop_x"], result[f"{key}.loop_y"] = d[part], law[part]
     return result
+
+
+def _surface(
+    course: Course, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
+) -> dict[str, NDArray[Any]]:
+    """The unnamed force over deflection and rate, with the standard deviation that its weights have."""
+    axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
+    mesh_d, mesh_v = np.meshgrid(axis_d, axis_v)
+    values = np.stack([np.broadcast_to(b, mesh_d.shape) for b in law.values(mesh_d, mesh_v)])
+    at = len(course.fit.point.theta)
+    for other in course.fit.point.terms:
+        if other.key == term.key:
+            break
+        at += len(other.parameters)
+    block = course.fit.covariance[at : at + len(values), at : at + len(values)]
+    variance = np.einsum("ivd,ij,jvd->vd", values, block, values)
+    return {
+        f"{key}.map_d": axis_d,
+        f"{key}.map_v": axis_v,
+        f"{key}.map_force": np.einsum("i,ivd->vd", np.array(term.parameters), values),
+        f"{key}.map_std": np.sqrt(np.maximum(variance, 0)),
+    }
 
 
 def latent_force(course: Course, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
@@ -95,6 +122,11 @@ def latent_force(course: Course, fit: Fit, port: FloatArray) -> tuple[FloatArray
     spectrum[projector.grid.band] = estimate
     variance = float(np.mean(seen / (seen + prior) ** 2))
     return projector.grid.inverse(spectrum), float(np.sqrt(variance))
+
+
+def _axis(x: FloatArray, outside: float) -> FloatArray:
+    low, high = np.quantile(x, [outside, 1 - outside])
+    return np.linspace(float(low), float(high), _BINS)
 
 
 def _share(force: FloatArray, signal: FloatArray) -> float:

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 _LEAST = 1.12  # ratio to its peers from which a noise level is a fault
 _SIGMAS = 6.0
+_UPPER = 0.38  # of the sample rate
 
 
 def noise_faults(course: Course) -> list[Finding]:
@@ -25,23 +26,39 @@ def noise_faults(course: Course) -> list[Finding]:
     count = grid.band.stop
     findings = []
     names = list(course.signals.sensor_names)
-    findings += _outliers(names, noise.sensors / declared.sensors, declared.sensors, count)
+    known = declared.sensors[np.isin(course.prepared.signals.sensor_index, course.signals.sensor_index)]
+    inside = noise.sensors / known
+    # what is left of physics is no noise: noise goes on above the band that is compared
+    white = upper_ratio(course, known) > 1 + 0.5 * (inside - 1)
+    findings += _outliers(names, inside, white, count)
     pairs = course.problem.part.pairs
     if len(pairs):
         supports = [course.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
-        findings += _outliers([f"{n}.displacement" for n in supports], d, declared.displacement[pairs], 0.5 * count)
-        findings += _outliers([f"{n}.velocity" for n in supports], v, declared.velocity[pairs], 0.15 * count)
+        findings += _outliers([f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count)
+        findings += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count)
     return findings
 
 
-def _outliers(names: list[str], ratio: np.ndarray, kind: np.ndarray, count: float) -> list[Finding]:
-    """Channels whose ratio of noise to declared noise leaves that of their peers (same declared noise)."""
+def upper_ratio(course: Course, declared: np.ndarray) -> np.ndarray:
+    """Residual over declared noise above the compared band, up to where anti-alias filters cut, per sensor."""
+    grid, plant = course.problem.part.grid, course.fit.forward.plant
+    upper = slice(grid.band.stop, int(_UPPER * grid.samples))
+    if upper.stop - upper.start < 20:
+        return np.full(len(declared), np.inf)
+    variance = course.problem.noise.support_variance(grid.omega[upper])
+    through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
+    power = np.mean(np.abs(course.fit.spectrum[upper]) ** 2, axis=0)
+    return np.sqrt(np.maximum(power - through, 0.0)) / declared
+
+
+def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: float) -> list[Finding]:
+    """Channels whose ratio of noise to declared noise leaves that of the others."""
     findings = []
     for i, name in enumerate(names):
-        peers = [j for j in range(len(names)) if j != i and np.isclose(kind[j], kind[i])]
-        if len(peers) < 2:
+        peers = [j for j in range(len(names)) if j != i]
+        if len(peers) < 2 or not white[i]:
             continue
         usual = float(np.median(ratio[peers]))
         relative = float(ratio[i]) / usual

@@ -295,7 +295,8 @@ class Columns:
         weighted = problem.whitener.factor * grid.weight[:, None, None]
         shown = forward.sensor_factor[band, :, None]
         self.of_shown = weighted
-        self.of_force = np.ascontiguousarray((weighted @ (forward.plant.sensor_of_force[band] * shown)).transpose(2, 0, 1))
+        along = weighted @ (forward.plant.sensor_of_force[band] * shown)
+        self.of_force = np.ascontiguousarray(along.transpose(2, 0, 1))
         size = weighted.shape[0] * weighted.shape[1]
         self.half = size
         self.store = np.zeros((count, 2 * size))
@@ -460,7 +461,9 @@ def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
     """Derivatives of a law's force by deflection and rate along the trajectory, less the preload, (2, N)."""
     term = forces.terms[i]
     grid = forward.part.grid
-    if term.law.memory:
+    law = term.law
+    assert isinstance(law, ElementLaw)
+    if law.memory:
         return np.zeros((2, grid.samples))
     d, v = forces.deflection[:, i], forces.rate[:, i]
     time = grid.start + grid.fine_time
@@ -469,7 +472,7 @@ def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
     for k, (signal, load) in enumerate(((d, term.preload[0]), (v, term.preload[1]))):
         step = 1e-3 * float(np.std(signal)) + 1e-300
         moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
-        up, down = (force_along(term.law, term.parameters, d + a, v + b, time, element) for a, b in moves)
+        up, down = (force_along(law, term.parameters, d + a, v + b, time, element) for a, b in moves)
         slope = ((up - down) / (2 * step)).reshape(-1, OVERSAMPLING).mean(axis=1)
         result[k] = slope - load
     return result
@@ -544,8 +547,9 @@ def _preloaded(problem: Problem, point: Point) -> Point:
                     abs(k - term.preload[0]) / (size[0] + abs(k)),
                     abs(c - term.preload[1]) / (size[1] + abs(c)),
                 )
-                term = replace(term, preload=(k, c))
-            terms.append(term)
+                terms.append(replace(term, preload=(k, c)))
+            else:
+                terms.append(term)
         point = replace(point, terms=tuple(terms))
         if forces.converged and change < 0.2:
             break

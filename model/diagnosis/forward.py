@@ -298,7 +298,7 @@ def _solve(forward: Forward, terms: list[Term], state: FloatArray) -> LawForces:
     def law(d: FloatArray, v: FloatArray) -> FloatArray:
         d, v = np.clip(d, -reach[0], reach[0]), np.clip(v, -reach[1], reach[1])
         columns = [
-            force_along(t.law, t.parameters, d[:, i], v[:, i], time, elements[i])
+            force_along(t.law, t.parameters, d[:, i], v[:, i], time, elements[i])  # type: ignore[arg-type]
             - t.preload[0] * d[:, i]
             - t.preload[1] * v[:, i]
             for i, t in enumerate(terms)
@@ -354,7 +354,10 @@ class _Loop:
         return np.array([self.plant.polynomial_response(one) for one in load])
 
     def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
-        """Periodic spectrum on the oversampled axis' bins (4N / 2 + 1, m) and polynomial (DEGREE + 1, m): a line that joins the ends, and the mean."""
+        """Periodic spectrum on the oversampled axis' bins, (4N / 2 + 1, m), and polynomial, (DEGREE + 1, m).
+
+        The polynomial is the line that joins the ends, and the mean.
+        """
         line = np.zeros((DEGREE + 1, force.shape[1]))
         line[1] = force[-1] - force[0]
         rest = force - self.powers[:, 1:2] * line[1]

@@ -43,11 +43,12 @@ def narrate(course: Course, record: Recorded) -> Report:
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     floor = course.held.noise_rms(course.fit, course.problem.noise)
-    floor_figures = floor / np.where(size > 0, size, 1.0)
+    floor_figures = realised_floor(floor / np.where(size > 0, size, 1.0), after)
     findings = [_input_finding(f) for f in course.input_faults]
     findings += [_stuck_finding(course, name, at) for name, at in course.prepared.stuck]
     findings += noise_faults(course)
     findings += _physics(course, before, after)
+    findings.sort(key=lambda f: f.delta_bic)
     advice = [*course.prepared.notes, *course.notes, *_undecided(course)]
     verdict = _verdict(findings)
     if after.nrmse > _STRANGE and verdict != "sensor_fault":
@@ -76,7 +77,7 @@ def narrate(course: Course, record: Recorded) -> Report:
         explained=explained,
         summary=_summary(verdict, findings, explained),
         advice=tuple(advice),
-        evidence=evidence_arrays(course, before, after, floor),
+        evidence=evidence_arrays(course, before, after, floor, [(f.location, f.effect) for f in findings]),
     )
 
 
@@ -103,6 +104,16 @@ def _explained(before: FreeRun, after: FreeRun, floor: FloatArray) -> float | No
     if excess <= 0:
         return None
     return float(np.clip(1 - left / excess, -1.0, 1.0))
+
+
+def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
+    """Noise floor of each sensor on the held-out samples themselves.
+
+    The estimated noise would give `expected` on average; these samples had their own.  Where the free run errs by
+    no more than that within sampling error, its error is noise, and is the floor.
+    """
+    spread = 4 * np.sqrt(1 / (2 * len(after.measured)))
+    return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
 
 
 def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:

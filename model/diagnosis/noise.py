@@ -7,6 +7,7 @@ median over frequency blocks, so that the misfit of a missing law does not pass 
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,7 +59,7 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Nois
         precision = factor.conj().transpose(0, 2, 1) @ factor
         alone = np.real(np.einsum("fss->fs", precision))  # 1 / variance given the other sensors
         surprise = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
-        blocks = np.array([surprise[a:b].mean(axis=0) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        blocks = np.array([surprise[a:b].mean(axis=0) for a, b in pairwise(edges)])
         level = _robust(blocks, np.diff(edges))
         own = np.median(1 / alone / noise.sensors**2, axis=0)  # variance given the others over the own variance
         ratio = np.maximum(1 + (level - 1) * own, 0.05)

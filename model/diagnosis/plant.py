@@ -136,7 +136,8 @@ class Plant:
         """Sensor signal per degree of freedom, shape (F, S, n); moving supports left out."""
         s, w = self.structure, self.grid.omega[:, None, None]
         kind = s.sensor_kind[:, None]
-        result = np.where(kind == ACCELERATION, -(w**2), np.where(kind == VELOCITY, 1j * w, 1.0)) * s.S
+        jw: ComplexArray = 1j * w
+        result: ComplexArray = np.where(kind == ACCELERATION, jw**2, np.where(kind == VELOCITY, jw, 1.0)) * s.S
         if np.any(s.L):
             result = result + self._of_deflection @ s.H
         return result

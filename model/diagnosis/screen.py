@@ -247,7 +247,7 @@ def _best_shape(
     i = int(np.argmax(scores))
     if scores[i] <= 0:
         return absent, len(trials)
-    found = law.clip(law.scaled(trials[i], float(amplitudes[i])))
+    found = law.clip(list(law.scaled(list(trials[i]), float(amplitudes[i]))))
     term = Term(law, location, tuple(float(value) for value in found), scales=scales)
     return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1))), len(trials)
 
@@ -297,7 +297,7 @@ def _admissible(law: ElementLaw, trial: FloatArray, amplitude: float) -> bool:
     """Whether the amplitude found leaves the law's strength within its bounds."""
     if law.strength is None:
         return amplitude > 0
-    value = float(law.scaled(trial, amplitude)[law.strength])
+    value = float(law.scaled(list(trial), amplitude)[law.strength])
     spec = law.parameters[law.strength]
     slack = 0.0 if spec.low == 0 and law.absent[law.strength] == 0 else abs(spec.high - spec.low)
     return spec.low - 0.5 * min(slack, 1.0) <= value <= spec.high + 0.5 * min(slack, 1.0)

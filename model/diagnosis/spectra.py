@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from model.signals import FloatArray
 
-ComplexArray = NDArray[np.complex128]
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
 
 DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
 OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
@@ -37,7 +38,7 @@ class Grid:
     @cached_property
     def omega(self) -> FloatArray:
         """Angular frequencies of the bins, rad/s, shape (F,)."""
-        return 2 * np.pi * np.fft.rfftfreq(self.samples, self.step)
+        return np.asarray(2 * np.pi * np.fft.rfftfreq(self.samples, self.step), dtype=np.float64)
 
     @cached_property
     def band(self) -> slice:
@@ -54,12 +55,12 @@ class Grid:
     @cached_property
     def time(self) -> FloatArray:
         """Seconds since the start of this part, shape (N,)."""
-        return np.arange(self.samples) * self.step
+        return np.arange(self.samples, dtype=np.float64) * self.step
 
     @cached_property
     def fine_time(self) -> FloatArray:
         """The oversampled time axis, shape (OVERSAMPLING N,)."""
-        return np.arange(OVERSAMPLING * self.samples) * (self.step / OVERSAMPLING)
+        return np.arange(OVERSAMPLING * self.samples, dtype=np.float64) * (self.step / OVERSAMPLING)
 
     @property
     def length(self) -> float:

@@ -1,0 +1,96 @@
+"""Whole diagnoses of a quarter car that another integrator simulated."""
+
+import json
+
+import numpy as np
+import pytest
+from diagnosis_cases import Recorded, quarter_car, simulate
+
+from model.diagnosis.channels import DiagnosisError
+from model.diagnosis.diagnose import Options, diagnose
+
+
+def _diagnose(record: Recorded, **options):
+    return diagnose(quarter_car(), record, Options(**options))
+
+
+def test_clean_recording_is_consistent_and_errs_by_its_noise():
+    report = _diagnose(simulate(seed=20))
+    assert report.verdict == "consistent"
+    assert report.findings == ()
+    assert report.baseline_validation.nrmse == pytest.approx(report.noise_floor.nrmse, rel=0.1)
+
+
+def test_dry_friction_is_found_named_and_sized():
+    report = _diagnose(simulate(lambda d, v: 300 * np.tanh(v / 0.002), seed=21))
+    first = report.findings[0]
+    assert report.verdict == "missing_physics"
+    assert (first.location, first.effect) == ("secondary", "coulomb_friction")
+    force = first.parameters[0]
+    assert abs(force.value - 300) < max(4 * force.std, 6.0)
+    assert report.augmented_validation.nrmse < report.baseline_validation.nrmse
+    assert report.explained is not None and report.explained > 0.9
+    assert "dry friction" in first.sentence
+
+
+def test_cubic_spring_is_not_taken_for_a_bump_stop():
+    report = _diagnose(simulate(lambda d, v: 4e9 * d**3, seed=22))
+    assert [(f.location, f.effect) for f in report.findings] == [("secondary", "cubic_stiffness")]
+    assert report.findings[0].runner_up is not None
+
+
+def test_wrong_gain_of_one_sensor_is_no_physics():
+    record = simulate(seed=23)
+    record.values[:, 4] *= 0.95
+    report = _diagnose(record)
+    assert report.verdict == "sensor_fault"
+    assert [(f.location, f.effect) for f in report.findings] == [("bogie_a", "sensor_gain")]
+    assert report.findings[0].parameters[0].value == pytest.approx(0.95, abs=0.005)
+
+
+def test_stuck_sensor_is_named_and_left_out():
+    record = simulate(seed=24)
+    record.values[1200:, 3] = record.values[1200, 3]
+    report = _diagnose(record)
+    assert report.verdict == "sensor_fault"
+    assert [(f.location, f.effect) for f in report.findings] == [("car_b", "sensor_stuck")]
+    assert "car_b" not in report.baseline_validation.per_sensor
+
+
+def test_noisy_sensor_is_told_from_physics():
+    record = simulate(seed=25)
+    rng = np.random.default_rng(0)
+    record.values[:, 2] += 0.01 * rng.standard_normal(len(record.values))
+    report = _diagnose(record)
+    assert [(f.location, f.effect) for f in report.findings] == [("car_a", "sensor_noise")]
+
+
+def test_recording_of_another_system_is_not_explained_by_physics():
+    record = simulate(seed=26)
+    rng = np.random.default_rng(1)
+    record.values[:, 2:] = rng.standard_normal((len(record.values), 4)) * record.values[:, 2:].std(axis=0)
+    report = _diagnose(record)
+    assert report.verdict == "unknown_physics"
+    assert report.findings == ()
+    assert "system file" in report.advice[0]
+
+
+def test_missing_input_is_refused_by_name():
+    record = simulate(seed=27, seconds=10)
+    record.values[:, :2] = np.nan
+    with pytest.raises(DiagnosisError, match="wheel"):
+        _diagnose(record)
+
+
+def test_short_recording_is_refused_with_what_is_needed():
+    record = simulate(seed=28, seconds=10)
+    with pytest.raises(DiagnosisError, match="200"):
+        _diagnose(Recorded(record.values[:90]))
+
+
+def test_report_is_json_with_the_contracts_keys():
+    report = _diagnose(simulate(seed=29, seconds=12))
+    data = json.loads(json.dumps(report.to_dict(), allow_nan=False))
+    keys = {"system", "recording", "verdict", "baseline", "findings", "augmented", "noise_floor", "localization"}
+    assert keys <= set(data)
+    assert set(data["baseline"]["validation"]) == {"nrmse", "per_sensor"}
