@@ -3,7 +3,7 @@
 Recordings are drawn from sealed seeds (`benchmarks.generator`), written as files, diagnosed through the public door
 and judged by `benchmarks.concealed_score`.  Everything is kept in a folder and taken up again where it stopped: the
 recordings with their labels, one JSON per diagnosis.  Sets: `strong` and `effects` (every kind, laws strong and down to
-weak), `limit` (laws from weak down to hidden in the noise), `clean` (healthy vehicles and plain parameter changes).
+weak), `limit` (the same from weak down to hidden in the noise), `clean` (healthy vehicles and plain parameter changes).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from model.system import MANCHESTER, System, load_system
 from replay.record import load_record
 
 NAMED = tuple(law.name for law in CATALOGUE)
+WEAK_KINDS = [*LAWS, "flexible_mode", "external_force", "mass_change", "sensor_gain", "sensor_lag", "sensor_bias"]
 QUIET_KINDS = ["clean", "clean", "clean", "clean", "k_scale", "c_scale"]
 
 ABLATIONS: dict[str, Options] = {
@@ -59,7 +60,7 @@ def run(
     sets = {
         "strong": _recordings(out / "strong", count, seed, None, 0.0, seconds),
         "effects": _recordings(out / "effects", count, seed + 1, None, 1.0, seconds),
-        "limit": _recordings(out / "limit", count, seed + 2, [*LAWS], 2.0, seconds),
+        "limit": _recordings(out / "limit", count, seed + 2, WEAK_KINDS, 2.0, seconds),
         "clean": _recordings(out / "clean", clean, seed + 3, QUIET_KINDS, 1.0, seconds),
     }
     everything: list[Score] = []

@@ -68,7 +68,8 @@ def detection_panel(axes: Axes, scores: list[Score], false_alarm_rate: float) ->
     axes.set_xlabel("signal-to-noise ratio of the oracle that knows place and law")
     axes.set_ylabel("found and placed")
     axes.set_title("how weak may an effect be?")
-    axes.legend(fontsize=8, loc="center right")
+    axes.set_ylim(-0.12, 1.12)
+    axes.legend(fontsize=8, loc="lower right")
 
 
 def main() -> None:

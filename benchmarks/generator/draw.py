@@ -100,16 +100,16 @@ def _add_law(case: Case, rng: np.random.Generator, element: str, law: str, weak:
     case.effects.append((element, law, parameters))
 
 
-def _add_fault(case: Case, rng: np.random.Generator, kind: str, vehicle: Vehicle) -> None:
+def _add_fault(case: Case, rng: np.random.Generator, kind: str, vehicle: Vehicle, small: float) -> None:
     channels = [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)
     noise = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
     on_sensor = rng.random() < 0.75
     first = 2 * len(vehicle.inputs)
     index = int(rng.integers(first, len(channels)) if on_sensor else rng.integers(0, first))
     value = {
-        "sensor_gain": lambda: 1 + rng.choice([-1, 1]) * _log_uniform(rng, 0.01, 0.2),
-        "sensor_lag": lambda: _log_uniform(rng, 5e-4, 0.012),
-        "sensor_bias": lambda: rng.choice([-1, 1]) * noise[index] * _log_uniform(rng, 0.3, 30),
+        "sensor_gain": lambda: 1 + rng.choice([-1, 1]) * small * _log_uniform(rng, 0.01, 0.2),
+        "sensor_lag": lambda: small * _log_uniform(rng, 5e-4, 0.012),
+        "sensor_bias": lambda: rng.choice([-1, 1]) * noise[index] * small * _log_uniform(rng, 0.3, 30),
         "sensor_noise": lambda: _log_uniform(rng, 1.5, 10),
         "sensor_stuck": lambda: rng.uniform(5, 45),
     }[kind]()
@@ -119,6 +119,7 @@ def _add_fault(case: Case, rng: np.random.Generator, kind: str, vehicle: Vehicle
 def _conceal(case: Case, rng: np.random.Generator, vehicle: Vehicle, weak: float) -> None:
     """Puts the effect that `case.kind` names into the case."""
     elements, kind = list(vehicle.elements), case.kind
+    small = 0.05 ** max(weak - 1, 0)  # of faults and bodies; laws have ranges of their own
     element = str(rng.choice(elements if rng.random() < 0.6 else elements[8:]))
     if kind in LAWS:
         _add_law(case, rng, element, kind, weak)
@@ -128,15 +129,15 @@ def _conceal(case: Case, rng: np.random.Generator, vehicle: Vehicle, weak: float
         for place, law in zip(places, rng.choice(names, 2, replace=False), strict=True):
             _add_law(case, rng, str(place), str(law), weak * 0.5)
     elif kind == "flexible_mode":
-        case.flex = [rng.uniform(6, 16), rng.uniform(0.01, 0.03), _log_uniform(rng, 0.03, 0.5), 8000.0]
+        case.flex = [rng.uniform(6, 16), rng.uniform(0.01, 0.03), small * _log_uniform(rng, 0.03, 0.5), 8000.0]
     elif kind == "external_force":
         degree = int(rng.choice([0, 0, 0, 1, 2, 3, 6]))
-        case.drive = [_log_uniform(rng, 20, 400), rng.uniform(1.5, 20), float(degree)]
+        case.drive = [small * _log_uniform(rng, 20, 400), rng.uniform(1.5, 20), float(degree)]
     elif kind == "mass_change":
         body = str(rng.choice(vehicle.bodies, p=[0.6, 0.2, 0.2]))
-        case.mass_scale = body, float(1 + rng.choice([-1, 1, 1]) * _log_uniform(rng, 0.01, 0.25))
+        case.mass_scale = body, float(1 + rng.choice([-1, 1, 1]) * small * _log_uniform(rng, 0.01, 0.25))
     elif kind in FAULTS:
-        _add_fault(case, rng, kind, vehicle)
+        _add_fault(case, rng, kind, vehicle, small)
     elif kind == "k_scale":
         case.change = {"k_scale": {element: rng.uniform(0.6, 0.9)}}
         case.stiffness[element] *= case.change["k_scale"][element]
