@@ -154,13 +154,13 @@ def compare(
         if not asked:
             continue
         hit = [r["gain"] > limit for _, r in asked]
-        located = [h and r["location"] in {f["location"] for f in fs} for h, (fs, r) in zip(hit, asked, strict=True)]
-        named = [
-            ok and any(r["location"] == f["location"] and r["effect"] == f["effect"] for f in fs)
-            for ok, (fs, r) in zip(located, asked, strict=True)
-        ]
+        placed = [r["location"] in {f["location"] for f in fs} for fs, r in asked]
+        named = [any((r["location"], r["effect"]) == (f["location"], f["effect"]) for f in fs) for fs, r in asked]
         yield {
-            "pysindy": name, "recordings": len(asked), "detected": rate(hit), "located_one": rate(located),
-            "named_one": rate(named), "gain_threshold": limit, "clean_recordings": len(quiet),
+            "pysindy": name, "recordings": len(asked), "detected": rate(hit),
+            "located_one": rate(h and p for h, p in zip(hit, placed, strict=True)),
+            "named_one": rate(h and n for h, n in zip(hit, named, strict=True)),
+            "located_one_without_threshold": rate(placed), "named_one_without_threshold": rate(named),
+            "false_alarms_without_threshold": rate(gain > 0 for gain in quiet), "gain_threshold": limit, "clean_recordings": len(quiet),
             "median_terms_kept": float(np.median([r["terms"] for _, r in asked])),
         }
