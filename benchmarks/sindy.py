@@ -161,6 +161,7 @@ def compare(
             "located_one": rate(h and p for h, p in zip(hit, placed, strict=True)),
             "named_one": rate(h and n for h, n in zip(hit, named, strict=True)),
             "located_one_without_threshold": rate(placed), "named_one_without_threshold": rate(named),
-            "false_alarms_without_threshold": rate(gain > 0 for gain in quiet), "gain_threshold": limit, "clean_recordings": len(quiet),
+            "false_alarms_without_threshold": rate(gain > 0 for gain in quiet), "gain_threshold": limit,
+            "clean_recordings": len(quiet),
             "median_terms_kept": float(np.median([r["terms"] for _, r in asked])),
         }
