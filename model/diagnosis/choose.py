@@ -19,7 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.catalogue import ElementLaw
+from model.diagnosis.fit import Fit, Point, Problem, advance
 from model.diagnosis.forward import BOTH
 from model.diagnosis.screen import Hit, Screening
 from model.diagnosis.terms import Term
@@ -33,6 +34,7 @@ _UNNAMED_RATIO = 1.3  # and explain this many times as much
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
+_HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST = 3  # that are fitted to the end
 
@@ -109,7 +111,7 @@ def compete(
     trials: list[Trial] = []
     for hit in hits:
         progress(f"fitting {hit.effect} at {hit.location}")
-        trial = _try(problem, base, hit, start_of(base, hit), 3)
+        trial = _try(problem, base, hit, joint_start(problem, base, hit), 3)
         if trial is not None:
             trials.append(trial)
     trials.sort(key=lambda t: -t.evidence)
@@ -139,6 +141,34 @@ def start_of(base: Fit, hit: Hit) -> Point:
     return Point(point.theta, (*point.terms, hit.term), state)
 
 
+def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
+    """The term at the strength that, with everything else moving along, the base's residual asks for.
+
+    The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
+    which have absorbed much of it, the model may be too far away for a first step.
+    """
+    start = start_of(base, hit)
+    law = hit.term.law
+    if not isinstance(law, ElementLaw) or law.strength is None or law.name == UNKNOWN:
+        return start
+    hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
+    faint = replace(start, terms=(*base.point.terms, hint))
+    with np.errstate(all="ignore"):
+        lin = replace(problem, smoothed=None, whitener=problem.whitener).linearise(faint)
+    count = len(hit.term.parameters)
+    first = lin.jacobian.shape[1] - len(faint.state) - count
+    kept = np.ones(lin.jacobian.shape[1], dtype=bool)
+    kept[first : first + count] = np.arange(count) == law.strength
+    columns = lin.jacobian[:, kept]
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = np.zeros(lin.jacobian.shape[1])
+    step[kept] = np.linalg.lstsq(columns / scale, lin.residual, rcond=1e-10)[0] / scale
+    moved = advance(faint, step)
+    if not moved.terms[-1].bounded and np.all(np.isfinite(step)):
+        return moved
+    return start
+
+
 def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
     own = replace(problem, smoothed=None)
     try:
@@ -148,7 +178,8 @@ def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -
         return None
     if not np.isfinite(fit.chi_square):
         return None
-    gain = profile_gain(base.residual, fit.residual, len(problem.sensors))
+    fall = base.chi_square - fit.chi_square
+    gain = min(fall, profile_gain(base.residual, fit.residual, len(problem.sensors)))
     return Trial(hit, fit, gain, gain - cost(fit, len(hit.term.parameters)) - _prior_cost(hit))
 
 

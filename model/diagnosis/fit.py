@@ -263,7 +263,7 @@ class Problem:
         damping, converged, count = 1e-6, False, 0
         for count in range(1, iterations + 1):
             step, sigma = _step(lin.jacobian, lin.residual, point, damping)
-            trial = _advance(point, step)
+            trial = advance(point, step)
             size = float(np.max(np.abs(step[: len(sigma)]) / sigma)) if len(sigma) else 0.0
             self.smooth(lin.spectrum, lin.residual)
             proposal = self.linearise(trial, _start(lin.forces))
@@ -567,7 +567,7 @@ def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float,
     inside = np.all(np.abs(regressors) < reach, axis=1)
     k, c = np.linalg.lstsq(regressors[inside] / sizes, f[inside], rcond=None)[0] / sizes
     element = forward.element_of(term)
-    k = max(k, -0.9 * element.stiffness) if element.stiffness else max(k, 0.0)
+    k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0  # a body that floats stays afloat
     c = max(c, -0.9 * element.damping) if element.damping else max(c, 0.0)
     if not forces.converged:
         k, c = (k + term.preload[0]) / 2, (c + term.preload[1]) / 2
@@ -601,7 +601,7 @@ def _step(
     return step, sigma
 
 
-def _advance(point: Point, step: FloatArray) -> Point:
+def advance(point: Point, step: FloatArray) -> Point:
     P = len(point.theta)
     theta = point.theta + np.clip(step[:P], -1.0, 1.0)
     at, terms = P, []

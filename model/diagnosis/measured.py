@@ -131,7 +131,7 @@ def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
     integrated[1:] = V[1:] / (1j * omega[1:])
     integrated[0] = D[0]
     precision_d, precision_v = 1 / noise.displacement**2, (omega / noise.velocity) ** 2
-    fused: ComplexArray = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
+    fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
     pairs = np.flatnonzero(has_rate & ~signals.integrated)
     redundancy = (integrated - D)[:, pairs]
     force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
@@ -139,7 +139,7 @@ def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
         force_polynomial = detrend_ends(signals.force, None, grid)
     return Part(
         grid=grid,
-        support=fused,
+        support=np.asarray(fused, dtype=complex),
         support_polynomial=polynomial,
         force=grid.forward(signals.force - grid.monomials @ force_polynomial),
         force_polynomial=force_polynomial,

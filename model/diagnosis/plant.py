@@ -137,9 +137,9 @@ class Plant:
         s, w = self.structure, self.grid.omega[:, None, None]
         kind = s.sensor_kind[:, None]
         jw: ComplexArray = 1j * w
-        result: ComplexArray = np.where(kind == ACCELERATION, jw**2, np.where(kind == VELOCITY, jw, 1.0)) * s.S
+        result = np.asarray(np.where(kind == ACCELERATION, jw**2, np.where(kind == VELOCITY, jw, 1.0)) * s.S, complex)
         if np.any(s.L):
-            result = result + self._of_deflection @ s.H
+            return result + self._of_deflection @ s.H
         return result
 
     @cached_property
