@@ -64,8 +64,10 @@ class TrainingConfig:
 
 
 _QUICK = {
-    "pendulum": TrainingConfig(divergence_start=0.03),
-    "mass_spring_damper": TrainingConfig(horizons=(33, 99), shares=(0.4, 0.6), warm_up=0.2, divergence_start=0.01),
+    "pendulum": TrainingConfig(warm_up=0.5, divergence_start=0.03, state_weight=0.2),
+    "mass_spring_damper": TrainingConfig(
+        horizons=(33, 99), shares=(0.4, 0.6), warm_up=0.5, divergence_start=0.01, state_weight=0.2
+    ),
     "two_body": TrainingConfig(shares=(0.2, 0.2, 0.3, 0.3), warm_up=0.5, divergence_start=1e-3),
 }
 

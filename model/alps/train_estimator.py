@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 WIDTHS = (256, 128)
+BOUND = 1.2  # of a log-ratio: a third to three times nominal; keeps the simulator away from absurd values
 
 
 class LogRatioEstimator(nn.Module):
@@ -20,4 +22,4 @@ class LogRatioEstimator(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """(B, columns) -> (B, P)."""
-        return self.net(features)
+        return BOUND * torch.tanh(self.net(features) / BOUND)

@@ -34,10 +34,10 @@ class TrainConfig:
     """Settings of one training run on the train task; ours, as the paper gives none."""
 
     seed: int = 0
-    updates: int = 1500
-    batch: int = 32
-    learning_rate: float = 2e-3
-    decay: float = 3.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
+    updates: int = 400
+    batch: int = 16
+    learning_rate: float = 4e-3
+    decay: float = 6.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
     checkpoint_every: int = 100
     divergence_weight: float = 1e-4
     observation_weight: float = 1.0
