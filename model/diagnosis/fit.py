@@ -514,15 +514,31 @@ def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> M
     free = propagate(A, np.eye(2 * n), state, grid.step, grid.samples)
     d = periodic + grid.monomial_spectra @ d_poly + grid.forward(free[:, :n] @ s.H.T)
     v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n:] @ s.H.T)
+    q = _periodic_motion(forward, forces)
+    bend = plant.derivative(plant.derivative(q_poly))
+    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
+    return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
+
+
+def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray:
+    """Periodic part of the degrees of freedom, (F, n)."""
+    plant, part = forward.plant, forward.part
+    s = plant.structure
     load = -((part.support @ s.G.T) * plant.impedance) @ s.H
     if part.force.shape[1]:
         load = load + forward.force @ s.F[:, : part.force.shape[1]].T
     q = np.einsum("fnm,fm->fn", plant.receptance, load)
-    if forces is not None:
-        q += forces.q
-    bend = plant.derivative(plant.derivative(q_poly))
-    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
-    return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
+    return q if forces is None else q + forces.q
+
+
+def _particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:
+    """State of the particular solution at the first sample; with the free state it is the true state, (2n,)."""
+    plant, grid = forward.plant, forward.part.grid
+    q = _periodic_motion(forward, forces)
+    polynomial = forward.polynomial[0] + (0.0 if forces is None else forces.motion)
+    position = grid.inverse(q)[0] + polynomial[0]
+    rate = grid.inverse(1j * grid.omega[:, None] * q)[0] + plant.derivative(polynomial)[0]
+    return np.concatenate([position, rate])
 
 
 def _preloaded(problem: Problem, point: Point) -> Point:
@@ -536,6 +552,7 @@ def _preloaded(problem: Problem, point: Point) -> Point:
         forward = problem.forward(point)
         forces = forward.law_forces(point.state)
         assert forces is not None
+        start = _particular_start(forward, forces)
         terms, change = [], 0.0
         for term in point.terms:
             if is_waveform(term) and "|" not in term.location:
@@ -551,6 +568,13 @@ def _preloaded(problem: Problem, point: Point) -> Point:
             else:
                 terms.append(term)
         point = replace(point, terms=tuple(terms))
+        if change < 1e-3:
+            break
+        # the free state counts from the plant's particular solution, which has changed: keep the true state
+        state = start + point.state
+        for _ in range(2):
+            moved = problem.forward(point)
+            point = replace(point, state=state - _particular_start(moved, moved.law_forces(point.state)))
         if forces.converged and change < 0.2:
             break
     return point
