@@ -14,7 +14,6 @@ from scipy import stats
 from model.diagnosis.catalogue import CLOCK_LEAD, BodyLaw, Law
 from model.diagnosis.forward import structure_of
 from model.diagnosis.screen import Channel, Hit, Projector
-from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.terms import Term
 from model.mechanics import ACCELERATION, VELOCITY
 from model.signals import FloatArray

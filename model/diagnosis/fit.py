@@ -19,7 +19,7 @@ from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.forward import Forward, LawForces, propagate
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.measured import Noise, Part
-from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
+from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import StaticLaw
 from model.signals import FloatArray
@@ -312,7 +312,20 @@ class Columns:
 
     def add_force(self, column: int, element: int, force: ComplexArray) -> None:
         """Response to a force along an element, (F,)."""
+        plant = self.forward.plant
+        if plant.floats:
+            rest, line = plant.without_line(force[:, None])
+            motion = np.einsum("k,kpn->pn", line[:, 0], plant.line_motion(np.eye(len(plant.structure.H))[element]))
+            self._add_polynomial(column, motion)
+            force = rest[:, 0]
         self._add(column, self.of_force[element] * force[self.band, None])
+
+    def _add_polynomial(self, column: int, motion: FloatArray) -> None:
+        """What the sensors show of a polynomial motion."""
+        plant = self.forward.plant
+        still = np.zeros((motion.shape[0], plant.structure.G.shape[1]))
+        seen = plant.grid.monomial_spectra @ plant.polynomial_sensors(motion, still)
+        self.add_shown(column, seen * self.forward.sensor_factor)
 
     def add_port(self, column: int, port: FloatArray, force: ComplexArray) -> None:
         """Response to a force along a port."""
@@ -322,6 +335,9 @@ class Columns:
     def add_load(self, column: int, load: ComplexArray) -> None:
         """Response to loads on the degrees of freedom, (F, n)."""
         plant, band = self.forward.plant, self.band
+        if plant.floats:
+            load, line = plant.without_line(load)
+            self._add_polynomial(column, plant.polynomial_response(_line_load(line)))
         shown = np.einsum("fsn,fn->fs", plant.sensor_of_load[band], load[band]) * self.forward.sensor_factor[band]
         self._add(column, (self.of_shown @ shown[:, :, None])[:, :, 0])
 
@@ -402,7 +418,46 @@ def _port_motions(
     result[0, :, :, : P + p] = grid.inverse(spectra)
     result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
     result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
+    if plant.floats:
+        for i, parameter in enumerate(forward.system.parameters):
+            if i in theta_loads:
+                rest, line = plant.without_line(theta_loads[i])
+                steady = plant.polynomial_response(_line_load(line)) @ (ports @ structure.H).T
+                swinging = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, rest)
+                result[0, :, :, i] = grid.inverse(swinging) + grid.monomials @ steady
+                rate = 1j * grid.omega[:, None] * swinging
+                result[1, :, :, i] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
+            else:
+                unit = np.eye(len(structure.H))[forward.system.elements.index(parameter.element)]
+                result[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
+        for j in range(p):
+            result[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
     return result
+
+
+def _line_load(line: FloatArray) -> FloatArray:
+    """Polynomial loads (DEGREE + 1, n) from their constants and slopes (2, n)."""
+    load = np.zeros((DEGREE + 1, line.shape[1]))
+    load[:2] = line
+    return load
+
+
+def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: ComplexArray) -> FloatArray:
+    """Motion along ports (m, E) of a floating system under forces (F, s, columns) along sources (s, E).
+
+    (2, N, m, columns): the mean of a force and the line that joins its ends act through polynomials.
+    """
+    plant, grid = forward.plant, forward.part.grid
+    H = plant.structure.H
+    shape = (len(grid.omega), len(sources), -1)
+    rest, line = plant.without_line(force.reshape(len(grid.omega), -1))
+    line = line.reshape(2, len(sources), -1)
+    answer = (ports @ plant.deflection_of_force @ sources.T) @ rest.reshape(shape)
+    lines = np.array([plant.line_motion(w) for w in sources])  # (s, 2, DEGREE + 1, n)
+    polynomial = np.einsum("skpn,mn,ksc->pmc", lines, ports @ H, line)
+    steady = np.stack([polynomial, plant.derivative(polynomial)])
+    swinging = np.stack([grid.inverse(answer), grid.inverse(1j * grid.omega[:, None, None] * answer)])
+    return swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
 
 
 def _tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> ComplexArray:
@@ -420,6 +475,9 @@ def _tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> Comple
     along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
 
     def close(force: FloatArray) -> FloatArray:
+        if plant.floats:
+            d, v = _floating(forward, ports, ports, grid.forward(force))
+            return force - along_d * d - along_v * v
         moved = compliance @ grid.forward(force)
         return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
 

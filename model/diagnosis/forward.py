@@ -323,7 +323,7 @@ class _Loop:
         self.plant, self.grid, self.d0, self.v0 = plant, plant.grid, d0, v0
         self.compliance = self._compliance(ports)  # (4N / 2 + 1, m, m)
         self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(d0), plant.grid.step / OVERSAMPLING)
-        self.lines = np.array([self._line_motion(port) for port in ports])  # (m, 2, DEGREE + 1, n)
+        self.lines = np.array([plant.line_motion(port) for port in ports])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, ports @ plant.structure.H)
         self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
 
@@ -345,13 +345,6 @@ class _Loop:
         high = fine[len(known) :]
         above = (rows / (1j * high[:, None] - values)[:, None, :]) @ columns
         return np.concatenate([known, above])
-
-    def _line_motion(self, port: FloatArray) -> FloatArray:
-        """Polynomial motions under a constant unit force and under one that rises to 1, (2, DEGREE + 1, n)."""
-        load = np.zeros((2, DEGREE + 1, self.plant.structure.H.shape[1]))
-        for k in range(2):
-            load[k, k] = -port @ self.plant.structure.H
-        return np.array([self.plant.polynomial_response(one) for one in load])
 
     def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
         """Periodic spectrum on the oversampled axis' bins, (4N / 2 + 1, m), and polynomial, (DEGREE + 1, m).

@@ -131,6 +131,29 @@ class Plant:
             return result
         return np.linalg.inv(Z)
 
+    @property
+    def floats(self) -> bool:
+        """Whether a steady force moves the system away without end: no stiffness holds it."""
+        return not np.any(self.receptance[0])
+
+    def line_motion(self, port: FloatArray) -> FloatArray:
+        """Polynomial motions under a constant unit force along a port and under one that rises to 1.
+
+        (2, DEGREE + 1, n)
+        """
+        load = np.zeros((2, DEGREE + 1, self.structure.H.shape[1]))
+        for k in range(2):
+            load[k, k] = -port @ self.structure.H
+        return np.array([self.polynomial_response(one) for one in load])
+
+    def without_line(self, spectrum: ComplexArray) -> tuple[ComplexArray, FloatArray]:
+        """A force's spectrum (F, m) without the line that joins its ends and its mean, and their sizes (2, m)."""
+        series = self.grid.inverse(spectrum)
+        slope = 2 * series[-1] - series[-2] - series[0]
+        mean = (series - self.grid.monomials[:, 1:2] * slope).mean(axis=0)
+        line = np.stack([mean, slope])
+        return spectrum - self.grid.monomial_spectra[:, :2] @ line, line
+
     @cached_property
     def sensor_of_dof(self) -> ComplexArray:
         """Sensor signal per degree of freedom, shape (F, S, n); moving supports left out."""
