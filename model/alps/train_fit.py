@@ -36,8 +36,8 @@ class TrainConfig:
     seed: int = 0
     updates: int = 400
     batch: int = 16
-    learning_rate: float = 4e-3
-    decay: float = 6.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
+    learning_rate: float = 6e-3
+    decay: float = 30.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
     checkpoint_every: int = 100
     divergence_weight: float = 1e-4
     observation_weight: float = 1.0
