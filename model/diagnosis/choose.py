@@ -31,6 +31,8 @@ _LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
 _WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
 _UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
 _UNNAMED_RATIO = 1.3  # and explain this many times as much
+# laws that contain a commoner one, or imitate it: they must beat it by the same
+_RARE = frozenset({"air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"})
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
@@ -111,9 +113,10 @@ def compete(
     trials: list[Trial] = []
     for hit in hits:
         progress(f"fitting {hit.effect} at {hit.location}")
-        trial = _try(problem, base, hit, joint_start(problem, base, hit), 3)
-        if trial is not None:
-            trials.append(trial)
+        starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+        tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
+        if tried:
+            trials.append(max(tried, key=lambda t: t.evidence))
     trials.sort(key=lambda t: -t.evidence)
     if not trials:
         return []
@@ -139,6 +142,24 @@ def start_of(base: Fit, hit: Hit) -> Point:
         n = len(state) // 2
         state = np.concatenate([state[:n], [0.0], state[n:], [0.0]])
     return Point(point.theta, (*point.terms, hit.term), state)
+
+
+def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
+    """A damper that gives way was read as a weaker one: start from stronger dampers, too."""
+    if hit.effect != "series_stiffness":
+        return []
+    names = [p.name for p in problem.system.parameters]
+    name = f"{hit.location}.damping"
+    if name not in names:
+        return []
+    starts = []
+    for factor in (1.6, 2.6):
+        start = start_of(base, hit)
+        theta = start.theta.copy()
+        theta[names.index(name)] += np.log(factor)
+        term = hit.term.at(np.array(hit.term.parameters) * factor)
+        starts.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
+    return starts
 
 
 def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
@@ -217,7 +238,7 @@ def cost(fit: Fit, count: int) -> float:
 
 
 def _prior_cost(hit: Hit) -> float:
-    if hit.term.variant == BOTH:
+    if hit.term.variant == BOTH or hit.effect in _RARE:
         return _UNNAMED_COST
     if hit.family != "unnamed":
         return 0.0

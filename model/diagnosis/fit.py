@@ -559,7 +559,7 @@ class Motions:
 
 
 def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> Motions:
-    plant, grid, part = forward.plant, forward.part.grid, forward.part
+    plant, grid = forward.plant, forward.part.grid
     s = plant.structure
     n = len(s.mass)
     jw = 1j * grid.omega[:, None]
