@@ -15,11 +15,12 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from model.estimator import Estimator, EstimatorNet, new_estimator, noise_power, save_estimator
 from model.excitation import ERRI_HIGH, ERRI_LOW, draw_log_ratios, simulate_runs
@@ -69,11 +70,11 @@ def train(
     data = _simulated_rows(features, settings, report)
     net = new_estimator(system, settings.seed).double()
     _initialise(net, features, data, settings)
-    run = _Run(net, out / "checkpoint", settings, _fingerprint(system, settings))
+    run = Run(net, out / "checkpoint", settings, _fingerprint(system, settings))
     run.resume()
-    _fit_simulated(run, data, report)
+    _fit_simulated(run, settings, data, report)
     if recordings is not None and len(recordings):
-        _fit_recordings(run, system, features, recordings, report)
+        _fit_recordings(run, settings, features, recordings, report)
     measured = evaluate(system, Estimator(system, net), settings.seed + 1)
     manifest_settings = asdict(settings) | {"recording_windows": 0 if recordings is None else len(recordings)}
     measured["training_seconds"] = round(time.perf_counter() - begin, 1)
@@ -143,10 +144,26 @@ def _initialise(net: EstimatorNet, features: ForceBalance, data: _Rows, settings
     net.log_weight.data = -0.5 * torch.log(power.clamp_min(power.max() * 1e-12))
 
 
-class _Run:
+class RunSettings(Protocol):
+    """What a run needs to know of its settings."""
+
+    @property
+    def seed(self) -> int:
+        """Seeds every step together with its number."""
+
+    @property
+    def learning_rate(self) -> float:
+        """Of Adam, at the start."""
+
+    @property
+    def checkpoint_every(self) -> int:
+        """Steps between checkpoints."""
+
+
+class Run:
     """The network with its optimiser, saved every so often as tensors (never a pickle)."""
 
-    def __init__(self, net: EstimatorNet, path: Path, settings: TrainingSettings, fingerprint: str) -> None:
+    def __init__(self, net: nn.Module, path: Path, settings: RunSettings, fingerprint: str) -> None:
         self.net, self.path, self.settings, self.fingerprint = net, path, settings, fingerprint
         self.step = 0
         self.optimiser = torch.optim.Adam(net.parameters(), lr=settings.learning_rate)
@@ -203,8 +220,7 @@ class _Run:
         self.path.with_suffix(".safetensors").unlink(missing_ok=True)
 
 
-def _fit_simulated(run: _Run, data: _Rows, report: Progress) -> None:
-    settings = run.settings
+def _fit_simulated(run: Run, settings: TrainingSettings, data: _Rows, report: Progress) -> None:
     while run.step < settings.steps:
         rng = run.generator()
         run.rate(settings.steps)
@@ -229,10 +245,11 @@ def _likelihood(error: Tensor, covariance: Tensor) -> Tensor:
     return (10 * torch.log1p(square / 10) + log_determinant).mean()
 
 
-def _fit_recordings(run: _Run, system: System, features: ForceBalance, windows: FloatArray, report: Progress) -> None:
+def _fit_recordings(
+    run: Run, settings: TrainingSettings, features: ForceBalance, windows: FloatArray, report: Progress
+) -> None:
     """Physics in the loop: the misfit of the simulated outputs, per degree of freedom, as the loss."""
-    settings = run.settings
-    refiner = Refiner(system)
+    refiner = Refiner(features.system)
     total = settings.steps + settings.recording_steps
     batch = min(32, len(windows))
     while run.step < total:

@@ -22,7 +22,7 @@ from model.alps.frames import FrameAutoencoder
 from model.alps.losses import loss_of, picture_loss
 from model.alps.network import Network
 from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
-from model.training import _Run as Run
+from model.training import Run
 
 _STREAMS = {"train": 0, "test": 1, "unseen": 2}
 
@@ -92,7 +92,7 @@ def train_frames(
         return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]
 
     frames.standardise(draw(1000, 5), before=True)
-    run = Run(frames, folder / "frames", config, _frames_name(task, config))  # type: ignore[arg-type]
+    run = Run(frames, folder / "frames", config, _frames_name(task, config))
     run.resume()
     while run.step < config.frame_updates:
         clock.check(run)
@@ -138,7 +138,7 @@ def train_method(
     if model.network.estimator is not None:  # methods without physics have no positions to start with
         model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1)[::7].to(device))
     trained = model if config.end_to_end else model.network
-    run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))  # type: ignore[arg-type]
+    run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))
     run.resume()
     model.train()
     while run.step < config.updates:

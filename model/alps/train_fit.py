@@ -24,7 +24,7 @@ from model.alps.train_system import STEPS, TrainData, smoothed, train_task
 from model.features import magnitudes
 from model.simulate.linear import LinearSimulator
 from model.system import load_system
-from model.training import _Run as Run
+from model.training import Run
 
 TrainMethod = Literal["alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors"]
 
@@ -139,7 +139,7 @@ def fit(method: TrainMethod, data: TrainData, config: TrainConfig, folder: Path,
     torch.manual_seed(config.seed)
     model = build(method, data)
     train, _ = halves(data)
-    run = Run(model, folder / f"{method}-s{config.seed}", config, f"{what} {method} " + json.dumps(asdict(config)))  # type: ignore[arg-type]
+    run = Run(model, folder / f"{method}-s{config.seed}", config, f"{what} {method} " + json.dumps(asdict(config)))
     run.resume()
     model.train()
     while run.step < config.updates:
