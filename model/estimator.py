@@ -20,8 +20,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
+from model.chunks import chunks, share
 from model.features import ForceBalance
-from model.signals import FloatArray
+from model.signals import FloatArray, IntArray
 from model.system import System
 
 WEIGHTS = Path(__file__).parent / "weights"
@@ -121,13 +122,17 @@ class Estimator:
         self.samples = net.architecture.samples
         self.features = ForceBalance(system, self.samples)
 
-    def estimate(self, windows: FloatArray) -> EstimatorOutput:
-        """Log-ratios and predicted covariances of windows (B, T, C)."""
-        with torch.no_grad():
-            log_ratio, covariance = self.net(*self.features(windows))
-        finite = torch.isfinite(log_ratio).all(dim=1)
-        log_ratio = torch.where(finite[:, None], log_ratio, torch.zeros_like(log_ratio))
-        return EstimatorOutput(log_ratio.numpy(), covariance.numpy())
+    def estimate(self, windows: FloatArray, workers: int = 1) -> EstimatorOutput:
+        """Log-ratios and predicted covariances of windows (B, T, C); `workers`: see `model.chunks`."""
+
+        def work(at: IntArray) -> tuple[FloatArray, FloatArray]:
+            with torch.no_grad():
+                log_ratio, covariance = self.net(*self.features(windows[at]))
+            finite = torch.isfinite(log_ratio).all(dim=1)
+            return torch.where(finite[:, None], log_ratio, torch.zeros_like(log_ratio)).numpy(), covariance.numpy()
+
+        parts = share(work, chunks(np.arange(len(windows))), workers)
+        return EstimatorOutput(*(np.concatenate(part) for part in zip(*parts, strict=True)))
 
 
 def new_estimator(system: System, seed: int = 0) -> EstimatorNet:

@@ -59,7 +59,7 @@ class Identifier:
             return []
         begin = time.perf_counter()
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
-            start = self.estimator.estimate(windows).log_ratio
+            start = self.estimator.estimate(windows, self.workers).log_ratio
         between = time.perf_counter()
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states)
         self.times = StageTimes(between - begin, time.perf_counter() - between)

@@ -18,7 +18,6 @@ the old products give a second correction, at a tenth of the price.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,8 +25,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from model.chunks import chunks, share
 from model.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
-from model.signals import BoolArray, FloatArray
+from model.signals import BoolArray, FloatArray, IntArray
 from model.system import System
 
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
@@ -35,7 +35,6 @@ _WEAK_STD = 0.1  # beyond this the excitation of a window is held against its no
 _NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
-_CHUNK = 64  # windows worked on at a time: larger ones leave the caches
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +56,7 @@ class Refined:
 class Refiner:
     """Gauss-Newton for one system and one window length.
 
-    workers: threads that share the chunks of a batch; with more than one, torch's own threads should be one
-    (`torch.set_num_threads(1)`), since its operations here are too small to be split well.
+    workers: threads that share the chunks of a batch, see `model.chunks`.
     """
 
     def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
@@ -78,21 +76,17 @@ class Refiner:
         first = np.zeros((len(windows), len(self.system.parameters))) if start is None else start
         present = ~np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1)
         patterns, which = np.unique(present, axis=0, return_inverse=True)
-        groups = [(pattern, np.flatnonzero(which.reshape(-1) == i)) for i, pattern in enumerate(patterns)]
-        chunks = [(p, at) for p, group in groups for at in np.array_split(group, max(1, -(-len(group) // _CHUNK)))]
+        pieces = [
+            (pattern, at) for i, pattern in enumerate(patterns) for at in chunks(np.flatnonzero(which.reshape(-1) == i))
+        ]
 
-        def work(chunk: tuple[BoolArray, np.ndarray]) -> Refined:
-            pattern, at = chunk
+        def work(piece: tuple[BoolArray, IntArray]) -> Refined:
+            pattern, at = piece
             with torch.no_grad():
                 data = self.model.batch(windows[at], pattern)
                 return self._refine_chunk(data, torch.as_tensor(first[at]), iterations, states)
 
-        if self.workers > 1 and len(chunks) > 1:
-            with ThreadPoolExecutor(self.workers) as pool:
-                parts = list(pool.map(work, chunks))
-        else:
-            parts = [work(chunk) for chunk in chunks]
-        return _in_order(parts, np.concatenate([at for _, at in chunks]))
+        return _in_order(share(work, pieces, self.workers), np.concatenate([at for _, at in pieces]))
 
     def misfit(self, windows: FloatArray, log_ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weighted squares of the simulated outputs (B,) at given parameters and their gradient (B, P).

@@ -283,7 +283,7 @@ def test_interrupting_a_replay_keeps_what_was_stored(tmp_path: Path) -> None:
         assert process.stdout is not None
         first = process.stdout.readline()
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=60)
+        _, errors = process.communicate(timeout=180)
     assert json.loads(first)["outcome"] == "used"
     assert process.returncode == 130
     assert errors == "sprung: interrupted\n"

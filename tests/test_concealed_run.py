@@ -43,6 +43,7 @@ def test_the_benchmark_is_resumed_where_it_stopped(tmp_path: Path, monkeypatch: 
 
 
 def test_pysindy_finds_a_strong_cubic_spring_in_perfect_motions() -> None:
+    pytest.importorskip("pysindy")
     vehicle, rng = read_vehicle(MANCHESTER), np.random.default_rng(1)
     names, matrix, _ = regression(vehicle, rng.normal(size=(3000, 28)) * np.r_[np.full(16, 1e-3), np.ones(12)], 100.0)
     value = np.zeros(len(names))
@@ -60,7 +61,8 @@ def test_pysindy_finds_a_strong_cubic_spring_in_perfect_motions() -> None:
 def test_the_free_run_of_an_oscillator_follows_the_closed_form() -> None:
     mass, damping, stiffness, rate = 2.0, 0.8, 50.0, 100.0
     parameters = [
-        {"name": "body.mass", "value": mass}, {"name": "spring.damping", "value": damping},
+        {"name": "body.mass", "value": mass},
+        {"name": "spring.damping", "value": damping},
         {"name": "spring.stiffness", "value": stiffness},
     ]
     model = oscillator(parameters, [])
@@ -74,7 +76,9 @@ def test_the_free_run_of_an_oscillator_follows_the_closed_form() -> None:
 
 def test_a_reported_cubic_spring_enters_the_free_run() -> None:
     parameters = [
-        {"name": "b.mass", "value": 1.0}, {"name": "s.damping", "value": 0.0}, {"name": "s.stiffness", "value": 4.0}
+        {"name": "b.mass", "value": 1.0},
+        {"name": "s.damping", "value": 0.0},
+        {"name": "s.stiffness", "value": 4.0},
     ]
     finding = {"location": "s", "effect": "cubic_stiffness", "parameters": [{"name": "k3", "value": 9.0}]}
     assert oscillator(parameters, [finding])[3](2.0, 0.0) == pytest.approx(72.0)

@@ -1,0 +1,31 @@
+"""Batches worked on in pieces that stay in the caches, shared among threads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+import numpy as np
+
+from model.signals import IntArray
+
+CHUNK = 32  # windows; twice as many take half as long again each
+Piece = TypeVar("Piece")
+Result = TypeVar("Result")
+
+
+def chunks(of: IntArray) -> list[IntArray]:
+    """Indices in pieces of at most `CHUNK`, of nearly equal size."""
+    return [np.asarray(part) for part in np.array_split(of, max(1, -(-len(of) // CHUNK)))]
+
+
+def share(work: Callable[[Piece], Result], pieces: Sequence[Piece], workers: int) -> list[Result]:
+    """Results in order; with more than one worker the pieces are shared among that many threads.
+
+    torch's own threads should then be one (`torch.set_num_threads(1)`): its operations here are too small to split.
+    """
+    if workers > 1 and len(pieces) > 1:
+        with ThreadPoolExecutor(workers) as pool:
+            return list(pool.map(work, pieces))
+    return [work(piece) for piece in pieces]
