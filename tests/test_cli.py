@@ -229,13 +229,14 @@ def test_options_of_a_benchmark_are_those_of_its_function() -> None:
 
 
 def sprung(*arguments: str, **options: Any) -> subprocess.Popen[str]:
-    """The real command in a process of its own."""
+    """The real command in a process of its own, which heeds Ctrl-C even where these tests run in the background."""
     return subprocess.Popen(
         [sys.executable, "-m", "service.cli", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         cwd=Path(__file__).parent.parent,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL) and None,  # noqa: PLW1509
         **options,
     )
 
