@@ -90,8 +90,15 @@ def run(
 def _line(name: str, file: str, truth: dict[str, Any], report: dict[str, Any], s: Score) -> dict[str, Any]:
     """One recording's result."""
     return {
-        "set": name, "file": file, "kind": s.kind, "snr": s.snr, "said": s.said, "right": s.verdict,
-        "located": s.located, "named": s.named, "explained": s.explained,
+        "set": name,
+        "file": file,
+        "kind": s.kind,
+        "snr": s.snr,
+        "said": s.said,
+        "right": s.verdict,
+        "located": s.located,
+        "named": s.named,
+        "explained": s.explained,
         "true": [(f["location"], f["effect"]) for f in truth["findings"]],
         "found": [(f["location"], f["effect"]) for f in report["findings"]],
     }
@@ -160,8 +167,11 @@ def _by_kind(scores: list[Score]) -> Figures:
     for kind in sorted({s.kind for s in scores}):
         mine = [s for s in scores if s.kind == kind]
         yield {
-            "kind": kind, "recordings": len(mine), "verdict": rate(s.verdict for s in mine),
-            "located": rate(s.located for s in mine), "named": rate(s.named for s in mine),
+            "kind": kind,
+            "recordings": len(mine),
+            "verdict": rate(s.verdict for s in mine),
+            "located": rate(s.located for s in mine),
+            "named": rate(s.named for s in mine),
         }
 
 

@@ -82,10 +82,18 @@ def score(truth: Truth, report: Verdict, named_laws: Sequence[str]) -> Score:
         if p["std"] and quantity in ("stiffness", "damping"):
             structure.append((p["value"] - truth[quantity][element]) / p["std"])
     return Score(
-        kind=truth.get("kind", ""), truth=truth["verdict"], said=report["verdict"],
-        verdict=truth["verdict"] == report["verdict"], located=located, named=named,
-        detected=report["verdict"] != "consistent", found=bool(pairs), explained=explained(report) if said else None,
-        parameter_z=tuple(parameter_z), structure_z=tuple(structure), snr=truth.get("oracle_snr"),
+        kind=truth.get("kind", ""),
+        truth=truth["verdict"],
+        said=report["verdict"],
+        verdict=truth["verdict"] == report["verdict"],
+        located=located,
+        named=named,
+        detected=report["verdict"] != "consistent",
+        found=bool(pairs),
+        explained=explained(report) if said else None,
+        parameter_z=tuple(parameter_z),
+        structure_z=tuple(structure),
+        snr=truth.get("oracle_snr"),
     )
 
 

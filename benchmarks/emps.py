@@ -33,7 +33,9 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         write_report(report, system, out)
     said = report.to_dict()
     yield {
-        "verdict": said["verdict"], "findings": said["findings"], "explained": said["explained"],
+        "verdict": said["verdict"],
+        "findings": said["findings"],
+        "explained": said["explained"],
         "viscous_without_friction": identified(said, "baseline").get("viscous"),
     }
     found = identified(said, "augmented")
@@ -41,7 +43,10 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         value = found.get(name)
         error = None if value is None else value / target - 1
         yield {
-            "value": name, "identified": value, "published": target, "relative_error": error,
+            "value": name,
+            "identified": value,
+            "published": target,
+            "relative_error": error,
             "met": error is not None and abs(error) <= TOLERANCE,
         }
 

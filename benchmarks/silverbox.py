@@ -48,7 +48,9 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         write_report(report, system, out)
     said = report.to_dict()
     yield {
-        "verdict": said["verdict"], "findings": said["findings"], "explained": said["explained"],
+        "verdict": said["verdict"],
+        "findings": said["findings"],
+        "explained": said["explained"],
         "parameters": {p["name"]: [p["value"], p["std"]] for p in said["augmented"]["parameters"]},
     }
     for name, target in TARGETS.items():

@@ -119,9 +119,7 @@ def sparse_fit(names: list[tuple[str, str]], matrix: Array, target: Array) -> di
         kept = np.where(linear, 0.0, np.abs(share))
         if gain > best["gain"] and kept.any():
             element, law = names[int(np.argmax(kept))]
-            best = {
-                "gain": gain, "location": element, "effect": law.partition("@")[0], "terms": int((kept > 0).sum())
-            }
+            best = {"gain": gain, "location": element, "effect": law.partition("@")[0], "terms": int((kept > 0).sum())}
     return best
 
 
@@ -148,7 +146,8 @@ def compare(
     limit = float(np.quantile(quiet, 0.99)) if quiet else 0.0
     for name, results in found.items():
         asked = [
-            (truth["findings"], r) for truth, r in results
+            (truth["findings"], r)
+            for truth, r in results
             if truth["findings"] and all(f["location"] in vehicle.elements for f in truth["findings"])
         ]
         if not asked:
@@ -157,11 +156,15 @@ def compare(
         placed = [r["location"] in {f["location"] for f in fs} for fs, r in asked]
         named = [any((r["location"], r["effect"]) == (f["location"], f["effect"]) for f in fs) for fs, r in asked]
         yield {
-            "pysindy": name, "recordings": len(asked), "detected": rate(hit),
+            "pysindy": name,
+            "recordings": len(asked),
+            "detected": rate(hit),
             "located_one": rate(h and p for h, p in zip(hit, placed, strict=True)),
             "named_one": rate(h and n for h, n in zip(hit, named, strict=True)),
-            "located_one_without_threshold": rate(placed), "named_one_without_threshold": rate(named),
-            "false_alarms_without_threshold": rate(gain > 0 for gain in quiet), "gain_threshold": limit,
+            "located_one_without_threshold": rate(placed),
+            "named_one_without_threshold": rate(named),
+            "false_alarms_without_threshold": rate(gain > 0 for gain in quiet),
+            "gain_threshold": limit,
             "clean_recordings": len(quiet),
             "median_terms_kept": float(np.median([r["terms"] for _, r in asked])),
         }

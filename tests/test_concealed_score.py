@@ -23,9 +23,12 @@ LAWS = ("coulomb_friction", "cubic_stiffness", "sensor_gain")
 
 def truth(verdict: str, *findings: tuple[str, str, list[float]], snr: float = 50.0) -> dict[str, Any]:
     return {
-        "verdict": verdict, "kind": findings[0][1] if findings else "clean", "oracle_snr": snr,
+        "verdict": verdict,
+        "kind": findings[0][1] if findings else "clean",
+        "oracle_snr": snr,
         "findings": [{"location": a, "effect": b, "parameters": c} for a, b, c in findings],
-        "stiffness": {"secondary_1r": 4.0e5}, "damping": {"secondary_1r": 2.0e4},
+        "stiffness": {"secondary_1r": 4.0e5},
+        "damping": {"secondary_1r": 2.0e4},
     }
 
 
@@ -35,7 +38,9 @@ def report(
     values = [{"name": "secondary_1r.stiffness", "value": 4.02e5, "std": 1e3}]
     fit = {"parameters": values, "validation": {"nrmse": 0.1}}
     return {
-        "verdict": verdict, "baseline": fit, "augmented": fit | {"validation": {"nrmse": 0.031}},
+        "verdict": verdict,
+        "baseline": fit,
+        "augmented": fit | {"validation": {"nrmse": 0.031}},
         "noise_floor": {"nrmse": 0.03},
         "findings": [
             {"location": a, "effect": b, "parameters": [{"name": n, "value": v, "std": s} for n, v, s in c]}

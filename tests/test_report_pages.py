@@ -41,24 +41,35 @@ def friction_report(system: System = SYSTEM) -> Report:
     law = 395 * np.tanh(x / 2e-3)
     place = system.elements[-3] if len(system.elements) > 3 else system.elements[0]
     augmented = tuple(ParameterValue(p.name, p.nominal, 0.01 * p.nominal, p.nominal, p.unit) for p in system.parameters)
-    baseline = tuple(
-        replace(p, value=2.48 * p.value) if p.name == f"{place}.damping" else p for p in augmented
-    )
+    baseline = tuple(replace(p, value=2.48 * p.value) if p.name == f"{place}.damping" else p for p in augmented)
     friction = LawParameter("force", 395.2, 6.1, "N"), LawParameter("smoothing", 2.1e-3, 3e-4, "m/s")
     return Report(
-        system=system.name, recording=RecordingFacts("run.mcap", 60.0, 6000, 3), verdict="missing_physics",
-        baseline=baseline, baseline_validation=fit(system, 0.145),
+        system=system.name,
+        recording=RecordingFacts("run.mcap", 60.0, 6000, 3),
+        verdict="missing_physics",
+        baseline=baseline,
+        baseline_validation=fit(system, 0.145),
         findings=(Finding(place, "coulomb_friction", friction, 0.0, -5100.0, ("damper_blowoff", -4300.0)),),
-        augmented=augmented, augmented_validation=fit(system, 0.031), noise_floor=fit(system, 0.030),
-        localization={place: 5100.0, "car": 30.0}, explained=0.993,
+        augmented=augmented,
+        augmented_validation=fit(system, 0.031),
+        noise_floor=fit(system, 0.030),
+        localization={place: 5100.0, "car": 30.0},
+        explained=0.993,
         candidates=(Candidate(place, "coulomb_friction", 5100.0, 0.0, -5100.0),),
         evidence={
-            "validation.time": np.arange(600) / system.sample_rate, "validation.measured": measured,
+            "validation.time": np.arange(600) / system.sample_rate,
+            "validation.measured": measured,
             "validation.baseline": measured + 0.2 * rng.normal(size=measured.shape),
-            "validation.augmented": measured + 0.03, "validation.noise": np.full(sensors, 0.03),
-            "finding.0.deflection": d, "finding.0.rate": v, "finding.0.force_before": 395 * np.tanh(v / 2e-3),
-            "finding.0.force_after": rng.normal(size=400), "finding.0.curve_axis": np.array("rate"),
-            "finding.0.curve_x": x, "finding.0.curve_mean": law, "finding.0.curve_std": np.full(41, 9.0),
+            "validation.augmented": measured + 0.03,
+            "validation.noise": np.full(sensors, 0.03),
+            "finding.0.deflection": d,
+            "finding.0.rate": v,
+            "finding.0.force_before": 395 * np.tanh(v / 2e-3),
+            "finding.0.force_after": rng.normal(size=400),
+            "finding.0.curve_axis": np.array("rate"),
+            "finding.0.curve_x": x,
+            "finding.0.curve_mean": law,
+            "finding.0.curve_std": np.full(41, 9.0),
             "finding.0.curve_law": law,
         },
     )
@@ -96,7 +107,12 @@ def test_the_json_beside_the_page_is_the_reports_own(tmp_path: Path) -> None:
 
 def test_a_consistent_report_without_arrays_still_makes_a_page(tmp_path: Path) -> None:
     report = replace(
-        friction_report(), verdict="consistent", findings=(), evidence={}, candidates=(), explained=None,
+        friction_report(),
+        verdict="consistent",
+        findings=(),
+        evidence={},
+        candidates=(),
+        explained=None,
         advice=("the record is too short to see <slow> changes",),
     )
     files = write_report(report, SYSTEM, tmp_path)
@@ -112,7 +128,10 @@ def test_an_unknown_law_is_shown_as_a_force_map(tmp_path: Path) -> None:
     force = np.outer(v, d**2) * 4e9
     finding = replace(report.findings[0], effect="unknown", parameters=())
     evidence = {
-        "finding.0.map_d": d, "finding.0.map_v": v, "finding.0.map_force": force, "finding.0.map_std": 0 * force + 5,
+        "finding.0.map_d": d,
+        "finding.0.map_v": v,
+        "finding.0.map_force": force,
+        "finding.0.map_std": 0 * force + 5,
     }
     report = replace(report, verdict="unknown_physics", findings=(finding,), evidence=evidence)
     assert "force_0" in write_report(report, SYSTEM, tmp_path).pictures

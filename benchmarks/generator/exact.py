@@ -51,8 +51,13 @@ def is_linear(case: Case) -> bool:
 def exact_response(vehicle: Vehicle, case: Case, seconds: float) -> Array:
     """Filtered true signals at 100 Hz: displacements, velocities, sensors, shape (T, C)."""
     spectra, omega, samples = track.wheel_spectra(
-        np.random.default_rng(case.seed + 2), seconds, case.speed, case.level,
-        vehicle.input_position, vehicle.input_side, joint_spacing=case.joints,
+        np.random.default_rng(case.seed + 2),
+        seconds,
+        case.speed,
+        case.level,
+        vehicle.input_position,
+        vehicle.input_side,
+        joint_spacing=case.joints,
     )
     reach = np.arange(LOW_PASS.size) - LOW_PASS.size // 2
     live = np.flatnonzero(omega < 2 * np.pi * 50.0)  # nothing on the track is faster
@@ -68,5 +73,5 @@ def exact_response(vehicle: Vehicle, case: Case, seconds: float) -> Array:
     padded = np.zeros((samples // 2 + 1, every.shape[1]), complex)
     padded[live] = every
     step = int(track.RATE / SAMPLE_RATE)
-    series: Array = np.fft.irfft(padded, samples, axis=0)[:: step][: int(np.ceil(seconds * SAMPLE_RATE))]
+    series: Array = np.fft.irfft(padded, samples, axis=0)[::step][: int(np.ceil(seconds * SAMPLE_RATE))]
     return series

@@ -68,10 +68,15 @@ def write_can(path: Path, vehicle: Vehicle, values: Array, name: str) -> None:
         for row in range(len(values)):
             for place, (frame_id, payloads) in enumerate(frames):
                 stamp = START / 1e9 + row * 0.01 + place * 1e-4
-                logger(can.Message(
-                    timestamp=stamp, arbitration_id=frame_id, data=payloads[row], is_extended_id=False,
-                    channel=0 if path.suffix != ".log" else "can0",
-                ))
+                logger(
+                    can.Message(
+                        timestamp=stamp,
+                        arbitration_id=frame_id,
+                        data=payloads[row],
+                        is_extended_id=False,
+                        channel=0 if path.suffix != ".log" else "can0",
+                    )
+                )
 
 
 def write_csv(path: Path, vehicle: Vehicle, values: Array, name: str) -> None:
@@ -82,5 +87,9 @@ def write_csv(path: Path, vehicle: Vehicle, values: Array, name: str) -> None:
 
 
 WRITERS: dict[str, Callable[[Path, Vehicle, Array, str], None]] = {
-    "mcap": write_mcap, "blf": write_can, "asc": write_can, "log": write_can, "csv": write_csv,
+    "mcap": write_mcap,
+    "blf": write_can,
+    "asc": write_can,
+    "log": write_can,
+    "csv": write_csv,
 }

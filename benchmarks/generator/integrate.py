@@ -210,9 +210,7 @@ def simulate(
     return out, strength
 
 
-def _advance(
-    motion: Motion, state: Array, memory: Array, support: Array, time: float
-) -> tuple[Array, Array, Array]:
+def _advance(motion: Motion, state: Array, memory: Array, support: Array, time: float) -> tuple[Array, Array, Array]:
     """One step from the supports at its start, middle and end, (3, 2 wheels, B); also what was felt at its start."""
     h = 1 / STEP_RATE
     k1, m1 = motion(state, memory, support[0], time)

@@ -116,50 +116,58 @@ def _hysteresis(rng: np.random.Generator, s: float, k: float, reach: float) -> l
 
 LAWS: dict[str, Law] = {
     "cubic_stiffness": Law(cubic, lambda rng, s, k, c, D, R: [s * k / (2 * D**2)], strength=(0.005, 0.4)),
-    "bump_stop": Law(
-        bump, lambda rng, s, k, c, D, R: [rng.uniform(0.8, 2.0) * D, 12 * s * k], strength=(0.02, 0.6)
-    ),
+    "bump_stop": Law(bump, lambda rng, s, k, c, D, R: [rng.uniform(0.8, 2.0) * D, 12 * s * k], strength=(0.02, 0.6)),
     "clearance": Law(clearance, lambda rng, s, k, c, D, R: [s * D], strength=(0.01, 0.4)),
     "coulomb_friction": Law(
-        coulomb, lambda rng, s, k, c, D, R: [s * k * D, float(rng.choice([0.001, 0.002, 0.004]))],
+        coulomb,
+        lambda rng, s, k, c, D, R: [s * k * D, float(rng.choice([0.001, 0.002, 0.004]))],
         strength=(0.005, 0.3),
     ),
     "damper_blowoff": Law(
-        blowoff, lambda rng, s, k, c, D, R: [rng.uniform(0.3, 1.3) * R, float(np.clip(1 - 2 * s, 0.05, 0.95))],
+        blowoff,
+        lambda rng, s, k, c, D, R: [rng.uniform(0.3, 1.3) * R, float(np.clip(1 - 2 * s, 0.05, 0.95))],
         strength=(0.05, 0.45),
     ),
     "damper_asymmetry": Law(asymmetry, lambda rng, s, k, c, D, R: [_signed(rng, s)], strength=(0.02, 0.5)),
-    "quadratic_damping": Law(
-        quadratic_damping, lambda rng, s, k, c, D, R: [s * c / R], strength=(0.05, 1.0)
-    ),
+    "quadratic_damping": Law(quadratic_damping, lambda rng, s, k, c, D, R: [s * c / R], strength=(0.05, 1.0)),
     "series_stiffness": Law(
         series, lambda rng, s, k, c, D, R: [c * 2 * np.pi * 3 / s], memory=True, strength=(0.1, 1.0)
     ),
     "bouc_wen": Law(
-        bouc_wen, lambda rng, s, k, c, D, R: _hysteresis(rng, s, k, rng.uniform(0.2, 1.0) * D), memory=True,
+        bouc_wen,
+        lambda rng, s, k, c, D, R: _hysteresis(rng, s, k, rng.uniform(0.2, 1.0) * D),
+        memory=True,
         strength=(0.02, 0.3),
     ),
     "time_varying_stiffness": Law(
-        varying_stiffness, lambda rng, s, k, c, D, R: [_signed(rng, s), rng.uniform(8, 40)],
+        varying_stiffness,
+        lambda rng, s, k, c, D, R: [_signed(rng, s), rng.uniform(8, 40)],
         strength=(0.01, 0.4),
     ),
     "time_varying_damping": Law(
-        varying_damping, lambda rng, s, k, c, D, R: [_signed(rng, s), rng.uniform(8, 40)],
+        varying_damping,
+        lambda rng, s, k, c, D, R: [_signed(rng, s), rng.uniform(8, 40)],
         strength=(0.03, 0.5),
     ),
     "quadratic_stiffness": Law(
-        quadratic_stiffness, lambda rng, s, k, c, D, R: [_signed(rng, s * k / D)], named=False,
+        quadratic_stiffness,
+        lambda rng, s, k, c, D, R: [_signed(rng, s * k / D)],
+        named=False,
         strength=(0.01, 0.12),
     ),
     "position_dependent_damping": Law(
         position_damping, lambda rng, s, k, c, D, R: [s * c / D**2], named=False, strength=(0.1, 1.5)
     ),
     "force_ripple": Law(
-        ripple, lambda rng, s, k, c, D, R: [s * k * D, rng.uniform(0.2, 0.5) * D], named=False,
+        ripple,
+        lambda rng, s, k, c, D, R: [s * k * D, rng.uniform(0.2, 0.5) * D],
+        named=False,
         strength=(0.02, 0.2),
     ),
     "one_sided_stop": Law(
-        one_sided_stop, lambda rng, s, k, c, D, R: [rng.uniform(0.6, 1.5) * D, 12 * s * k], named=False,
+        one_sided_stop,
+        lambda rng, s, k, c, D, R: [rng.uniform(0.6, 1.5) * D, 12 * s * k],
+        named=False,
         strength=(0.02, 0.4),
     ),
     "saturating_spring": Law(

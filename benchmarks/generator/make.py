@@ -124,8 +124,13 @@ def _integrated(
     """True filtered signals and strengths of each case, integrated together."""
     tables = [
         track.wheels(
-            np.random.default_rng(case.seed + 2), WARM_UP + seconds + SLACK + 2, case.speed, case.level,
-            vehicle.input_position, vehicle.input_side, joint_spacing=case.joints,
+            np.random.default_rng(case.seed + 2),
+            WARM_UP + seconds + SLACK + 2,
+            case.speed,
+            case.level,
+            vehicle.input_position,
+            vehicle.input_side,
+            joint_spacing=case.joints,
         )
         for case in group
     ]
@@ -141,10 +146,18 @@ def label(made: Recording, seconds: float) -> dict[str, Any]:
     """One entry of labels.json, in the form of the published labels, with the generator's extras."""
     case = made.case
     entry: dict[str, Any] = {
-        "verdict": case.verdict(), "seconds": seconds, "findings": case.findings(),
-        "stiffness": case.stiffness, "damping": case.damping, **case.change,
-        "kind": case.kind, "strength": made.strengths, "oracle_snr": made.snr,
-        "speed": case.speed, "joints": case.joints, "track_level": case.level,
+        "verdict": case.verdict(),
+        "seconds": seconds,
+        "findings": case.findings(),
+        "stiffness": case.stiffness,
+        "damping": case.damping,
+        **case.change,
+        "kind": case.kind,
+        "strength": made.strengths,
+        "oracle_snr": made.snr,
+        "speed": case.speed,
+        "joints": case.joints,
+        "track_level": case.level,
     }
     if case.flex:
         entry["flex"] = case.flex

@@ -35,8 +35,10 @@ def _periodic(x: Array) -> Array:
     u = (np.arange(1, n + 1) / (n + 1))[:, None]
     slope_end, slope_start = (x[-1] - x[-3]) / 2 * (n + 1), (x[2] - x[0]) / 2 * (n + 1)
     bridge = (
-        x[-1] * (2 * u**3 - 3 * u**2 + 1) + slope_end * (u**3 - 2 * u**2 + u)
-        + x[0] * (3 * u**2 - 2 * u**3) + slope_start * (u**3 - u**2)
+        x[-1] * (2 * u**3 - 3 * u**2 + 1)
+        + slope_end * (u**3 - 2 * u**2 + u)
+        + x[0] * (3 * u**2 - 2 * u**3)
+        + slope_start * (u**3 - u**2)
     )
     return np.vstack([x, bridge])
 
@@ -72,9 +74,7 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
     wheels = len(vehicle.inputs)
     periodic = _periodic(clean[:, :wheels])
     omega_full = np.asarray(2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE), dtype=np.float64)
-    stiffness, damping = (
-        np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping)
-    )
+    stiffness, damping = (np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping))
     full = Transfer(vehicle, stiffness, damping, omega_full)
     spectrum = np.fft.rfft(periodic, axis=0)
 

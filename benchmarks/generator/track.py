@@ -87,9 +87,7 @@ def wheels(
     joint_spacing: float | None = None,
 ) -> tuple[Array, Array]:
     """Displacement (m) and velocity (m/s) under every wheel on a grid of 1 kHz, each of shape (N, wheels)."""
-    spectra, omega, samples = wheel_spectra(
-        rng, seconds, speed, level, position, side, correlation, joint_spacing
-    )
+    spectra, omega, samples = wheel_spectra(rng, seconds, speed, level, position, side, correlation, joint_spacing)
     count = int(np.ceil(seconds * RATE)) + 2
     displacement = np.fft.irfft(spectra, samples, axis=0)[:count]
     velocity = np.fft.irfft(1j * omega[:, None] * spectra, samples, axis=0)[:count]

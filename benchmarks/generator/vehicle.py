@@ -82,9 +82,7 @@ def read_vehicle(path: str | Path) -> Vehicle:
         inputs=tuple(wheels),
         input_position=np.array([where[w][0] for w in wheels], float),
         input_side=np.sign([where[w][1] for w in wheels]).astype(float),
-        input_noise=np.array(
-            [[inputs[w][q]["noise"] for w in wheels] for q in ("displacement", "velocity")], float
-        ),
+        input_noise=np.array([[inputs[w][q]["noise"] for w in wheels] for q in ("displacement", "velocity")], float),
         sensors=tuple(sensors),
         sensor_body=tuple(s["body"] for s in sensors.values()),
         pickup=np.array([_lever(bodies, s["body"], s["position"]) for s in sensors.values()]),

@@ -59,9 +59,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
     band = grid.band
     omega = grid.omega[band]
     bare = structure_of(system, projector.problem.sensors, fit.point.theta)
-    element_force = (
-        bare.stiffness * fit.motions.deflection[band] + bare.damping * fit.motions.rate[band]
-    )  # (F, E)
+    element_force = bare.stiffness * fit.motions.deflection[band] + bare.damping * fit.motions.rate[band]  # (F, E)
     kinds = bare.sensor_kind
     frequencies, ratios = _mode_grid(1 / grid.step)
     w0 = 2 * np.pi * frequencies[:, None]
@@ -136,9 +134,7 @@ def _local_median(scores: FloatArray, reach: int = 24) -> FloatArray:
     return median_filter(scores, size=2 * reach + 1, mode="nearest")
 
 
-def _refined_line(
-    projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float
-) -> Hit:
+def _refined_line(projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float) -> Hit:
     """Frequency, amplitude and phase of a line by exact columns near the bin."""
     grid = projector.grid
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")

@@ -71,9 +71,7 @@ class Trial:
 
 def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Hit]:
     """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
-    good = [
-        h for h in screening.hits if (screening.p_value(h) if multiplicity else h.p_single) <= alpha
-    ]
+    good = [h for h in screening.hits if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
         return []
     good.sort(key=_strength, reverse=True)
@@ -243,4 +241,3 @@ def _prior_cost(hit: Hit) -> float:
     if hit.family != "unnamed":
         return 0.0
     return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))
-

@@ -108,7 +108,17 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     tell(0.2, "screening all laws at all places")
     screening = screen(problem, base, options.catalogue, options.project)
     course = Course(
-        system, options, prepared, signals, problem.noise, problem, base, base, None, screening, screening  # type: ignore[arg-type]
+        system,
+        options,
+        prepared,
+        signals,
+        problem.noise,
+        problem,
+        base,
+        base,
+        None,
+        screening,
+        screening,  # type: ignore[arg-type]
     )
     _mend_inputs(course, declared, tell)
     split = course.problem.part.grid.samples

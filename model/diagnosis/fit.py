@@ -207,9 +207,7 @@ class Problem:
         modal = rows[None] * (scalar / np.sqrt(grid.samples))[:, None, :]
         return modal @ np.linalg.inv(vectors)
 
-    def _theta_forces(
-        self, forward: Forward, motions: Motions
-    ) -> tuple[ComplexArray, dict[int, ComplexArray]]:
+    def _theta_forces(self, forward: Forward, motions: Motions) -> tuple[ComplexArray, dict[int, ComplexArray]]:
         """Forces along the own element that act like a rise of log k (log c): (F, P); loads (F, n) of log masses."""
         omega, structure = forward.plant.grid.omega, forward.plant.structure
         forces = np.zeros((len(omega), len(self.system.parameters)), dtype=complex)
@@ -664,9 +662,7 @@ def _objective(residual: FloatArray, point: Point) -> float:
     return float(residual @ residual + np.sum((point.theta / PRIOR) ** 2))
 
 
-def _step(
-    jacobian: FloatArray, residual: FloatArray, point: Point, damping: float
-) -> tuple[FloatArray, FloatArray]:
+def _step(jacobian: FloatArray, residual: FloatArray, point: Point, damping: float) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton step and the standard deviations of theta and term parameters."""
     P = len(point.theta)
     normal = jacobian.T @ jacobian

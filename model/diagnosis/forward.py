@@ -35,9 +35,7 @@ DELAY, BOTH = "delay", "lag and delay"  # variants of a sensor's lag, which is e
 _REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
 
 
-def structure_of(
-    system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()
-) -> Structure:
+def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
     """Structure for log-ratios `theta` (P,) of the system's parameters, with the laws of bodies in place."""
     mechanics = system.mechanics
     for term in terms:

@@ -30,9 +30,7 @@ def force_along(
         alpha, beta, exponent = parameters
         return alpha * bouc_wen_memory(deflection, beta, exponent)
     step = time[1] - time[0]
-    return along(
-        law, parameters, deflection, rate, sample_rate=1 / step, element=element, start=time[0] + CLOCK_LEAD
-    )
+    return along(law, parameters, deflection, rate, sample_rate=1 / step, element=element, start=time[0] + CLOCK_LEAD)
 
 
 def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float) -> FloatArray:

@@ -254,11 +254,7 @@ def _verdict(findings: list[Finding]) -> Verdict:
 def _undecided(course: Course) -> list[str]:
     """What the recording is too short or too still to tell."""
     sigma = np.sqrt(np.maximum(np.diag(course.fit.covariance), 0))
-    loose = [
-        p.name
-        for i, p in enumerate(course.system.parameters)
-        if sigma[i] > _LOOSE
-    ]
+    loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > _LOOSE]
     if not loose:
         return []
     shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")

@@ -232,9 +232,7 @@ class Plant:
         scale = np.abs(system).max(axis=1)
         scale[scale == 0] = 1.0
         columns = np.tile(1 / np.sqrt(np.maximum(np.abs(np.diag(s.K)), s.mass / T**2)), p)
-        solution = np.linalg.lstsq(
-            system * columns / scale[:, None], load.reshape(-1) / scale, rcond=1e-13
-        )[0]
+        solution = np.linalg.lstsq(system * columns / scale[:, None], load.reshape(-1) / scale, rcond=1e-13)[0]
         return (solution * columns).reshape(p, n)
 
     def polynomial_sensors(self, q: FloatArray, support: FloatArray) -> FloatArray:

@@ -301,4 +301,3 @@ def _admissible(law: ElementLaw, trial: FloatArray, amplitude: float) -> bool:
     spec = law.parameters[law.strength]
     slack = 0.0 if spec.low == 0 and law.absent[law.strength] == 0 else abs(spec.high - spec.low)
     return spec.low - 0.5 * min(slack, 1.0) <= value <= spec.high + 0.5 * min(slack, 1.0)
-

@@ -86,9 +86,7 @@ class Grid:
 
     def fine(self, spectrum: ComplexArray) -> FloatArray:
         """Band-limited series on the oversampled axis: (F, ...) -> (OVERSAMPLING N, ...)."""
-        return scipy.fft.irfft(spectrum, OVERSAMPLING * self.samples, axis=0) * (
-            OVERSAMPLING * np.sqrt(self.samples)
-        )
+        return scipy.fft.irfft(spectrum, OVERSAMPLING * self.samples, axis=0) * (OVERSAMPLING * np.sqrt(self.samples))
 
     def coarse_spectrum(self, fine_series: FloatArray) -> ComplexArray:
         """Transform of an oversampled series, kept up to the record's Nyquist frequency."""

@@ -29,9 +29,7 @@ def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Pat
     units = {channel.name: channel.unit for channel in system.channels}
     figures: dict[str, Figure | None] = {
         "system": drawing.draw_system(system, findings, report.localization),
-        "fit": signals.fit_figure(
-            report, system.sensors, tuple(units[s] for s in system.sensors), system.sample_rate
-        ),
+        "fit": signals.fit_figure(report, system.sensors, tuple(units[s] for s in system.sensors), system.sample_rate),
         "sensors": signals.sensor_figure(report),
         "locations": values.location_figure(report),
         "parameters": values.parameter_figure(report),

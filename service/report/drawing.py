@@ -257,9 +257,16 @@ def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings:
         beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, y)
         words = "\n".join(textwrap.wrap(findings[name], 44 if len(known) <= 2 else 26)[:3])
         axes.annotate(
-            f"{name}\n{words}", xy=place, xytext=beside, fontsize=10 if len(known) <= 2 else 8.5, color=ink.HIGHLIGHT,
-            ha="left" if layout.slant == 0 else "center", va="center" if layout.slant == 0 else "top",
-            fontweight="bold", zorder=200, annotation_clip=False,
+            f"{name}\n{words}",
+            xy=place,
+            xytext=beside,
+            fontsize=10 if len(known) <= 2 else 8.5,
+            color=ink.HIGHLIGHT,
+            ha="left" if layout.slant == 0 else "center",
+            va="center" if layout.slant == 0 else "top",
+            fontweight="bold",
+            zorder=200,
+            annotation_clip=False,
             bbox={"boxstyle": "round,pad=0.35", "fc": "white", "ec": ink.HIGHLIGHT, "lw": 1.2},
             arrowprops={"arrowstyle": "-|>", "color": ink.HIGHLIGHT, "lw": 1.4, "shrinkB": 6},
         )

@@ -95,8 +95,13 @@ def _curve_panel(axes: Axes, report: Report, finding: int, x: Array, mean: Array
     if spread is not None:
         for width, shade in ((2, 0.16), (1, 0.24)):
             axes.fill_between(
-                x * factor, (mean - width * spread) * scale, (mean + width * spread) * scale, color=ink.AFTER,
-                alpha=shade, lw=0, label="± 1 and 2 std" if width == 1 else None,
+                x * factor,
+                (mean - width * spread) * scale,
+                (mean + width * spread) * scale,
+                color=ink.AFTER,
+                alpha=shade,
+                lw=0,
+                label="± 1 and 2 std" if width == 1 else None,
             )
     axes.plot(x * factor, mean * scale, color=ink.AFTER, lw=1.6, label="identified without a law")
     if law is not None:
@@ -136,8 +141,14 @@ def _map_figure(report: Report, finding: int) -> Figure:
             drawn.append((panels[1], spread, "Greys", 0.0, "its standard deviation"))
         for axes, values, colours, low, title in drawn:
             image = axes.pcolormesh(
-                d * x_factor, v * y_factor, values * scale, cmap=colours, vmin=low,
-                vmax=top if low < 0 else None, shading="nearest", rasterized=True,
+                d * x_factor,
+                v * y_factor,
+                values * scale,
+                cmap=colours,
+                vmin=low,
+                vmax=top if low < 0 else None,
+                shading="nearest",
+                rasterized=True,
             )
             figure.colorbar(image, ax=axes, label=unit, pad=0.02)
             axes.set_xlabel(f"deflection [{x_unit}]")

@@ -143,9 +143,11 @@ def _groups(report: Report, inside: Mapping[str, str]) -> list[dict[str, Any]]:
             title = f"{finding.location}: {words.finding_words(finding)}"
             groups.append({"title": title, "pictures": own, "note": ""})
     if "fit" in inside:
-        groups.append({
-            "title": "Measured against simulated, held-out part",
-            "pictures": [inside["fit"]],
-            "note": "Free-running: the simulation sees the measured inputs only.",
-        })
+        groups.append(
+            {
+                "title": "Measured against simulated, held-out part",
+                "pictures": [inside["fit"]],
+                "note": "Free-running: the simulation sees the measured inputs only.",
+            }
+        )
     return groups

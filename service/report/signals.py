@@ -125,8 +125,16 @@ def sensor_figure(report: Report) -> Figure | None:
         axes.scatter([before[n] for n in names], rows, color=ink.BEFORE, s=34, label="nominal", zorder=3)
         if report.findings:
             axes.scatter(low, rows, color=ink.AFTER, s=34, label="with finding", zorder=4)
-        axes.scatter([floor.get(n, np.nan) for n in names], rows, color=ink.NOISE, marker="|", s=90, lw=2,
-                     label="noise floor", zorder=5)
+        axes.scatter(
+            [floor.get(n, np.nan) for n in names],
+            rows,
+            color=ink.NOISE,
+            marker="|",
+            s=90,
+            lw=2,
+            label="noise floor",
+            zorder=5,
+        )
         axes.set_yticks(rows, names)
         axes.set_xlabel("rms error / rms measured, held-out part")
         axes.set_xlim(left=0)

@@ -73,8 +73,15 @@ def parameter_figure(report: Report) -> Figure | None:
                 after = np.array([np.nan if r.after is None else r.after / r.nominal for r in mine])
                 axes.hlines(place, before, after, color="#c6ced6", lw=3.5, zorder=1)
             axes.errorbar(
-                before, place, xerr=[2 * r.before_std / r.nominal for r in mine], fmt="o", ms=5, color=ink.BEFORE,
-                lw=1.2, label="nominal structure", zorder=3,
+                before,
+                place,
+                xerr=[2 * r.before_std / r.nominal for r in mine],
+                fmt="o",
+                ms=5,
+                color=ink.BEFORE,
+                lw=1.2,
+                label="nominal structure",
+                zorder=3,
             )
             if report.findings:
                 spread = [2 * (r.after_std or 0.0) / r.nominal for r in mine]
