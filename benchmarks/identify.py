@@ -191,6 +191,7 @@ def _speed(system: System, scipy_windows: int) -> Iterator[dict]:
             "value": round(seconds, 2),
             "unit": "s/window",
             "error_percent": round(100 * float(np.mean(wrong)), 3),
+            "start_error_percent": round(100 * float(np.abs(np.expm1(-runs.log_ratio[:scipy_windows])).mean()), 3),
             "our_error_percent": round(100 * ours, 3),
             "converged": sum(r.converged for r in results),
             "windows": scipy_windows,

@@ -31,14 +31,14 @@ class ScipyPeer:
         self.state_scale = np.r_[np.full(9, 1e-2), np.full(9, 0.2)]
 
     def fit(self, window: FloatArray, help_given: str, limit: float = 120.0) -> PeerFit:
-        """help_given: none (2-point Jacobian of the joint problem) or analytic (initial state and sensitivities
-        solved by linear algebra, parameters only in the search)."""
+        """help_given: none (2-point Jacobian of the joint problem, library defaults) or analytic (initial state solved
+        by linear algebra, parameters only in the search, a difference step that suits the solver)."""
         begin = time.perf_counter()
         P = len(self.system.parameters)
         u = self._drive(window)
         fit = self._joint if help_given == "none" else self._separated
-        log_ratio, converged = fit(window, u, P, begin + limit)
-        return PeerFit(log_ratio, time.perf_counter() - begin, converged)
+        ratio, converged = fit(window, u, P, begin + limit)
+        return PeerFit(np.log(np.maximum(ratio, 1e-3)), time.perf_counter() - begin, converged)
 
     def _drive(self, window: FloatArray):
         t = np.arange(len(window)) / self.system.sample_rate
@@ -50,12 +50,12 @@ class ScipyPeer:
 
         return u
 
-    def _matrices(self, log_ratio: FloatArray):
-        value = self.system.nominal * np.exp(log_ratio)
+    def _matrices(self, ratio: FloatArray):
+        value = self.system.nominal * ratio
         return self.system.mechanics.matrices(value[:12], value[12:])
 
-    def _simulate(self, log_ratio: FloatArray, x0: FloatArray, u, samples: int) -> FloatArray:
-        A, B, C, D = self._matrices(log_ratio)
+    def _simulate(self, ratio: FloatArray, x0: FloatArray, u, samples: int) -> FloatArray:
+        A, B, C, D = self._matrices(ratio)
         t = np.arange(samples) / self.system.sample_rate
         solution = solve_ivp(lambda s, x: A @ x + B @ u(s), (0, t[-1]), x0, t_eval=t, rtol=1e-6, atol=1e-9)
         return solution.y.T @ C.T + np.array([u(s) for s in t]) @ D.T
@@ -70,7 +70,7 @@ class ScipyPeer:
             best[0] = z
             return ((measured - y) / self.system.sensor_noise).ravel()
 
-        best = [np.zeros(P + 18)]
+        best = [np.r_[np.ones(P), np.zeros(18)]]
         try:
             found = least_squares(residual, best[0], x_scale="jac", xtol=1e-6, ftol=1e-6)
         except TimeoutError:
@@ -78,7 +78,7 @@ class ScipyPeer:
         return found.x[:P], bool(found.success)
 
     def _separated(self, window: FloatArray, u, P: int, deadline: float) -> tuple[FloatArray, bool]:
-        """The help: free responses by the matrix exponential and projected out, forced response by solve_ivp."""
+        """The help: free responses by the matrix exponential and projected out, and a step for the differences."""
         measured = window[:, self.inputs :]
 
         def residual(z: FloatArray) -> FloatArray:
@@ -95,9 +95,10 @@ class ScipyPeer:
             best[0] = z
             return r - q @ (q.T @ r)
 
-        best = [np.zeros(P)]
+        best = [np.ones(P)]
         try:
-            found = least_squares(residual, best[0], method="trf", xtol=1e-6, ftol=1e-6, bounds=(-2.5, 2.5))
+            # Differences of a hundredth stand clear of the solver's tolerance; the default ones drown in it.
+            found = least_squares(residual, best[0], diff_step=1e-2, xtol=1e-4, ftol=1e-4, bounds=(0.1, 5.0))
         except TimeoutError:
             return best[0], False
         return found.x, bool(found.success)
