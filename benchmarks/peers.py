@@ -30,7 +30,7 @@ class ScipyPeer:
         self.inputs = len(system.inputs)
         self.state_scale = np.r_[np.full(9, 1e-2), np.full(9, 0.2)]
 
-    def fit(self, window: FloatArray, help_given: str, limit: float = 120.0) -> PeerFit:
+    def fit(self, window: FloatArray, help_given: str, limit: float = 240.0) -> PeerFit:
         """help_given: none (2-point Jacobian of the joint problem, library defaults) or analytic (initial state solved
         by linear algebra, parameters only in the search, a difference step that suits the solver)."""
         begin = time.perf_counter()
