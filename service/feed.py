@@ -18,6 +18,7 @@ from replay import open_recording
 from replay.pacing import paced
 from replay.windowing import Windower
 from service.compute import Priority
+from service.errors import Busy
 from service.pipeline import Batch, Identified, Pipeline
 from service.times import NANOSECONDS
 
@@ -136,9 +137,13 @@ def feed_file(
 def feed_live(pipeline: Pipeline, source: Source, vehicle: str, stopping: threading.Event, on_tally: OnTally) -> None:
     """Feed a live source until it ends or `stopping` is set; every window as soon as it is whole."""
     fed = Fed(vehicle)
-    for window in _windows(pipeline, _until(source.blocks(), stopping), fed):
-        _count(fed, pipeline.process(fed.vehicle, [window], None, Priority.LIVE))
-        on_tally(source.tally)
+    try:
+        for window in _windows(pipeline, _until(source.blocks(), stopping), fed):
+            _count(fed, pipeline.process(fed.vehicle, [window], None, Priority.LIVE))
+            on_tally(source.tally)
+    except Busy:  # a service that stops accepts nothing more; what it had accepted is stored
+        if not stopping.is_set():
+            raise
     on_tally(source.tally)
 
 
