@@ -27,7 +27,7 @@ def time_domain_bound(system: System, clean: FloatArray, log_ratio: FloatArray, 
     x = torch.as_tensor(log_ratio)[None]
     values = simulator.element_values(x)
     discrete = simulator.discretise(values)
-    free = simulator.free_response(discrete, T)[0].numpy().transpose(0, 1, 2).reshape(T * S, -1)
+    free = simulator.free_response(discrete, T)[0].numpy().reshape(T * S, -1)
     measured = clean[:, len(system.inputs) :].reshape(-1)
     none = torch.zeros(1, free.shape[1], dtype=torch.float64)
     forced = simulator.simulate(x, w, none)[0].numpy().reshape(-1)

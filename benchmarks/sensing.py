@@ -8,9 +8,10 @@ import numpy as np
 
 from model.excitation import Runs
 from model.mechanics import DISPLACEMENT, VELOCITY
+from model.refine import Refiner
 from model.schema import MotionSensor
-from model.simulate.linear import LinearSimulator
-from model.system import System
+from model.signals import FloatArray
+from model.system import System, load_system
 
 
 def full_state_system(typical: Runs, share: float) -> System:
@@ -19,8 +20,6 @@ def full_state_system(typical: Runs, share: float) -> System:
     Inputs are known.  States are sensors on degrees of freedom, which no system file can say (a roll angle is no
     vertical motion of a point), so the mechanics is put in place by hand.
     """
-    from model.system import load_system
-
     base = load_system()
     states = _states(base, typical)
     noise = share * np.sqrt((states**2).mean(axis=(0, 1)))
@@ -49,12 +48,7 @@ def full_state_system(typical: Runs, share: float) -> System:
     return system
 
 
-def _states(system: System, runs: Runs) -> np.ndarray:
+def _states(system: System, runs: Runs) -> FloatArray:
     """States of clean runs, (B, T, N)."""
-    import torch
-
-    from model.refine import Refiner
-
-    refined = Refiner(system, runs.clean.shape[1]).refine(runs.clean, runs.log_ratio, iterations=1, states=True)
-    assert LinearSimulator(system).H.shape[1] * 2 == refined.states.shape[2]
-    return np.asarray(torch.as_tensor(refined.states))
+    refiner = Refiner(system, runs.clean.shape[1])
+    return refiner.refine(runs.clean, runs.log_ratio, iterations=1, states=True).states

@@ -136,9 +136,10 @@ class WindowModel:
 
         left = white[..., :1] - white[..., 1:] @ x0[:, None, :, None].to(white.dtype)  # (B, F, R, 1)
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
-        J = self._sensitivities(values, compliance, whiten @ per_force, forced, x0, discrete, data, noise)
+        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
+        J = self._sensitivities(values, compliance, whiten @ per_force, states, data, noise)
         if s.estimates_mass:
-            J = torch.cat([J, self._mass_columns(values, compliance, whiten, forced, x0, discrete, data)], dim=3)
+            J = torch.cat([J, self._mass_columns(values, compliance, whiten, states, data)], dim=3)
         J = _rows(J)
         columns = torch.cat([basis, J], dim=1)
         across_products = basis @ J.mT
@@ -207,8 +208,12 @@ class WindowModel:
     def _sensing(self, values: ElementValues, data: WindowBatch) -> Tensor:
         """Compressed signals per degree of freedom, (B, F, R, n)."""
         kind = self.frequency.jw.dtype
+        return self._signal_rows(data, kind) @ self.frequency.sensing(values)
+
+    def _signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
+        """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
         select = torch.eye(len(data.present), dtype=kind)[data.present]
-        return (self.compression(data.present).to(kind) @ select) @ self.frequency.sensing(values)
+        return self.compression(data.present).to(kind) @ select
 
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression(data.present).mT
@@ -228,7 +233,7 @@ class WindowModel:
         s, f = self.simulator, self.frequency
         compliance = torch.linalg.inv(f.stiffness(values))
         kind = compliance.dtype
-        Q = self.compression(data.present).to(kind) @ torch.eye(len(data.present), dtype=kind)[data.present]
+        Q = self._signal_rows(data, kind)
         sensing = f.sensing(values) if f.element_sensors else f.motion_sensing
         per_load = (Q @ sensing) @ compliance
         per_force = -per_load @ s.H.T.to(kind)
@@ -256,16 +261,13 @@ class WindowModel:
         values: ElementValues,
         compliance: Tensor,
         per_force: Tensor,
-        forced: Tensor,
-        x0: Tensor,
-        discrete: Discrete,
+        states: Tensor,
         data: WindowBatch,
         noise: Tensor,
     ) -> Tensor:
         """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P')."""
         s = self.simulator
         n = s.H.shape[1]
-        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
         d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
         v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
         spectra = torch.fft.rfft(torch.cat([d, v], dim=2), dim=1)[:, : self.bins]
@@ -290,16 +292,13 @@ class WindowModel:
         values: ElementValues,
         compliance: Tensor,
         whiten: Tensor,
-        forced: Tensor,
-        x0: Tensor,
-        discrete: Discrete,
+        states: Tensor,
         data: WindowBatch,
     ) -> Tensor:
         """Whitened sensitivities to the masses: inertia forces m q'' along the motion, (B, F, R, masses)."""
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]
-        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
         acceleration = (
             states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
         )
