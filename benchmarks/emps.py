@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.silverbox import data_file
-from model.diagnosis.diagnose import Options, diagnose
+from benchmarks.silverbox import data_file, diagnosis_of
 from model.system import load_system
 from replay.record import load_record
 
@@ -25,13 +24,7 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yields the diagnosis and every published value beside the identified one."""
     system = load_system(SYSTEM)
     path = data_file(data, "closed_loop.csv")
-    record = load_record(path, system.channels, system.sample_rate)
-    report = diagnose(system, record, options=Options(file=path.name))
-    if out is not None:
-        from service.report import write_report
-
-        write_report(report, system, out)
-    said = report.to_dict()
+    said = diagnosis_of(system, load_record(path, system.channels, system.sample_rate), path.name, out)
     yield {
         "verdict": said["verdict"],
         "findings": said["findings"],

@@ -20,8 +20,8 @@ from scipy import optimize, signal
 
 from benchmarks.generator.laws import LAWS
 from model.diagnosis.diagnose import Options, diagnose
-from model.system import load_system
-from replay.record import load_record
+from model.system import System, load_system
+from replay.record import Record, load_record
 
 Array = NDArray[np.float64]
 Model = tuple[float, float, float, Callable[[float, float], float]]  # mass, damping, stiffness, force of the laws
@@ -41,12 +41,7 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
     system = load_system(SYSTEM)
     train = data_file(data, "train.csv")
     record = load_record(train, system.channels, system.sample_rate)
-    report = diagnose(system, record, options=Options(file=train.name))
-    if out is not None:
-        from service.report import write_report
-
-        write_report(report, system, out)
-    said = report.to_dict()
+    said = diagnosis_of(system, record, train.name, out)
     yield {
         "verdict": said["verdict"],
         "findings": said["findings"],
@@ -63,6 +58,16 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             error = free_run_error(model, test.values, system.sample_rate, offset)
             line[f"rmse_{key}_mv"] = 1e3 * error
         yield {**line, "met": line["rmse_augmented_mv"] <= target}
+
+
+def diagnosis_of(system: System, record: Record, name: str, out: Path | None) -> dict[str, Any]:
+    """The report on a record as JSON; `out` also receives its page and pictures."""
+    report = diagnose(system, record, options=Options(file=name))
+    if out is not None:
+        from service.report import write_report
+
+        write_report(report, system, out)
+    return report.to_dict()
 
 
 def data_file(data: Path, name: str) -> Path:
