@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from model.signals import IntArray
+from model.signals import BoolArray, IntArray
 
 CHUNK = 32  # windows; twice as many take half as long again each
 Piece = TypeVar("Piece")
@@ -18,6 +18,15 @@ Result = TypeVar("Result")
 def chunks(of: IntArray) -> list[IntArray]:
     """Indices in pieces of at most `CHUNK`, of nearly equal size."""
     return [np.asarray(part) for part in np.array_split(of, max(1, -(-len(of) // CHUNK)))]
+
+
+def alike(present: BoolArray, of: IntArray) -> list[IntArray]:
+    """The windows `of` in groups with the same signals present; present (B, S)."""
+    chosen = present[of]
+    if (chosen == chosen[:1]).all():
+        return [of]
+    patterns, which = np.unique(chosen, axis=0, return_inverse=True)
+    return [of[which.reshape(-1) == i] for i in range(len(patterns))]
 
 
 def share(work: Callable[[Piece], Result], pieces: Sequence[Piece], workers: int) -> list[Result]:

@@ -69,12 +69,16 @@ class EstimatorNet(nn.Module):
         # Power of noise in every row: products of [regressors, target], shape (R, P + 1, P + 1).
         self.register_buffer("noise", torch.zeros(R, P + 1, P + 1))
 
-    def forward(self, target: Tensor, regressors: Tensor) -> tuple[Tensor, Tensor]:
+    def noise_taken(self) -> Tensor:
+        """What the noise adds to the weighted normal equations, as far as it is taken out, (P + 1, P + 1)."""
+        weight = torch.exp(2 * self.log_weight)
+        return (weight @ self.noise.flatten(1)).reshape(self.noise.shape[1:]) * torch.sigmoid(self.compensation)
+
+    def forward(self, target: Tensor, regressors: Tensor, noise_taken: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """log-ratio (B, P) and covariance (B, P, P) from rows (B, R) and (B, R, P)."""
         P = self.architecture.parameters
-        weight = torch.exp(self.log_weight)
-        rows = torch.cat([regressors, target.unsqueeze(2)], dim=2) * weight[:, None]
-        taken = (weight.square() @ self.noise.flatten(1)).reshape(P + 1, P + 1) * torch.sigmoid(self.compensation)
+        rows = torch.cat([regressors, target.unsqueeze(2)], dim=2) * torch.exp(self.log_weight)[:, None]
+        taken = self.noise_taken() if noise_taken is None else noise_taken
         products = rows.mT @ rows
         raw = products[:, :P, :P]
         diagonal = torch.diagonal(raw, dim1=1, dim2=2)
@@ -121,13 +125,15 @@ class Estimator:
         self.system, self.net, self.digest = system, net.double().eval(), digest
         self.samples = net.architecture.samples
         self.features = ForceBalance(system, self.samples)
+        with torch.no_grad():
+            self.noise_taken = self.net.noise_taken()
 
     def estimate(self, windows: FloatArray, workers: int = 1) -> EstimatorOutput:
         """Log-ratios and predicted covariances of windows (B, T, C); `workers`: see `model.chunks`."""
 
         def work(at: IntArray) -> tuple[FloatArray, FloatArray]:
             with torch.no_grad():
-                log_ratio, covariance = self.net(*self.features(windows[at]))
+                log_ratio, covariance = self.net(*self.features(windows[at]), self.noise_taken)
             finite = torch.isfinite(log_ratio).all(dim=1)
             return torch.where(finite[:, None], log_ratio, torch.zeros_like(log_ratio)).numpy(), covariance.numpy()
 

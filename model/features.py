@@ -17,6 +17,7 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from model.chunks import alike
 from model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
 from model.signals import BoolArray, FloatArray, IntArray
 from model.simulate.linear import LinearSimulator
@@ -93,9 +94,8 @@ class ForceBalance:
         """Motion of the degrees of freedom, weighted least squares over the sensors that are present."""
         present = ~np.isnan(sensors).any(axis=1) & self.use
         out = np.zeros((len(sensors), sensors.shape[1], self.system.mechanics.n))
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
-        for i, pattern in enumerate(patterns):
-            at = which.reshape(-1) == i
+        for at in alike(present, np.arange(len(sensors))):
+            pattern = present[at[0]]
             out[at] = sensors[at][:, :, pattern] @ self._inverse(pattern).T
         return torch.as_tensor(out)
 

@@ -40,8 +40,9 @@ class Linearisation:
     """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
 
     whiten: Tensor  # shape (B, F, R, R), weights of the bins included
-    columns: Tensor  # whitened [free responses, sensitivities], shape (B, N + P, K)
-    column_scale: Tensor  # of the free responses, shape (B, N)
+    free: Tensor  # whitened free responses, normalised, shape (B, N, K)
+    free_scale: Tensor  # what they were divided by, shape (B, N)
+    sensitivities: Tensor  # whitened, shape (B, P, K)
     factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N, N)
     across: Tensor  # free responses solved for the sensitivities, shape (B, N, P)
     covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
@@ -53,7 +54,7 @@ class Linearisation:
 
     def state_after(self, step: Tensor) -> Tensor:
         """Best initial state when the log-ratios move by `step`."""
-        return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.column_scale
+        return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +83,18 @@ class WindowModel:
         self.sensor_noise = system.sensor_noise
         self._compressions: dict[bytes, Tensor] = {}
 
-    def batch(self, windows: FloatArray, present: BoolArray) -> WindowBatch:
-        """Windows (B, T, C) in which exactly the sensors `present` are measured."""
-        inputs = len(self.system.inputs)
-        w = torch.as_tensor(self.simulator.knots(windows[:, :, :inputs]))
-        return WindowBatch(w, torch.as_tensor(windows[:, :, inputs:][:, :, present]), present)
+    @property
+    def states_count(self) -> int:
+        return 2 * self.simulator.H.shape[1]
+
+    def knots(self, windows: FloatArray) -> FloatArray:
+        """Knots of the drives, (B, T, W), of windows (B, T, C)."""
+        return self.simulator.knots(windows[:, :, : len(self.system.inputs)])
+
+    def batch(self, knots: FloatArray, windows: FloatArray, present: BoolArray) -> WindowBatch:
+        """Windows (B, T, C), their knots (B, T, W) at hand, in which exactly the sensors `present` are measured."""
+        sensors = windows[:, :, len(self.system.inputs) :][:, :, present]
+        return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present)
 
     def compression(self, present: BoolArray) -> Tensor:
         """Matrix (R, S') from the sensors present to independent signals of unit noise."""
@@ -118,30 +126,28 @@ class WindowModel:
         forced = s.states(discrete, data.w, x.new_zeros(len(x), discrete.Ad.shape[1]))
         residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
         free = s.free_response(discrete, self.samples)
-        spectra = torch.fft.rfft(torch.cat([residual.unsqueeze(3), free], dim=3), dim=1)[:, : self.bins]
 
         compliance, per_force, carried = self._transfer(values, data)
         whiten = self._whitening(carried)
-        white = whiten @ spectra
-        flat = _rows(white)  # (B, 1 + N, K)
-        r, basis = flat[:, :1], flat[:, 1:]
-        column_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
-        basis = basis / column_scale.unsqueeze(2)
+        white_residual = whiten @ self._spectra(residual).unsqueeze(3)  # (B, F, R, 1)
+        white_free = whiten @ self._spectra(free)  # (B, F, R, N)
+        r, basis = _rows(white_residual), _rows(white_free)  # (B, 1, K), (B, N, K)
+        free_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
+        basis = basis / free_scale.unsqueeze(2)
         products = basis @ basis.mT
         factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(products.shape[1], dtype=x.dtype))
         along = basis @ r.mT  # (B, N, 1)
         x0_scaled = torch.cholesky_solve(along, factor).squeeze(2)
-        x0 = x0_scaled / column_scale
+        x0 = x0_scaled / free_scale
         cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
 
-        left = white[..., :1] - white[..., 1:] @ x0[:, None, :, None].to(white.dtype)  # (B, F, R, 1)
+        left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
-        states = forced + s.states(discrete, torch.zeros_like(data.w), x0)
+        states = forced + s.free_states(discrete, x0, self.samples)
         J = self._sensitivities(values, compliance, whiten @ per_force, states, data, noise)
         if s.estimates_mass:
             J = torch.cat([J, self._mass_columns(values, compliance, whiten, states, data)], dim=3)
         J = _rows(J)
-        columns = torch.cat([basis, J], dim=1)
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
         information = J @ J.mT - across_products.mT @ across
@@ -149,7 +155,7 @@ class WindowModel:
         prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
         covariance = torch.linalg.inv(information + prior)
         step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
-        return Linearisation(whiten, columns, column_scale, factor, across, covariance, x, x0, cost, gradient, step)
+        return Linearisation(whiten, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step)
 
     def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
         """One more step from (x, x0) with the products of `at`."""
@@ -157,15 +163,14 @@ class WindowModel:
         discrete = self._present(s.discretise(s.element_values(x)), data)
         states = s.states(discrete, data.w, x0)
         error = data.measured - states @ discrete.C.mT - data.w @ discrete.D.mT
-        spectra = torch.fft.rfft(error @ self.compression(data.present).mT, dim=1)[:, : self.bins].unsqueeze(3)
-        r = _rows(at.whiten @ spectra)  # (B, 1, K)
-        N = x0.shape[1]
-        along = at.columns @ r.mT  # (B, N + P, 1)
-        free_part = torch.cholesky_solve(along[:, :N], at.factor)
-        gradient = along[:, N:] - at.across.mT @ along[:, :N]
+        spectra = self._spectra(error @ self.compression(data.present).mT)
+        r = _rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
+        along = at.free @ r
+        free_part = torch.cholesky_solve(along, at.factor)
+        gradient = at.sensitivities @ r - at.across.mT @ along
         step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
-        cost = r.square().sum(dim=(1, 2)) - (along[:, :N] * free_part).sum(dim=(1, 2))
-        x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.column_scale
+        cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
+        x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.free_scale
         return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt())
 
     def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
@@ -200,7 +205,7 @@ class WindowModel:
         by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
         k_at, c_at = s.estimated_elements
         noise = torch.cat([by_k[:, k_at], by_c[:, c_at]], dim=1)
-        shown = at.columns[:, -at.x.shape[1] :].square().sum(dim=2)
+        shown = at.sensitivities.square().sum(dim=2)
         share = torch.zeros_like(shown)
         share[:, : noise.shape[1]] = noise / shown[:, : noise.shape[1]].clamp_min(1e-300)
         return share
@@ -214,6 +219,10 @@ class WindowModel:
         """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
         select = torch.eye(len(data.present), dtype=kind)[data.present]
         return self.compression(data.present).to(kind) @ select
+
+    def _spectra(self, signals: Tensor) -> Tensor:
+        """Bins within the band of signals (B, T, ...), (B, F, ...)."""
+        return torch.fft.rfft(signals, dim=1)[:, : self.bins]
 
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression(data.present).mT
@@ -234,8 +243,8 @@ class WindowModel:
         compliance = torch.linalg.inv(f.stiffness(values))
         kind = compliance.dtype
         Q = self._signal_rows(data, kind)
-        sensing = f.sensing(values) if f.element_sensors else f.motion_sensing
-        per_load = (Q @ sensing) @ compliance
+        sensing = Q @ (f.sensing(values) if f.element_sensors else f.motion_sensing)
+        per_load = sensing @ compliance
         per_force = -per_load @ s.H.T.to(kind)
         dynamic = self.frequency.dynamic(values)
         drive = per_load.new_zeros(*per_load.shape[:3], s.W // 2)

@@ -25,8 +25,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.chunks import chunks, share
-from model.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
+from model.chunks import alike, chunks, share
+from model.linearise import PRIOR_STD, WindowBatch, WindowModel
 from model.signals import BoolArray, FloatArray, IntArray
 from model.system import System
 
@@ -73,20 +73,34 @@ class Refiner:
         self, windows: FloatArray, start: FloatArray | None = None, *, iterations: int = 12, states: bool = False
     ) -> Refined:
         """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors."""
-        first = np.zeros((len(windows), len(self.system.parameters))) if start is None else start
         present = ~np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1)
-        patterns, which = np.unique(present, axis=0, return_inverse=True)
-        pieces = [
-            (pattern, at) for i, pattern in enumerate(patterns) for at in chunks(np.flatnonzero(which.reshape(-1) == i))
-        ]
+        everything = np.arange(len(windows))
+        knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
+        progress = _Progress.begin(start, *present.shape, len(self.system.parameters), self.model.states_count)
 
-        def work(piece: tuple[BoolArray, IntArray]) -> Refined:
-            pattern, at = piece
+        def batch(at: IntArray) -> WindowBatch:
+            return self.model.batch(knots[at], windows[at], present[at[0]])
+
+        def iterate(at: IntArray) -> None:
             with torch.no_grad():
-                data = self.model.batch(windows[at], pattern)
-                return self._refine_chunk(data, torch.as_tensor(first[at]), iterations, states)
+                self._iterate(batch(at), progress, torch.as_tensor(at))
 
-        return _in_order(share(work, pieces, self.workers), np.concatenate([at for _, at in pieces]))
+        def conclude(at: IntArray) -> Refined:
+            with torch.no_grad():
+                return self._result(batch(at), progress, torch.as_tensor(at), states)
+
+        active = everything
+        for _ in range(iterations):
+            share(iterate, self._pieces(present, active), self.workers)
+            # The few that need more are gathered from all chunks.
+            active = active[~progress.converged.numpy()[active]]
+            if len(active) == 0:
+                break
+        pieces = self._pieces(present, everything)
+        return _in_order(share(conclude, pieces, self.workers), np.concatenate(pieces))
+
+    def _pieces(self, present: BoolArray, of: IntArray) -> list[IntArray]:
+        return [piece for group in alike(present, of) for piece in chunks(group)]
 
     def misfit(self, windows: FloatArray, log_ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Weighted squares of the simulated outputs (B,) at given parameters and their gradient (B, P).
@@ -94,63 +108,33 @@ class Refiner:
         Every sensor must be present.
         """
         with torch.no_grad():
-            data = self.model.batch(windows, np.ones(len(self.system.sensors), dtype=bool))
+            data = self.model.batch(self.model.knots(windows), windows, np.ones(len(self.system.sensors), dtype=bool))
             at = self.model.linearise(torch.as_tensor(log_ratio), data)
         return at.cost.numpy(), -2 * at.gradient.numpy()
 
-    def _refine_chunk(self, data: WindowBatch, start: Tensor, iterations: int, states: bool) -> Refined:
-        B, P = start.shape
-        x = start.to(torch.float64).clone()
-        x0 = torch.zeros(B, 2 * self.model.simulator.H.shape[1], dtype=torch.float64)
-        covariance = torch.zeros(B, P, P, dtype=torch.float64)
-        cost = torch.full((B,), torch.inf, dtype=torch.float64)
-        best = x.clone()
-        converged = torch.zeros(B, dtype=torch.bool)
-        taken = torch.zeros(B, dtype=torch.long)
-        error = torch.zeros(B, data.measured.shape[2], dtype=torch.float64)
-        active = torch.arange(B)
-        for iteration in range(1, iterations + 1):
-            chosen = data.take(active)
-            at = self.model.linearise(x[active], chosen)
-            worse = at.cost > cost[active] * (1 + 1e-6) + 1e-9
-            step, second = self._iterate(at, chosen)
-            std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
-            held = second.cost <= at.cost * (1 + 1e-6) + 1e-9
-            small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
-            final = at.x + step + _limited(second.step)
-            # A step that made things worse is taken back to a third.
-            retreat = best[active] + (x[active] - best[active]) / 3
-            forward = torch.where(held[:, None], final, at.x + step / 3)
-            x[active] = torch.where(worse[:, None], retreat, forward)
-            better = active[~worse]
-            best[better], cost[better] = at.x[~worse], at.cost[~worse]
-            done = small & ~worse
-            taken[active] = iteration
-            x0[active], covariance[active], error[active] = second.x0, at.covariance, second.error
-            cost[active[done]] = second.cost[done]
-            converged[active[done]] = True
-            active = active[~done]
-            if len(active) == 0:
-                break
-        return self._result(data, x, x0, covariance, cost, converged, taken, error, states)
-
-    def _iterate(self, at: Linearisation, data: WindowBatch) -> tuple[Tensor, Chord]:
-        """The first step and the chord step from where it leads."""
+    def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor) -> None:
+        """A full linearisation and a chord step for the windows `rows`, whose data are given."""
+        x, cost, best = progress.x[rows], progress.cost[rows], progress.best[rows]
+        at = self.model.linearise(x, data)
         step = _limited(at.step)
-        return step, self.model.chord(at, at.x + step, at.state_after(step), data)
+        second = self.model.chord(at, x + step, at.state_after(step), data)
+        worse = at.cost > cost * (1 + 1e-6) + 1e-9
+        std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
+        held = second.cost <= at.cost * (1 + 1e-6) + 1e-9
+        small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
+        forward = torch.where(held[:, None], x + step + _limited(second.step), x + step / 3)
+        # A step that made things worse is taken back to a third.
+        progress.x[rows] = torch.where(worse[:, None], best + (x - best) / 3, forward)
+        progress.best[rows] = torch.where(worse[:, None], best, x)
+        done = small & ~worse
+        progress.cost[rows] = torch.where(done, second.cost, torch.where(worse, cost, at.cost))
+        progress.converged[rows] = done
+        progress.iterations[rows] += 1
+        progress.x0[rows], progress.covariance[rows] = second.x0, at.covariance
+        progress.error[rows[:, None], torch.as_tensor(np.flatnonzero(data.present))] = second.error
 
-    def _result(
-        self,
-        data: WindowBatch,
-        x: Tensor,
-        x0: Tensor,
-        covariance: Tensor,
-        cost: Tensor,
-        converged: Tensor,
-        taken: Tensor,
-        error: Tensor,
-        states: bool,
-    ) -> Refined:
+    def _result(self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool) -> Refined:
+        x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
         weak = (std > _WEAK_STD).any(dim=1).nonzero().squeeze(1)
@@ -160,27 +144,55 @@ class Refiner:
             identifiable[weak] &= share < _NOISE_SHARE
         signals = len(self.model.compression(data.present))
         freedom = (2 * self.model.bins - 1) * signals - x0.shape[1] - identifiable.sum(dim=1)
-        chi_square = cost / freedom.clamp_min(1)
+        chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise, so that intervals stay honest.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]
         prior = torch.eye(x.shape[1], dtype=torch.float64) * PRIOR_STD**2
-        wrong = np.full((len(x), len(data.present)), np.nan)
-        rms = wrong.copy()
-        wrong[:, data.present] = error
+        rms = np.full((len(x), len(data.present)), np.nan)
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
         path = self.model.states(x, x0, data) if states else x0.new_zeros(len(x), 0, x0.shape[1])
         return Refined(
             log_ratio=torch.where(identifiable, x, torch.zeros_like(x)).numpy(),
             covariance=torch.where(both, covariance, prior).numpy(),
             identifiable=identifiable.numpy(),
-            converged=converged.numpy(),
-            iterations=taken.numpy(),
+            converged=progress.converged[rows].numpy(),
+            iterations=progress.iterations[rows].numpy(),
             chi_square=chi_square.numpy(),
             freedom=freedom.numpy(),
-            error=wrong,
+            error=progress.error[rows].numpy(),
             rms=rms,
             states=path.numpy(),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """Where every window of a batch stands; chunks write their own rows."""
+
+    x: Tensor  # log-ratios, shape (B, P)
+    best: Tensor  # those of the lowest cost so far, shape (B, P)
+    cost: Tensor  # shape (B,)
+    x0: Tensor  # initial states, shape (B, N)
+    covariance: Tensor  # shape (B, P, P)
+    error: Tensor  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
+    converged: Tensor  # shape (B,)
+    iterations: Tensor  # shape (B,)
+
+    @classmethod
+    def begin(cls, start: FloatArray | None, B: int, sensors: int, P: int, N: int) -> _Progress:
+        x = torch.zeros(B, P, dtype=torch.float64)
+        if start is not None:
+            x += torch.as_tensor(start)
+        return cls(
+            x=x,
+            best=x.clone(),
+            cost=torch.full((B,), torch.inf, dtype=torch.float64),
+            x0=torch.zeros(B, N, dtype=torch.float64),
+            covariance=torch.zeros(B, P, P, dtype=torch.float64),
+            error=torch.full((B, sensors), torch.nan, dtype=torch.float64),
+            converged=torch.zeros(B, dtype=torch.bool),
+            iterations=torch.zeros(B, dtype=torch.long),
         )
 
 

@@ -59,7 +59,7 @@ def test_one_window_alone_is_the_window_in_a_batch(vehicle):
 def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle):
     system, truth, runs = vehicle
     model = WindowModel(system, system.window)
-    data = model.batch(runs.clean[:2], np.ones(12, dtype=bool))
+    data = model.batch(model.knots(runs.clean[:2]), runs.clean[:2], np.ones(12, dtype=bool))
     x = torch.as_tensor(truth[:2])
     with torch.no_grad():
         at = model.linearise(x, data)

@@ -13,6 +13,7 @@ for such inputs; the only error is in the interpolation.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,11 +22,17 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from model.fusion import fuse
+from model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
 from model.signals import FloatArray
 from model.system import System
 
 _TAYLOR_NORM = 1.0  # 1-norm up to which the Taylor polynomial of degree 15 is exact to double precision
-_COEFFICIENTS = [1.0 / math.factorial(k + 4) for k in range(16)]  # phi_4
+_TAYLOR = torch.tensor([[1.0 / math.factorial(4 * i + j + 4) for j in range(4)] for i in range(4)], dtype=torch.float64)
+_MIX = torch.tensor(  # how much of phi_k a doubling adds to phi_l
+    [[1.0 / math.factorial(l - k) if 0 < k <= l else 0.0 for k in range(5)] for l in range(5)],  # noqa: E741
+    dtype=torch.float64,
+)
+_SCALE = torch.tensor([[2.0**-order] for order in range(5)], dtype=torch.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +66,11 @@ class LinearSimulator:
         def constant(array: np.ndarray) -> Tensor:
             return torch.as_tensor(array, dtype=dtype, device=device)
 
+        # Value and slope at the left end, then at the right end, in a cubic's coefficients; times j! of Psi_j.
+        left_and_right = np.array([[1, 0, -3, 2], [0, 1, -2, 1], [0, 0, 3, -2], [0, 0, -1, 1]]) * [1, 1, 2, 6]
+        self.hermite = constant(left_and_right * np.array([1, self.dt, 1, self.dt])[:, None])
+        self.not_constant = constant(np.array([0.0, 1.0, 1.0, 1.0])[:, None, None])
+
         self.nominal_k = constant(mechanics.stiffness)
         self.nominal_c = constant(mechanics.damping)
         self.nominal_m = constant(mechanics.mass)
@@ -70,6 +82,7 @@ class LinearSimulator:
         self.supports = torch.as_tensor([_knot_of(system, u) for u in mechanics.support_drive], dtype=torch.long)
         self.forces = torch.as_tensor([_knot_of(system, u) for u in mechanics.force_drive], dtype=torch.long)
         self.W = 2 * (len(self.supports) + len(self.forces))
+        self._assemble(constant)
         index = {name: i for i, name in enumerate(system.elements)}
         quantity = [p.quantity for p in system.parameters]
         self.k_of = _scatter(system, "stiffness", index, len(index), constant)
@@ -87,6 +100,32 @@ class LinearSimulator:
         root = self.nominal_m.rsqrt()
         # Mass-normalised states with rates in units of the fastest mode: the norm of A h is then about omega h.
         self.scale = torch.cat([root, root * max(omega, 1e-6)])
+        self.normalised_step = self.dt * self.scale / self.scale[:, None]
+
+    def _assemble(self, constant: Callable[[FloatArray], Tensor]) -> None:
+        """Everything that is linear in the element values, as matrices; columns are [q, q', values, rates]."""
+        m, half = self.mechanics, self.W // 2
+        E, n = m.H.shape
+        deflection, rate = np.zeros((2, E, 2 * n + self.W))  # of the elements, per column
+        deflection[:, :n], rate[:, n : 2 * n] = m.H, m.H
+        at = 2 * n + self.supports.numpy() // 2
+        deflection[:, at], rate[:, at + half] = m.G, m.G
+        applied = np.zeros((n, 2 * n + self.W))
+        applied[:, 2 * n + self.forces.numpy() // 2] = m.F
+        by_value = np.concatenate([deflection, rate])  # per stiffness, then per damping, (2E, columns)
+        self.loads = constant(np.einsum("en,ec->enc", -np.tile(m.H, (2, 1)), by_value).reshape(2 * E, -1))
+        self.applied = constant(applied.reshape(-1))
+        self.rates = constant(np.eye(n, 2 * n + self.W, n))
+        kind = m.sensor_kind[:, None]
+        self.acceleration = constant(np.where(kind == ACCELERATION, m.S, 0.0))
+        sensing = np.zeros((len(kind), 2 * n + self.W))
+        sensing[:, n : 2 * n] = np.where(kind == VELOCITY, m.S, 0.0)
+        sensing[:, :n] = np.where(kind == DISPLACEMENT, m.S, 0.0)
+        self.motion_sensing = constant(sensing + np.where(kind == DEFLECTION, m.L, 0.0) @ deflection)
+        force = np.tile(np.where(kind == FORCE, m.L, 0.0), (1, 2))  # (S, 2E)
+        self.force_sensing = (
+            constant(np.einsum("se,ec->esc", force, by_value).reshape(2 * E, -1)) if force.any() else None
+        )
 
     def _normalised_stiffness(self) -> Tensor:
         root = self.nominal_m.rsqrt()
@@ -103,77 +142,76 @@ class LinearSimulator:
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:
         """A (B, N, N), input columns of the knots' values and rates, each (B, N, W/2)."""
-        B, n = values.mass.shape
-        inverse = 1.0 / values.mass
-        A = values.mass.new_zeros(B, 2 * n, 2 * n)
-        A[:, :n, n:] = torch.eye(n, dtype=A.dtype, device=A.device)
-        A[:, n:, :n] = -(values.stiffness @ self.outer).reshape(B, n, n) * inverse[:, :, None]
-        A[:, n:, n:] = -(values.damping @ self.outer).reshape(B, n, n) * inverse[:, :, None]
-        b_value = A.new_zeros(B, 2 * n, self.W // 2)
-        b_rate = torch.zeros_like(b_value)
-        if len(self.supports):
-            at = self.supports // 2
-            b_value[:, n:, at] = -(self.H.T * values.stiffness[:, None, :]) @ self.G * inverse[:, :, None]
-            b_rate[:, n:, at] = -(self.H.T * values.damping[:, None, :]) @ self.G * inverse[:, :, None]
-        if len(self.forces):
-            b_value[:, n:, self.forces // 2] = self.F * inverse[:, :, None]
-        return A, b_value, b_rate
+        N, half = 2 * values.mass.shape[1], self.W // 2
+        dynamics = self._dynamics(values)
+        return dynamics[..., :N], dynamics[..., N : N + half], dynamics[..., N + half :]
 
-    def outputs(self, values: ElementValues, A: Tensor, b_value: Tensor, b_rate: Tensor) -> tuple[Tensor, Tensor]:
+    def _dynamics(self, values: ElementValues) -> Tensor:
+        """[A, input columns of the knots' values, of their rates], (B, N, N + W)."""
+        B, n = values.mass.shape
+        forces = torch.cat([values.stiffness, values.damping], dim=1) @ self.loads + self.applied
+        accelerations = forces.reshape(B, n, -1) / values.mass[:, :, None]
+        return torch.cat([self.rates.expand(B, -1, -1), accelerations], dim=1)
+
+    def _outputs(self, values: ElementValues, dynamics: Tensor) -> tuple[Tensor, Tensor]:
         """C (B, S, N) and D (B, S, W) of the sensors."""
         n = values.mass.shape[1]
-        kind = self.kind[:, None]
-        S, zero = self.S, torch.zeros((), dtype=A.dtype, device=A.device)
-        acceleration = torch.where(kind == 0, S, zero)
-        C = acceleration @ A[:, n:]
-        C[:, :, n:] += torch.where(kind == 1, S, zero)
-        C[:, :, :n] += torch.where(kind == 2, S, zero)
-        D = A.new_zeros(len(A), len(S), self.W)
-        D[:, :, 0::2] = acceleration @ b_value[:, n:]
-        D[:, :, 1::2] = acceleration @ b_rate[:, n:]
-        if bool((self.kind >= 3).any()):
-            deflection, force = torch.where(kind == 3, self.L, zero), torch.where(kind == 4, self.L, zero)
-            of_d = deflection + force * values.stiffness[:, None, :]
-            of_v = force * values.damping[:, None, :]
-            C[:, :, :n] += of_d @ self.H
-            C[:, :, n:] += of_v @ self.H
-            D[:, :, self.supports] += of_d @ self.G
-            D[:, :, self.supports + 1] += of_v @ self.G
-        return C, D
+        rows = self.motion_sensing + self.acceleration @ dynamics[:, n:]
+        if self.force_sensing is not None:
+            force = torch.cat([values.stiffness, values.damping], dim=1) @ self.force_sensing
+            rows = rows + force.reshape(rows.shape)
+        value_then_rate = rows[..., 2 * n :].reshape(*rows.shape[:2], 2, self.W // 2)
+        return rows[..., : 2 * n], value_then_rate.mT.flatten(2)
 
     def discretise(self, values: ElementValues) -> Discrete:
         """The exact step over one sample."""
-        A, b_value, b_rate = self.continuous(values)
-        C, D = self.outputs(values, A, b_value, b_rate)
-        h = self.dt
-        phi = phi_functions(A * h * (self.scale[None, :] / self.scale[:, None]))
-        columns = torch.cat([b_value, b_rate], dim=2) / self.scale[:, None]
+        dynamics = self._dynamics(values)
+        C, D = self._outputs(values, dynamics)
+        B, N, _ = dynamics.shape
         half = self.W // 2
-        # Psi_j = j! (h phi_{j+1} b + phi_j b')
-        psi = []
-        for j in range(4):
-            term = h * phi[j + 1] @ columns[:, :, :half]
-            if j:
-                term = term + phi[j] @ columns[:, :, half:]
-            psi.append(math.factorial(j) * term * self.scale[:, None])
-        G0 = torch.stack([psi[0] - 3 * psi[2] + 2 * psi[3], h * (psi[1] - 2 * psi[2] + psi[3])], dim=3)
-        G1 = torch.stack([3 * psi[2] - 2 * psi[3], h * (psi[3] - psi[2])], dim=3)
-        Ad = phi[0] * (self.scale[:, None] / self.scale[None, :])
-        return Discrete(Ad, G0.flatten(2), G1.flatten(2), C, D)
+        phi = phi_functions(dynamics[..., :N] * self.normalised_step)  # (B, 5, N, N)
+        responses = (phi.flatten(1, 2) @ (dynamics[..., N:] / self.scale[:, None])).reshape(B, 5, N, 2 * half)
+        # Psi_j / j!, j = 0..3; the constant of a cubic has no rate
+        psi = responses[:, 1:, :, :half] * self.dt + responses[:, :4, :, half:] * self.not_constant
+        G = (self.hermite @ psi.flatten(2)).reshape(B, 2, 2, N, half) * self.scale[:, None]
+        G0, G1 = G.permute(1, 0, 3, 4, 2).flatten(3)
+        return Discrete(phi[:, 0] * (self.scale[:, None] / self.scale), G0, G1, C, D)
 
     def knots(self, windows: FloatArray) -> FloatArray:
         """Values and slopes of all drives, (B, T, W), from windows (B, T, C) in the system's channel order."""
         return knots(self.system, windows)
 
     def states(self, discrete: Discrete, w: Tensor, x0: Tensor) -> Tensor:
-        """States (B, T, N) from knots (B, T, W) and the first state (B, N)."""
+        """States (B, T, N) from knots (B, T, W) and the first state (B, N).
+
+        Samples go in blocks of about sqrt(T), a step in all blocks at once: first from rest, which with the free motion
+        over a block gives the blocks' first states one from the other, then from these.
+        """
+        (B, T, _), N, Ad = w.shape, x0.shape[1], discrete.Ad
+        length = 2 ** round(math.log2(T) / 2)
+        blocks = -(-T // length)
         push = w[:, :-1] @ discrete.G0.mT + w[:, 1:] @ discrete.G1.mT  # (B, T-1, N)
-        x = x0.unsqueeze(2)
-        path = [x]
-        for drive in push.unsqueeze(3).unbind(1):
-            x = torch.baddbmm(drive, discrete.Ad, x)
-            path.append(x)
-        return torch.cat(path, dim=2).mT
+        push = torch.nn.functional.pad(push, (0, 0, 0, blocks * length - T + 1))
+        steps = push.reshape(B, blocks, length, N).permute(2, 0, 3, 1).contiguous().unbind()  # each (B, N, blocks)
+        ends = steps[0]
+        for step in steps[1:]:
+            ends = torch.baddbmm(step, Ad, ends)
+        over_block = torch.linalg.matrix_power(Ad, length)
+        first = [x0.unsqueeze(2)]
+        for end in ends.unsqueeze(3).unbind(2)[:-1]:
+            first.append(torch.baddbmm(end, over_block, first[-1]))
+        path = [torch.cat(first, dim=2)]
+        for step in steps[:-1]:
+            path.append(torch.baddbmm(step, Ad, path[-1]))
+        return torch.stack(path, dim=3).flatten(2)[:, :, :T].mT
+
+    def free_states(self, discrete: Discrete, x0: Tensor, samples: int) -> Tensor:
+        """Ad^k x0 for k < samples, shape (B, T, N), by doubling."""
+        path, power = x0.unsqueeze(2), discrete.Ad
+        while path.shape[2] < samples:
+            path = torch.cat([path, power @ path[:, :, : samples - path.shape[2]]], dim=2)
+            power = power @ power if path.shape[2] < samples else power
+        return path.mT
 
     def simulate(self, log_ratio: Tensor, w: Tensor, x0: Tensor) -> tuple[Tensor, Tensor]:
         """Sensor outputs (B, T, S) and states (B, T, N)."""
@@ -196,33 +234,31 @@ class LinearSimulator:
         return blocks.reshape(B, samples, S, N)
 
 
-def phi_functions(z: Tensor) -> list[Tensor]:
-    """phi_0 (the exponential) to phi_4 of a batch of matrices, by Taylor polynomial with scaling and doubling.
+def phi_functions(z: Tensor) -> Tensor:
+    """phi_0 (the exponential) to phi_4 of a batch of matrices (B, N, N), shape (B, 5, N, N).
 
-    Doubling: phi_l(2z) = 2^-l (phi_0(z) phi_l(z) + sum_{k=1..l} phi_k(z) / (l-k)!)
+    Taylor polynomial with scaling and doubling: phi_l(2z) = 2^-l (phi_l(z) phi_0(z) + sum_{k=1..l} phi_k(z) / (l-k)!)
     (Hochbruck and Ostermann, Exponential integrators, Acta Numerica 2010).
     """
     norm = float(z.detach().abs().sum(dim=1).max()) if z.numel() else 0.0
     doublings = max(0, math.ceil(math.log2(max(norm, 1e-300) / _TAYLOR_NORM)))
     z = z / 2**doublings
-    eye = torch.eye(z.shape[-1], dtype=z.dtype, device=z.device)
+    B, N, _ = z.shape
+    eye = torch.eye(N, dtype=z.dtype, device=z.device).expand(B, N, N)
+    taylor, mix, scale = (c.to(z) for c in (_TAYLOR, _MIX, _SCALE))
     z2 = z @ z
-    z3, z4 = z2 @ z, z2 @ z2
-    top = None
-    for block in (12, 8, 4, 0):
-        a, b, c, d = _COEFFICIENTS[block : block + 4]
-        polynomial = a * eye + b * z + c * z2 + d * z3
-        top = polynomial if top is None else polynomial + z4 @ top
-    assert top is not None
-    phi = [top]
+    powers = torch.stack([eye, z, z2, z2 @ z], dim=1).flatten(2)
+    pieces = torch.matmul(taylor, powers).reshape(B, 4, N, N)  # of phi_4, to be joined by Horner's rule in z^4
+    z4, phi_4 = z2 @ z2, pieces[:, 3]
+    for piece in (2, 1, 0):
+        phi_4 = torch.baddbmm(pieces[:, piece], z4, phi_4)
+    orders = [phi_4]
     for order in (3, 2, 1, 0):
-        phi.insert(0, z @ phi[0] + eye / math.factorial(order))
+        orders.insert(0, torch.baddbmm(eye, z, orders[0], beta=1.0 / math.factorial(order)))
+    phi = torch.stack(orders, dim=1)
     for _ in range(doublings):
-        phi = [
-            (phi[0] @ phi[order] + sum((phi[k] / math.factorial(order - k) for k in range(1, order + 1)), 0 * eye))
-            / 2**order
-            for order in range(5)
-        ]
+        product = (phi.flatten(1, 2) @ phi[:, 0]).reshape(B, 5, N * N)
+        phi = (torch.baddbmm(product, mix.expand(B, 5, 5), phi.flatten(2)) * scale).reshape(B, 5, N, N)
     return phi
 
 
