@@ -13,12 +13,14 @@ tells about it, so a shape that does not matter costs nothing, where BIC would c
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
+from model.chunks import share
 from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit, Point, Problem, advance
 from model.diagnosis.forward import BOTH
@@ -38,7 +40,8 @@ _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
 _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
-_LAST = 3  # that are fitted to the end
+_LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
+_WORKERS = min(2, os.cpu_count() or 1)  # fits at a time: each holds some 200 MB for a minute of twelve sensors
 
 
 @dataclass(frozen=True)
@@ -108,26 +111,29 @@ def compete(
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Trial]:
     """Fits of the hits around the present model, best evidence first."""
-    trials: list[Trial] = []
-    for hit in hits:
-        progress(f"fitting {hit.effect} at {hit.location}")
+    places = sorted({hit.location for hit in hits})
+    progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
+
+    def begin(hit: Hit) -> Trial | None:
         starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
         tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
-        if tried:
-            trials.append(max(tried, key=lambda t: t.evidence))
+        return max(tried, key=lambda t: t.evidence, default=None)
+
+    trials = [t for t in share(begin, hits, _WORKERS) if t is not None]
     trials.sort(key=lambda t: -t.evidence)
     if not trials:
         return []
     best = trials[0].evidence
-    finished = []
-    for rank, trial in enumerate(trials):
-        close = trial.evidence > best - max(_NEAR, 0.3 * abs(best))
-        if rank < _LAST or (close and rank < 6):
-            point = trial.fit.point
-            done = _try(problem, base, trial.hit, point, 10)
-            finished.append(done if done is not None else trial)
-        else:
-            finished.append(replace(trial, finished=False))
+
+    def finish(trial: Trial) -> Trial:
+        return _try(problem, base, trial.hit, trial.fit.point, 10) or trial
+
+    def close(rank: int, trial: Trial) -> bool:
+        return rank < _LAST or (rank < _MOST_FINISHED and trial.evidence > best - max(_NEAR, 0.3 * abs(best)))
+
+    leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
+    behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
+    finished = [*share(finish, leading, _WORKERS), *behind]
     finished.sort(key=lambda t: -t.evidence)
     return finished
 

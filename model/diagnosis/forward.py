@@ -30,6 +30,7 @@ from model.system import System
 
 _TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
+_PATIENCE, _PROGRESS = 16, 0.5  # it is given up when the error has not fallen by this factor in so many iterations
 _HISTORY = 8
 DELAY, BOTH = "delay", "lag and delay"  # variants of a sensor's lag, which is else of first order
 _REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
@@ -373,14 +374,17 @@ def _fixed_point(step: Callable[[FloatArray], FloatArray], start: FloatArray) ->
     image = step(start).ravel()
     past_x: list[FloatArray] = []
     past_r: list[FloatArray] = []
-    best, best_size = image, np.inf
-    for _ in range(_ITERATIONS):
+    best, best_size, sizes = image, np.inf, []
+    for iteration in range(_ITERATIONS):
         residual = image - x
         size = float(np.linalg.norm(residual))
         if size < best_size:
             best, best_size = image, size
         if size <= _TOLERANCE * max(float(np.linalg.norm(image)), 1e-300):
             return image.reshape(shape), True
+        sizes.append(best_size)
+        if iteration >= _PATIENCE and best_size > _PROGRESS * sizes[-_PATIENCE]:
+            break
         past_x.append(x)
         past_r.append(residual)
         past_x, past_r = past_x[-_HISTORY:], past_r[-_HISTORY:]
