@@ -132,7 +132,8 @@ def _on_rows(even: FloatArray, start: float, period: float, rows: FloatArray, lo
     steps = np.arange(len(even))
     even[blocked] = np.interp(steps[blocked], steps[~blocked], even[~blocked])  # what surrounds a gap stays sound
     position = (rows - start) / period
-    nearest = np.clip(np.rint(position).astype(np.int64), 0, len(even) - 1)
+    # Half-way samples all go to the same side: rounded to even, one of a gap would answer for two rows or for none.
+    nearest = np.clip(np.floor(position + 0.5 + 1e-6).astype(np.int64), 0, len(even) - 1)
     if np.abs(position - np.rint(position)).max() <= TOLERANCE and abs(period - 1.0) < 1e-3:
         result = even[nearest]
     else:

@@ -186,6 +186,15 @@ def test_invalid_values_are_missing_samples():
     assert windower.lost == 1
 
 
+@pytest.mark.parametrize("phase", [0.002, 0.0045, 0.005])
+def test_every_lost_sample_counts_once_whatever_the_phase_of_its_channel(phase):
+    """Half a period off the grid, too, where a sample is as near to the row before it as to the one after."""
+    seconds = even()
+    seconds[1] = np.delete(seconds[1] + phase, [50, 150, 151, 152, 153])
+    windower, _ = windows_of(stream(seconds))
+    assert windower.lost == 5
+
+
 def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other():
     block = stream(even())
     row = np.rint((block.time - START) / 1e7).astype(int)
