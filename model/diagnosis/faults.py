@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import stats
 
+from model.diagnosis.heldout import FreeRun
 from model.diagnosis.measured import declared_noise
 from model.diagnosis.report import Finding, LawParameter
 
@@ -15,11 +16,16 @@ if TYPE_CHECKING:
 
 _LEAST = 1.12  # ratio to its peers from which a noise level is a fault
 _SIGMAS = 6.0
+_INACCURACY = 0.05  # of the power of what the findings changed
 _UPPER = 0.38  # of the sample rate
 
 
-def noise_faults(course: Course) -> list[Finding]:
-    """Sensors and input channels that are noisier than their peers by more than chance."""
+def noise_faults(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
+    """Sensors and input channels that are noisier than their peers by more than chance.
+
+    before, after: free runs without and with the findings.  What these have changed at a sensor they may have got
+    wrong by a little; that much is no noise of the sensor.
+    """
     declared = declared_noise(course.system, course.prepared.signals)
     noise = course.problem.noise
     grid = course.problem.part.grid
@@ -30,6 +36,8 @@ def noise_faults(course: Course) -> list[Finding]:
     inside = noise.sensors / known
     # what is left of physics is no noise: noise goes on above the band that is compared
     white = upper_ratio(course, known) > 1 + 0.5 * (inside - 1)
+    inaccuracy = _INACCURACY * np.mean((after.simulated - before.simulated) ** 2, axis=0)
+    white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
     findings += _outliers(names, inside, white, count)
     pairs = course.problem.part.pairs
     if len(pairs):

@@ -46,7 +46,7 @@ def narrate(course: Course, record: Recorded) -> Report:
     floor_figures = realised_floor(floor / np.where(size > 0, size, 1.0), after)
     findings = [_input_finding(f) for f in course.input_faults]
     findings += [_stuck_finding(course, name, at) for name, at in course.prepared.stuck]
-    findings += noise_faults(course)
+    findings += noise_faults(course, before, after)
     findings += _physics(course, before, after)
     findings.sort(key=lambda f: f.delta_bic)
     advice = [*course.prepared.notes, *course.notes, *_undecided(course)]
