@@ -8,6 +8,7 @@ import numpy as np
 
 from model.diagnosis.fit import Fit, Point, Problem, Whitener
 from model.diagnosis.forward import propagate
+from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Signals, transform
 from model.diagnosis.spectra import Grid
 from model.signals import FloatArray
@@ -52,6 +53,8 @@ class HeldOut:
         for _ in range(4):
             now = Point(point.theta, point.terms, state)
             shown, forward, forces = problem.predict(now, waveform or ())
+            if forces is not None and not forces.converged:
+                shown, forward, forces = problem.predict(now, march_forces(forward, state))
             waveform = None if forces is None else tuple(forces.force.T)
             rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, self.whole.grid.step, self.split)

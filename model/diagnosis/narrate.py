@@ -88,8 +88,28 @@ def _figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
     )
 
 
+def _deviations(system: System, fit: Fit) -> FloatArray:
+    """Standard deviations of the log-ratios, (P,).
+
+    What of an unnamed force belongs to the spring and damper that it works beside is a matter of convention: their
+    own values are uncertain by as much as the whole of it would change them.
+    """
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
+    for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
+        if term.law.name != UNKNOWN or fit.forces is None:
+            continue
+        d, v = fit.forces.deflection[:, i], fit.forces.rate[:, i]
+        force = np.std(fit.forces.force[:, i] + term.preload[0] * d + term.preload[1] * v)
+        for j, parameter in enumerate(system.parameters):
+            if parameter.element == term.location and parameter.quantity != "mass":
+                along = np.std(d if parameter.quantity == "stiffness" else v)
+                value = parameter.nominal * np.exp(fit.point.theta[j])
+                sigma[j] = np.hypot(sigma[j], force / max(along * value, 1e-300))
+    return sigma
+
+
 def _parameters(system: System, fit: Fit) -> tuple[ParameterValue, ...]:
-    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))
+    sigma = _deviations(system, fit)
     values = []
     for i, parameter in enumerate(system.parameters):
         value = parameter.nominal * float(np.exp(fit.point.theta[i]))
@@ -203,12 +223,13 @@ def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, aft
 
 def _worst_bias(course: Course) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
-    sigma = np.sqrt(np.maximum(np.diag(course.fit.covariance), 1e-30))[: len(course.fit.point.theta)]
+    sigma = _deviations(course.system, course.fit)
     shift = course.base.point.theta - course.fit.point.theta
     if not len(shift):
         return None
+    shift = np.where(np.abs(shift) > 5 * sigma, shift, 0.0)
     worst = int(np.argmax(np.abs(shift)))
-    if abs(shift[worst]) < 5 * sigma[worst] or abs(shift[worst]) < 0.01:
+    if abs(shift[worst]) < 0.01:
         return None
     change = 100 * (np.exp(shift[worst]) - 1)
     side = "high" if change > 0 else "low"
@@ -253,7 +274,7 @@ def _verdict(findings: list[Finding]) -> Verdict:
 
 def _undecided(course: Course) -> list[str]:
     """What the recording is too short or too still to tell."""
-    sigma = np.sqrt(np.maximum(np.diag(course.fit.covariance), 0))
+    sigma = _deviations(course.system, course.base)
     loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > _LOOSE]
     if not loose:
         return []
@@ -266,7 +287,7 @@ def _undecided(course: Course) -> list[str]:
 
 def _changes(course: Course) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
-    sigma = np.sqrt(np.maximum(np.diag(course.fit.covariance), 1e-30))
+    sigma = _deviations(course.system, course.fit)
     words = []
     theta = course.fit.point.theta
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
