@@ -25,7 +25,7 @@ from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit, Point, Problem, advance
 from model.diagnosis.forward import BOTH
 from model.diagnosis.screen import Hit, Screening
-from model.diagnosis.terms import Term
+from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import SMALL, UNKNOWN
 from model.signals import FloatArray
 
@@ -145,7 +145,10 @@ def start_of(base: Fit, hit: Hit) -> Point:
     if hit.family == "mode":  # one more degree of freedom, at the end of q and of q'
         n = len(state) // 2
         state = np.concatenate([state[:n], [0.0], state[n:], [0.0]])
-    return Point(point.theta, (*point.terms, hit.term), state)
+    near = point.near
+    if near and is_waveform(hit.term):
+        near = (*near, np.zeros_like(near[0]))
+    return Point(point.theta, (*point.terms, hit.term), state, near)
 
 
 def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:

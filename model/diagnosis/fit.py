@@ -75,6 +75,7 @@ class Point:
     theta: FloatArray  # (P,)
     terms: tuple[Term, ...]
     state: FloatArray  # (2n,)
+    near: tuple[FloatArray, ...] = ()  # the laws' forces on a trajectory nearby, each (4N,), to start from
 
 
 @dataclass(frozen=True)
@@ -126,7 +127,7 @@ class Problem:
 
     def forward(self, point: Point, start: tuple[FloatArray, ...] = ()) -> Forward:
         part = self.part if self.smoothed is None else replace(self.part, support=self.smoothed)
-        return Forward(self.system, part, self.sensors, point.theta, point.terms, start)
+        return Forward(self.system, part, self.sensors, point.theta, point.terms, start or point.near)
 
     def predict(
         self, point: Point, start: tuple[FloatArray, ...] = ()
@@ -687,7 +688,7 @@ def advance(point: Point, step: FloatArray) -> Point:
         count = len(term.parameters)
         terms.append(term.advanced(step[at : at + count]))
         at += count
-    return Point(theta, tuple(terms), point.state + step[at:])
+    return Point(theta, tuple(terms), point.state + step[at:], point.near)
 
 
 def _finish(problem: Problem, point: Point, lin: Linearisation, converged: bool, count: int) -> Fit:
@@ -701,7 +702,7 @@ def _finish(problem: Problem, point: Point, lin: Linearisation, converged: bool,
     slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)
     covariance = covariance * slopes * slopes[:, None]
     return Fit(
-        point=point,
+        point=replace(point, near=_start(lin.forces)),
         chi_square=float(lin.residual @ lin.residual),
         count=len(lin.residual),
         covariance=covariance,
