@@ -60,7 +60,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
     omega = grid.omega[band]
     bare = structure_of(system, projector.problem.sensors, fit.point.theta)
     element_force = bare.stiffness * fit.motions.deflection[band] + bare.damping * fit.motions.rate[band]  # (F, E)
-    kinds = bare.sensor_kind
+    kinds = plant.structure.sensor_kind
     frequencies, ratios = _mode_grid(1 / grid.step)
     w0 = 2 * np.pi * frequencies[:, None]
     h = np.reciprocal(w0**2 - omega**2 + 2j * ratios[:, None] * w0 * omega)  # (trials, F)

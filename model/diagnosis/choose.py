@@ -42,6 +42,7 @@ _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
 _WORKERS = min(2, os.cpu_count() or 1)  # fits at a time: each holds some 200 MB for a minute of twelve sensors
+_QUIET = 0.5  # least noise power of a block over the estimated one
 
 
 @dataclass(frozen=True)
@@ -182,7 +183,9 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
     hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
     faint = replace(start, terms=(*base.point.terms, hint))
     with np.errstate(all="ignore"):
-        lin = replace(problem, smoothed=None, whitener=problem.whitener).linearise(faint)
+        own = replace(problem, smoothed=None)
+        faint = own.smooth(faint)
+        lin = own.linearise(faint)
     count = len(hit.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
@@ -222,14 +225,17 @@ def preferred(trials: list[Trial]) -> list[Trial]:
 
 
 def profile_gain(before: FloatArray, after: FloatArray, sensors: int) -> float:
-    """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out."""
+    """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out.
+
+    A block much quieter than the estimated noise, which is white, owes that to its colour and is no evidence.
+    """
     power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
     bins = len(power[0])
     edges = np.unique(np.round(np.geomspace(_FIRST_BLOCK, bins, _BLOCKS)).astype(int))
     edges = np.concatenate([[0], edges[edges > 0]])
-    sums = [np.add.reduceat(p, edges[:-1], axis=0) for p in power]
     counts = 2.0 * np.diff(edges)[:, None]
-    return float(np.sum(counts * np.log(np.maximum(sums[0], 1e-300) / np.maximum(sums[1], 1e-300))))
+    levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, _QUIET) for p in power]
+    return float(np.sum(counts * np.log(levels[0] / levels[1])))
 
 
 def cost(fit: Fit, count: int) -> float:

@@ -14,13 +14,15 @@ from model.diagnosis.choose import Trial, compete, preferred, shortlist
 from model.diagnosis.fit import Fit, Point, Problem
 from model.diagnosis.heldout import HeldOut
 from model.diagnosis.inputs import InputFault, best_input_fault, input_faults_of
-from model.diagnosis.measured import Noise, Signals, declared_noise, transform
-from model.diagnosis.noise import input_noise, sensor_noise
+from model.diagnosis.measured import Noise, Signals, declared_noise, drifting, transform
+from model.diagnosis.noise import force_noise, input_noise, sensor_noise
 from model.diagnosis.report import Report
 from model.diagnosis.screen import Screening, screen
 from model.diagnosis.unknown import UNKNOWN
 from model.signals import FloatArray
 from model.system import System
+
+_NOISE_ROUNDS = 3  # of force noise and fit, which weighs by it
 
 Progress = Callable[[float, str], None]
 
@@ -134,7 +136,7 @@ def baseline(system: System, signals: Signals, declared: Noise, options: Options
     split = fast_length(round(options.train_share * signals.samples))
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
-    part = transform(first, noise)
+    part = transform(first, noise, rated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise)
     n = 2 * system.mechanics.n
     start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
@@ -156,9 +158,12 @@ def fast_length(samples: int) -> int:
 
 def refreshed(problem: Problem, fit: Fit, iterations: int = 6) -> tuple[Problem, Fit]:
     """Noise levels and whitening at a fit, and the fit again."""
-    noise = sensor_noise(fit.forward, fit.spectrum, problem.noise)
-    problem = replace(problem, noise=noise, whitener=None, smoothed=None)
-    return problem, problem.fit(fit.point, iterations=iterations)
+    for _ in range(_NOISE_ROUNDS if len(problem.noise.force) else 1):
+        noise = force_noise(fit.forward, fit.spectrum, problem.noise)
+        noise = sensor_noise(fit.forward, fit.spectrum, noise)
+        problem = replace(problem, noise=noise, whitener=None, smoothed=None)
+        fit = problem.fit(fit.point, iterations=iterations)
+    return problem, fit
 
 
 def _mend_inputs(course: Course, declared: Noise, tell: Progress) -> None:

@@ -28,7 +28,9 @@ from model.system import System
 PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
 _SLACK = 5e-4  # of the objective: inputs are smoothed again and loops solved again in every round
 _PRELOADS = 4  # rounds of equivalent law and motion
+_SMOOTHINGS = 3  # rounds of smoothed inputs and the laws' forces along the smoothed motion
 _KRYLOV, _KRYLOV_TOLERANCE = 16, 3e-3
+_UNSEEN = 1e-26  # of the largest squared sensitivity to a state: rounding
 _RELATIVE_STEP = 1e-4  # of finite differences
 
 
@@ -37,7 +39,7 @@ class Whitener:
     """Inverse Cholesky factors of the residual's covariance on the compared bins."""
 
     factor: ComplexArray  # (F, S, S)
-    smoother: ComplexArray  # S_u G^H R^-1 of supports then forces, (F, inputs, S)
+    blame: ComplexArray  # whitened residual to the inputs' share of it, supports then forces, (F, inputs, S)
 
     @classmethod
     def of(cls, forward: Forward, noise: Noise) -> Whitener:
@@ -46,19 +48,15 @@ class Whitener:
         band = part.grid.band
         G = plant.sensor_of_support[band]
         variance = noise.support_variance(part.grid.omega[band])
-        if part.force.shape[1]:
-            F = plant.structure.F[:, : part.force.shape[1]]
-            G = np.concatenate([G, plant.sensor_of_load[band] @ F], axis=2)
-            more = np.broadcast_to(noise.force**2, (len(G), part.force.shape[1]))
-            variance = np.concatenate([variance, more], axis=1)
+        G = np.concatenate([G, plant.sensor_of_measured_force[band]], axis=2)
+        variance = np.concatenate([variance, np.broadcast_to(noise.force**2, (len(G), len(noise.force)))], axis=1)
         G = G * forward.sensor_factor[band, :, None]
         weighted = G * variance[:, None, :]
         R = weighted @ G.conj().transpose(0, 2, 1)
         index = np.arange(R.shape[1])
-        R[:, index, index] += noise.sensors**2
+        R[:, index, index] += noise.sensor_variance(part.grid, part.rated)[band]
         factor = np.linalg.inv(np.linalg.cholesky(R))
-        precision = factor.conj().transpose(0, 2, 1) @ factor
-        return cls(factor, weighted.conj().transpose(0, 2, 1) @ precision)
+        return cls(factor, (factor @ weighted).conj().transpose(0, 2, 1))
 
     def __call__(self, spectrum: ComplexArray, part: Part) -> FloatArray:
         """(F, S) or (F, S, m) -> real unit-noise vectors (2 F S,) or (2 F S, m)."""
@@ -122,11 +120,11 @@ class Problem:
     sensors: np.ndarray  # indices of the present sensors
     noise: Noise
     whitener: Whitener | None = None
-    smoothed: ComplexArray | None = None  # fused support displacements after smoothing, (F, supports)
+    smoothed: Part | None = None  # the part with its inputs after smoothing
     cache: dict = field(default_factory=dict)
 
     def forward(self, point: Point, start: tuple[FloatArray, ...] = ()) -> Forward:
-        part = self.part if self.smoothed is None else replace(self.part, support=self.smoothed)
+        part = self.smoothed or self.part
         return Forward(self.system, part, self.sensors, point.theta, point.terms, start or point.near)
 
     def predict(
@@ -135,19 +133,31 @@ class Problem:
         """Shown sensor signals, (F, S)."""
         forward = self.forward(point, start)
         forces = forward.law_forces(point.state)
+        return self._shown(forward, forces), forward, forces
+
+    def _shown(self, forward: Forward, forces: LawForces | None) -> ComplexArray:
+        """What the sensors show of a solution, (F, S)."""
+        plant, part = forward.plant, forward.part
         periodic = forward.linear_sensors
-        if self.smoothed is not None:
-            noise = self.part.support - self.smoothed
-            periodic = periodic + np.einsum("fsi,fi->fs", forward.plant.sensor_of_support, noise)
-        polynomial = forward.plant.polynomial_sensors(forward.polynomial[0], self.part.support_polynomial)
+        polynomial = plant.polynomial_sensors(forward.polynomial[0], part.support_polynomial)
+        if part is not self.part:
+            periodic = periodic + self._of_input_noise(forward)
         if forces is not None:
             periodic = periodic + forces.sensors
-            still = np.zeros_like(self.part.support_polynomial)
-            polynomial = polynomial + forward.plant.polynomial_sensors(forces.motion, still)
+            polynomial = polynomial + plant.polynomial_sensors(forces.motion, np.zeros_like(part.support_polynomial))
         shown = forward.shown(periodic, polynomial)
-        for term in point.terms:
+        for term in forward.terms:
             shown = shown + _loads(forward, term)
-        return shown, forward, forces
+        return shown
+
+    def _of_input_noise(self, forward: Forward) -> ComplexArray:
+        """What the linear plant makes of the measured inputs less the smoothed ones, (F, S)."""
+        plant, part, smoothed = forward.plant, self.part, forward.part
+        supports = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support - smoothed.support)
+        forces = part.force - smoothed.force
+        forces[0] += (part.force_polynomial - smoothed.force_polynomial)[0] * np.sqrt(part.grid.samples)
+        forces = forces / forward.force_faults[0]
+        return supports + np.einsum("fsi,fi->fs", plant.sensor_of_measured_force, forces)
 
     def linearise(self, point: Point, start: tuple[FloatArray, ...] = ()) -> Linearisation:
         """Residual and sensitivities at a point."""
@@ -182,7 +192,10 @@ class Problem:
         packed.add_free(count, free)
         if forces is not None:
             along = _port_motions(forward, forces, theta_forces, theta_loads, law_forces, free.shape[2])
-            extra = _tangent(forward, forces, along)
+            taken = Taken(self, forward, forces) if len(self.noise.force) else None
+            if taken is not None:
+                along = along - taken.motion(packed.whitened)
+            extra = _tangent(forward, forces, along, taken)
             for k, port in enumerate(forces.ports):
                 for column in range(extra.shape[2]):
                     packed.add_port(column, port, extra[:, k, column])
@@ -241,35 +254,90 @@ class Problem:
         free = other_forward.free_rows() - forward.free_rows()
         return (other - shown + self.part.grid.forward(free @ point.state)) / step
 
-    def smooth(self, spectrum: ComplexArray, residual: FloatArray) -> None:
-        """Update the smoothed inputs from a residual; where the model misfits, the noise keeps its prior size."""
-        if self.whitener is None or not self.part.support.shape[1]:
-            return
-        band = self.part.grid.band
-        size = (residual.reshape(2, band.stop, -1) ** 2).mean(axis=(0, 2))
+    def smooth(self, point: Point, last: Linearisation | None = None) -> Point:
+        """Smooth the inputs at a point near the last one: what of the residual their noise explains is taken for it.
+
+        Returns the point, where the system has measured forces with its starting state fitted anew.
+        """
+        if len(self.noise.force):
+            return self._along_measured_motion(
+                point, None if last is None or last.forces is None else last.forces.force
+            )
+        if last is not None:  # the noise of supports is small: the last residual tells it well enough
+            self.smoothed = self._smoothed(last.spectrum)
+        return point
+
+    def shown_by_motion(self, fit: Fit) -> ComplexArray:
+        """What the sensors show of a fit's smoothed motion, (F, S)."""
+        shown = self.part.sensors - fit.spectrum
+        if fit.forward.part is self.part:
+            return shown
+        return shown - self._of_input_noise(fit.forward) * fit.forward.sensor_factor
+
+    def _along_measured_motion(self, point: Point, force: FloatArray | None) -> Point:
+        """Smooth measured forces, with laws along the motion that results; `force` (4N, m) is theirs along one nearby.
+
+        A measured force takes the blame for whatever else pushes the body, so its noise is large and the smoothed
+        motion is the one that the sensors saw, not a free run.  Smoothing and the laws' forces take turns.
+        """
+        part = self.part
+        forward = Forward(self.system, part, self.sensors, point.theta, point.terms)
+        self.whitener = Whitener.of(forward, self.noise)  # the noise goes through the plant as it is now
+        free = self._free_columns(forward)
+        columns = self.whitener(free, part)
+        scale = _scale(columns.T @ columns, columns.shape[1])
+        for _ in range(_SMOOTHINGS if any(map(is_waveform, point.terms)) else 1):
+            loop = forward.loop(point.state)
+            forces = None
+            if loop is not None:
+                force = loop.law(loop.d0, loop.v0) if force is None else force
+                forces = loop.answer(force)
+            spectrum = part.sensors - self._shown(forward, forces) - free @ point.state
+            residual = self.whitener(spectrum, part)
+            if not np.all(np.isfinite(residual)):
+                break  # a law gone astray; the residual will tell
+            change = scale * np.linalg.lstsq(columns * scale, residual, rcond=1e-9)[0]
+            point = replace(point, state=point.state + change)
+            self.smoothed = self._smoothed(spectrum - free @ change)
+            if force is not None:
+                loop = forward.driven_by(self.smoothed).loop(point.state)
+                assert loop is not None
+                force = loop.law(*loop.motion(force))
+        return point
+
+    def _smoothed(self, spectrum: ComplexArray) -> Part:
+        """The part with its inputs as a residual (F, S) asks for."""
+        assert self.whitener is not None
+        part, band = self.part, self.part.grid.band
+        whitened = (self.whitener.factor @ spectrum[band, :, None])[:, :, 0]
+        size = np.mean(np.abs(whitened) ** 2, axis=1)
         width = 21
         local = np.convolve(np.pad(size, width // 2, mode="edge"), np.ones(width) / width, mode="valid")
-        shift = np.einsum("fis,fs->fi", self.whitener.smoother, spectrum[band])
-        shift = shift[:, : self.part.support.shape[1]] / np.maximum(1.0, local)[:, None]
-        self.smoothed = self.part.support.copy()
-        self.smoothed[band] += shift
+        shift = np.einsum("fis,fs->fi", self.whitener.blame, whitened)
+        support, force = part.support.copy(), part.force.copy()
+        count = support.shape[1]
+        support[band] += shift[:, :count] / np.maximum(1.0, local)[:, None]
+        force[band] += shift[:, count:]
+        steady = part.force_polynomial.copy()  # moves a floating system steadily, which its spectrum cannot
+        steady[0] += np.real(force[0] - part.force[0]) / np.sqrt(part.grid.samples)
+        force[0] = part.force[0]
+        return replace(part, support=support, force=force, force_polynomial=steady)
 
     def fit(self, start: Point, iterations: int = 12, tolerance: float = 1e-3) -> Fit:
         """Gauss-Newton with Levenberg damping from `start`; stops when no parameter moves by `tolerance` std."""
-        point = _preloaded(self, start)
+        point = self.smooth(_preloaded(self, start))
         lin = self.linearise(point)
-        best = _objective(lin.residual, point)
+        best, kept = _objective(lin.residual, point), (self.whitener, self.smoothed)
         damping, converged, count = 1e-6, False, 0
         for count in range(1, iterations + 1):
             step, sigma = _step(lin.jacobian, lin.residual, point, damping)
-            trial = advance(point, step)
-            size = float(np.max(np.abs(step[: len(sigma)]) / sigma)) if len(sigma) else 0.0
-            self.smooth(lin.spectrum, lin.residual)
+            trial = self.smooth(advance(point, step), lin)
+            size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
             proposal = self.linearise(trial, _start(lin.forces))
             value = _objective(proposal.residual, trial)
             if value <= best * (1 + _SLACK) + 0.5:
                 gained = best - value
-                point, lin, best = trial, proposal, value
+                point, lin, best, kept = trial, proposal, value, (self.whitener, self.smoothed)
                 damping = max(damping / 10, 1e-9)
                 if size < tolerance or gained < 0.02 * max(1.0, size):
                     converged = True
@@ -280,6 +348,7 @@ class Problem:
                 damping = max(damping * 30, 1e-4)
                 if damping > 1e3:
                     break
+        self.whitener, self.smoothed = kept
         return _finish(self, point, lin, converged, count)
 
 
@@ -304,6 +373,13 @@ class Columns:
     def jacobian(self) -> FloatArray:
         """(2 F S, columns)."""
         return self.store.T
+
+    @property
+    def whitened(self) -> ComplexArray:
+        """All columns as whitened spectra, (F, S, columns)."""
+        weight = self.problem.part.grid.weight[:, None, None]
+        shape = (self.band.stop, -1, len(self.store))
+        return (self.store[:, : self.half] + 1j * self.store[:, self.half :]).T.reshape(shape) / weight
 
     def _add(self, column: int, whitened: ComplexArray) -> None:
         self.store[column, : self.half] += whitened.real.ravel()
@@ -349,6 +425,37 @@ class Columns:
         whitened = np.ascontiguousarray((self.of_shown @ free[self.band]).transpose(2, 0, 1))
         for i, column in enumerate(whitened):
             self._add(first + i, column)
+
+
+class Taken:
+    """What of a motion along the laws' ports the smoothed inputs take back.
+
+    Inputs are smoothed anew when a value moves, so that the motion moves only as far as sensors and inputs allow: where
+    a force's noise is large, not at all.
+    """
+
+    def __init__(self, problem: Problem, forward: Forward, forces: LawForces) -> None:
+        assert problem.whitener is not None
+        plant, self.grid = forward.plant, forward.part.grid
+        band = self.grid.band
+        ports = np.array([_wide(forward, w) for w in forces.ports])
+        inputs = np.concatenate([plant.deflection_of_support, plant.deflection_of_measured_force], axis=2)[band]
+        self.deflection = ports @ inputs @ problem.whitener.blame  # of whitened sensor signals, (F, m, S)
+        self.rate = 1j * self.grid.omega[band, None, None] * self.deflection
+        if plant.floats:
+            steady = ports @ plant.structure.H @ plant.steady_rate @ plant.structure.F
+            self.rate[0] = steady @ problem.whitener.blame[0, plant.structure.G.shape[1] :]
+        shown = plant.sensor_of_force[band] * forward.sensor_factor[band, :, None]
+        self.seen = problem.whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
+
+    def motion(self, whitened: ComplexArray) -> FloatArray:
+        """Deflection and rate along the ports taken back of whitened sensor signals (F, S, c), (2, N, m, c)."""
+        result = np.empty((2, self.grid.samples, self.deflection.shape[1], whitened.shape[2]))
+        for k, rows in enumerate((self.deflection, self.rate)):
+            spectra = np.zeros((len(self.grid.omega), *result.shape[2:]), dtype=complex)
+            spectra[self.grid.band] = rows @ whitened
+            result[k] = self.grid.inverse(spectra)
+        return result
 
 
 def _loads(forward: Forward, term: Term) -> ComplexArray | float:
@@ -459,7 +566,7 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
     return swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
 
 
-def _tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> ComplexArray:
+def _tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Taken | None) -> ComplexArray:
     """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
 
     The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant:
@@ -470,12 +577,17 @@ def _tangent(forward: Forward, forces: LawForces, motions: FloatArray) -> Comple
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
     ports = np.array([_wide(forward, w) for w in forces.ports])
     compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
+    if taken is not None:
+        compliance[grid.band] -= taken.deflection @ taken.seen
     jw = 1j * grid.omega[:, None, None]
     along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
 
     def close(force: FloatArray) -> FloatArray:
         if plant.floats:
-            d, v = _floating(forward, ports, ports, grid.forward(force))
+            spectrum = grid.forward(force)
+            d, v = _floating(forward, ports, ports, spectrum)
+            if taken is not None:
+                d, v = (d, v) - taken.motion(taken.seen @ spectrum[grid.band])
             return force - along_d * d - along_v * v
         moved = compliance @ grid.forward(force)
         return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
@@ -582,8 +694,7 @@ def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray
     plant, part = forward.plant, forward.part
     s = plant.structure
     load = -((part.support @ s.G.T) * plant.impedance) @ s.H
-    if part.force.shape[1]:
-        load = load + forward.force @ s.F[:, : part.force.shape[1]].T
+    load = load + forward.force @ s.F.T
     q = np.einsum("fnm,fm->fn", plant.receptance, load)
     return q if forces is None else q + forces.q
 
@@ -670,7 +781,7 @@ def _step(jacobian: FloatArray, residual: FloatArray, point: Point, damping: flo
     gradient = jacobian.T @ residual
     normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
     gradient[:P] -= point.theta / PRIOR**2
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = _scale(normal, len(point.state))
     scaled = normal * scale * scale[:, None]
     scaled[np.diag_indices_from(scaled)] += damping + 1e-13
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
@@ -678,6 +789,17 @@ def _step(jacobian: FloatArray, residual: FloatArray, point: Point, damping: flo
     free = len(normal) - len(point.state)
     sigma = (scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300)))[:free]
     return step, sigma
+
+
+def _scale(normal: FloatArray, states: int) -> FloatArray:
+    """What brings the diagonal of normal equations to one; zero for a state at the end of it that leaves no trace.
+
+    Where a body floats, its starting position leaves none in rates and accelerations.
+    """
+    size = np.diag(normal)
+    seen = np.ones(len(size), dtype=bool)
+    seen[-states:] = size[-states:] > _UNSEEN * size[-states:].max()
+    return np.where(seen, 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)
 
 
 def advance(point: Point, step: FloatArray) -> Point:
@@ -696,7 +818,7 @@ def _finish(problem: Problem, point: Point, lin: Linearisation, converged: bool,
     free = lin.jacobian.shape[1] - len(point.state)
     normal = lin.jacobian.T @ lin.jacobian
     normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
-    scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    scale = _scale(normal, len(point.state))
     inverse = np.linalg.pinv(normal * scale * scale[:, None], rcond=1e-14, hermitian=True)
     covariance = (inverse * scale * scale[:, None])[:free, :free]
     slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)

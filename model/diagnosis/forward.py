@@ -25,6 +25,7 @@ from model.diagnosis.measured import Part
 from model.diagnosis.plant import Plant, Structure
 from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, impedance, split
+from model.mechanics import VELOCITY
 from model.signals import FloatArray
 from model.system import System
 
@@ -70,6 +71,7 @@ class Forward:
     @cached_property
     def plant(self) -> Plant:
         structure = structure_of(self.system, self.sensors, self.theta, self.terms)
+        structure = replace(structure, sensor_kind=np.where(self.part.rated, VELOCITY, structure.sensor_kind))
         waveform, linear, _, _ = split(self.terms)
         stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
         for term in waveform:
@@ -102,7 +104,7 @@ class Forward:
         support = self.part.support_polynomial
         moved = support @ s.G.T
         load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
-        load = load + self.force_polynomial @ s.F.T[: self.force_polynomial.shape[1]]
+        load = load + self.force_polynomial @ s.F.T
         q = plant.polynomial_response(load)
         return q, q @ s.H.T + moved
 
@@ -110,11 +112,8 @@ class Forward:
     def linear_sensors(self) -> ComplexArray:
         """True signals without laws' forces and free motion, (F, S)."""
         plant, part = self.plant, self.part
-        result = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support)
-        if part.force.shape[1]:
-            F = plant.structure.F[:, : part.force.shape[1]]
-            result += np.einsum("fsi,fi->fs", plant.sensor_of_load @ F, self.force)
-        return result
+        supports = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support)
+        return supports + np.einsum("fsi,fi->fs", plant.sensor_of_measured_force, self.force)
 
     @cached_property
     def force_faults(self) -> tuple[FloatArray, FloatArray]:
@@ -182,11 +181,8 @@ class Forward:
     def linear_deflection(self) -> ComplexArray:
         """Periodic part of the deflections without laws' forces and free motion, (F, E)."""
         plant, part = self.plant, self.part
-        result = np.einsum("fei,fi->fe", plant.deflection_of_support, part.support)
-        if part.force.shape[1]:
-            F = plant.structure.F[:, : part.force.shape[1]]
-            result += np.einsum("fei,fi->fe", plant.deflection_of_load @ F, self.force)
-        return result
+        supports = np.einsum("fei,fi->fe", plant.deflection_of_support, part.support)
+        return supports + np.einsum("fei,fi->fe", plant.deflection_of_measured_force, self.force)
 
     def free_rows(self) -> FloatArray:
         """Sensors over the free state at the first sample, (N, S, 2n)."""
@@ -222,10 +218,22 @@ class Forward:
 
     def law_forces(self, state: FloatArray) -> LawForces | None:
         """Forces of the laws along their own trajectory; None when no law needs it."""
-        waveform, *_ = split(self.terms)
-        if not waveform:
+        loop = self.loop(state)
+        if loop is None:
             return None
-        return _solve(self, waveform, state)
+        start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
+        return loop.answer(*_fixed_point(lambda force: loop.law(*loop.motion(force)), start))
+
+    def loop(self, state: FloatArray) -> Loop | None:
+        """The laws that act along the trajectory and the plant between them; None when there is none."""
+        waveform, *_ = split(self.terms)
+        return Loop(self, waveform, state) if waveform else None
+
+    def driven_by(self, part: Part) -> Forward:
+        """The same model under other inputs."""
+        other = replace(self, part=part)
+        other.__dict__["plant"] = self.plant
+        return other
 
 
 @dataclass(frozen=True)
@@ -283,48 +291,45 @@ def propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, c
     return states @ rows.T
 
 
-def _solve(forward: Forward, terms: list[Term], state: FloatArray) -> LawForces:
-    plant, grid = forward.plant, forward.part.grid
-    structure = plant.structure
-    ports = np.array([t.port(forward.system) for t in terms])
-    wide = np.pad(ports, ((0, 0), (0, len(structure.H) - ports.shape[1])))
-    loop = _Loop(plant, wide, *forward.fine_motion(ports, state))
-    time = grid.start + grid.fine_time
-    elements = [forward.element_of(term) for term in terms]
+class Loop:
+    """Laws and the motion along their ports under the laws' forces, on the oversampled axis."""
 
-    reach = _REACH * np.abs(loop.d0).max(axis=0), _REACH * np.abs(loop.v0).max(axis=0)
+    def __init__(self, forward: Forward, terms: list[Term], state: FloatArray) -> None:
+        self.plant, self.grid = forward.plant, forward.part.grid
+        H = self.plant.structure.H
+        self.terms, self.ports = terms, np.array([t.port(forward.system) for t in terms])
+        self.wide = np.pad(self.ports, ((0, 0), (0, len(H) - self.ports.shape[1])))
+        self.elements = [forward.element_of(term) for term in terms]
+        self.d0, self.v0 = forward.fine_motion(self.ports, state)
+        self.reach = _REACH * np.abs(self.d0).max(axis=0), _REACH * np.abs(self.v0).max(axis=0)
+        self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
+        self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
+        self.lines = np.array([self.plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
+        self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
+        self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
 
-    def law(d: FloatArray, v: FloatArray) -> FloatArray:
-        d, v = np.clip(d, -reach[0], reach[0]), np.clip(v, -reach[1], reach[1])
+    def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
+        """Forces along a motion (4N, m), without what the plant carries."""
+        time = self.grid.start + self.grid.fine_time
+        d, v = np.clip(d, -self.reach[0], self.reach[0]), np.clip(v, -self.reach[1], self.reach[1])
         columns = [
-            force_along(t.law, t.parameters, d[:, i], v[:, i], time, elements[i])  # type: ignore[arg-type]
+            force_along(t.law, t.parameters, d[:, i], v[:, i], time, self.elements[i])  # type: ignore[arg-type]
             - t.preload[0] * d[:, i]
             - t.preload[1] * v[:, i]
-            for i, t in enumerate(terms)
+            for i, t in enumerate(self.terms)
         ]
         return np.column_stack(columns)
 
-    start = np.column_stack(forward.start_force) if forward.start_force else law(loop.d0, loop.v0)
-    force, converged = _fixed_point(lambda f: law(*loop.motion(f)), start)
-    d, v = loop.motion(force)
-    fine_spectrum, line = loop.decompose(force)
-    spectrum = fine_spectrum[: len(grid.omega)] / (OVERSAMPLING * np.sqrt(grid.samples))
-    motion = np.einsum("bkpn,kb->pn", loop.lines, line[:2])
-    sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ wide.T, spectrum)
-    q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (wide @ structure.H))
-    return LawForces(terms, ports, d, v, force, converged, sensors, q @ structure.H.T, q, motion)
-
-
-class _Loop:
-    """Motion along the ports under forces along the ports, on the oversampled axis."""
-
-    def __init__(self, plant: Plant, ports: FloatArray, d0: FloatArray, v0: FloatArray) -> None:
-        self.plant, self.grid, self.d0, self.v0 = plant, plant.grid, d0, v0
-        self.compliance = self._compliance(ports)  # (4N / 2 + 1, m, m)
-        self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(d0), plant.grid.step / OVERSAMPLING)
-        self.lines = np.array([plant.line_motion(port) for port in ports])  # (m, 2, DEGREE + 1, n)
-        self.line_d = np.einsum("bkpn,an->kpab", self.lines, ports @ plant.structure.H)
-        self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+    def answer(self, force: FloatArray, converged: bool = True) -> LawForces:
+        """What forces (4N, m) do to the system."""
+        plant, grid = self.plant, self.grid
+        d, v = self.motion(force)
+        fine_spectrum, line = self.decompose(force)
+        spectrum = fine_spectrum[: len(grid.omega)] / (OVERSAMPLING * np.sqrt(grid.samples))
+        motion = np.einsum("bkpn,kb->pn", self.lines, line[:2])
+        sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
+        q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
+        return LawForces(self.terms, self.ports, d, v, force, converged, sensors, q @ plant.structure.H.T, q, motion)
 
     def _compliance(self, ports: FloatArray) -> ComplexArray:
         """Deflection along the ports per force along them, also above the record's Nyquist frequency.
@@ -378,6 +383,8 @@ def _fixed_point(step: Callable[[FloatArray], FloatArray], start: FloatArray) ->
     for iteration in range(_ITERATIONS):
         residual = image - x
         size = float(np.linalg.norm(residual))
+        if not np.isfinite(size):
+            break
         if size < best_size:
             best, best_size = image, size
         if size <= _TOLERANCE * max(float(np.linalg.norm(image)), 1e-300):

@@ -9,7 +9,7 @@ import numpy as np
 from model.diagnosis.fit import Fit, Point, Problem, Whitener
 from model.diagnosis.forward import propagate
 from model.diagnosis.march import march_forces
-from model.diagnosis.measured import Noise, Signals, transform
+from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
 from model.diagnosis.spectra import Grid
 from model.signals import FloatArray
 from model.system import System
@@ -38,6 +38,7 @@ class HeldOut:
         self.whole = transform(signals, noise)
         self.grid = Grid(signals.samples - split, 1 / signals.sample_rate, split / signals.sample_rate)
         self.whitener: Whitener | None = None
+        self.later: Part | None = None
 
     def run(self, point: Point) -> FreeRun:
         """Simulate with the measured inputs from the state that the fitted part ends in.
@@ -74,24 +75,25 @@ class HeldOut:
     def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
         error = measured - simulated
-        if self.whitener is None:
-            later = transform(self.signals.part(self.split, self.signals.samples), self.noise)
-            problem = Problem(self.system, later, self.signals.sensor_index, self.noise)
+        if self.later is None:
+            part = self.signals.part(self.split, self.signals.samples)
+            self.later = transform(part, self.noise, rated=drifting(self.system, self.signals.sensor_index))
+        if self.whitener is None or len(self.noise.force):
+            problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
             self.whitener = Whitener.of(problem.forward(point), self.noise)
-            self.later = later
-        residual = self.whitener(self.grid.forward(error), self.later)
+        compared = np.where(self.later.rated, rate_of(error, self.grid), error)
+        residual = self.whitener(self.grid.forward(compared), self.later)
         size = np.sqrt(np.mean(measured**2, axis=0))
         per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
         return FreeRun(simulated, measured, float(residual @ residual), len(residual), per_sensor)
 
     def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""
-        plant, grid = fit.forward.plant, fit.forward.part.grid
-        variance = noise.support_variance(grid.omega)
+        problem = Problem(self.system, self.whole, self.signals.sensor_index, noise)
+        plant = problem.forward(fit.point).plant
+        variance = noise.support_variance(self.whole.grid.omega)
         power = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support) ** 2, variance)
-        if fit.forward.part.force.shape[1]:
-            F = plant.structure.F[:, : fit.forward.part.force.shape[1]]
-            power = power + np.abs(plant.sensor_of_load @ F) ** 2 @ noise.force**2
+        power = power + np.abs(plant.sensor_of_measured_force) ** 2 @ noise.force**2
         return np.sqrt(power.mean(axis=0) + noise.sensors**2)
 
 

@@ -15,11 +15,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.diagnosis.spectra import ComplexArray, Grid, detrend_ends
+from model.mechanics import DISPLACEMENT
 from model.schema import SupportInput
 from model.signals import FloatArray
 from model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
+_HELD = 1e-9  # of the largest stiffness: less holds nothing
+_END = 9  # samples that tell the slope at an end of a record
 
 
 @dataclass(frozen=True)
@@ -65,6 +68,14 @@ class Noise:
         """Variance of the fused displacement per bin, shape (F, supports)."""
         return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)
 
+    def sensor_variance(self, grid: Grid, rated: np.ndarray) -> FloatArray:
+        """Variance of the compared sensor signals per bin, (F, S); of positions compared by their rates, of the rate.
+
+        The noise of the record's two ends, where the rate's line is anchored, spreads over all bins alike.
+        """
+        ends = 2 / (grid.samples * grid.step**2)
+        return self.sensors**2 * np.where(rated, grid.omega[:, None] ** 2 + ends, 1.0)
+
 
 @dataclass(frozen=True)
 class Part:
@@ -76,7 +87,7 @@ class Part:
     force: ComplexArray  # (F, forces)
     force_polynomial: FloatArray
     sensors: ComplexArray  # (F, S), whole signal
-    series: FloatArray  # (N, S)
+    rated: np.ndarray  # sensors that measure a position and are compared by its rate, (S,)
     redundancy: ComplexArray  # V / j w - D_d of the supports with both, zero at zero frequency, (F, pairs)
     pairs: np.ndarray  # which supports, shape (pairs,)
     displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
@@ -112,9 +123,41 @@ def _size(series: FloatArray) -> float:
     return float(np.std(series)) or 1.0
 
 
-def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
-    """Spectra of a part; `start` is its first sample's time since the start of the recording, s."""
+def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
+    """Which of the given sensors show the position of something that no stiffness holds, (sensors,).
+
+    Such a position is the integral of every disturbance since the start: it wanders without end, its two ends do not
+    meet, and its spectrum is all leakage.  Its rate is stationary.
+    """
+    mechanics = system.mechanics
+    stiffness = (mechanics.H.T * mechanics.stiffness) @ mechanics.H
+    values, shapes = np.linalg.eigh(stiffness)
+    loose = shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)]
+    seen = np.any(np.abs(mechanics.S[sensors] @ loose) > _HELD, axis=1)
+    return seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
+
+
+def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
+    """Time derivative of series (N, m), exact within the band: what their ends leave open is a parabola's."""
+    ends = np.vander(np.arange(_END) * grid.step, 3)
+    slopes = [np.linalg.lstsq(ends, stretch, rcond=None)[0][1] for stretch in (position[:_END], position[::-1][:_END])]
+    polynomial = detrend_ends(position, (slopes[0], -slopes[1]), grid)
+    rest = grid.forward(position - grid.monomials @ polynomial)
+    slope = np.zeros_like(polynomial)
+    slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
+    return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + grid.monomials @ slope)
+
+
+def transform(signals: Signals, noise: Noise, start: float = 0.0, rated: np.ndarray | None = None) -> Part:
+    """Spectra of a part; `start` is its first sample's time since the start of the recording, s.
+
+    `rated`: sensors whose series are compared by their rates (`drifting`), (S,).
+    """
     grid = Grid(signals.samples, 1 / signals.sample_rate, start)
+    rated = np.zeros(signals.sensors.shape[1], dtype=bool) if rated is None else rated
+    sensors = signals.sensors
+    if rated.any():
+        sensors = np.where(rated, rate_of(sensors, grid), sensors)
     omega = grid.omega[:, None]
     has_rate = np.isfinite(noise.velocity)
     d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
@@ -143,8 +186,8 @@ def transform(signals: Signals, noise: Noise, start: float = 0.0) -> Part:
         support_polynomial=polynomial,
         force=grid.forward(signals.force - grid.monomials @ force_polynomial),
         force_polynomial=force_polynomial,
-        sensors=grid.forward(signals.sensors),
-        series=signals.sensors,
+        sensors=grid.forward(sensors),
+        rated=rated,
         redundancy=redundancy,
         pairs=pairs,
         displacement=D,

@@ -1,5 +1,9 @@
 """Noise levels, estimated: of inputs from their redundancy, of sensors from what neither model nor neighbours explain.
 
+A measured force has no second measurement, and between it and the body lies what nobody measured: the drive's ripple,
+friction in the transmission, the amplifier.  Its noise is estimated from the residual; through the plant it gives the
+residual of a real record its colour.
+
 Physics that was left out is concentrated in some bands and sensors, noise is white: the level of a sensor is the
 median over frequency blocks, so that the misfit of a missing law does not pass for noise.
 """
@@ -19,6 +23,8 @@ from model.signals import FloatArray
 
 _BLOCKS = 24
 _ROUNDS = 4
+_OWN = 0.01  # least share of a sensor's own noise in a bin that tells its level
+_LEAST = 0.01  # share of a force's noise power that one round may leave
 
 
 def input_noise(part: Part, noise: Noise) -> Noise:
@@ -53,25 +59,49 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Nois
     """Levels of the sensors from the residual (F, S) of a fit."""
     band = forward.part.grid.band
     residual = spectrum[band][1:]
-    edges = np.linspace(0, len(residual), _BLOCKS + 1).astype(int)
+    variance = noise.sensor_variance(forward.part.grid, forward.part.rated)[band][1:] / noise.sensors**2
     for _ in range(_ROUNDS):
         factor = Whitener.of(forward, noise).factor[1:]
         precision = factor.conj().transpose(0, 2, 1) @ factor
         alone = np.real(np.einsum("fss->fs", precision))  # 1 / variance given the other sensors
         surprise = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
-        blocks = np.array([surprise[a:b].mean(axis=0) for a, b in pairwise(edges)])
-        level = _robust(blocks, np.diff(edges))
-        own = np.median(1 / alone / noise.sensors**2, axis=0)  # variance given the others over the own variance
-        ratio = np.maximum(1 + (level - 1) * own, 0.05)
+        share = alone * variance * noise.sensors**2  # of the own noise in the variance given the others
+        ratio = [_level(surprise[:, i], share[:, i]) for i in range(len(noise.sensors))]
         noise = replace(noise, sensors=noise.sensors * np.sqrt(ratio))
     return noise
 
 
-def _robust(blocks: FloatArray, counts: np.ndarray) -> FloatArray:
-    """Level over blocks (blocks, S): the mean of those that agree with the quiet half, per sensor."""
-    middle = np.median(blocks, axis=0)
-    quiet = np.quantile(blocks, 0.3, axis=0)
+def _level(surprise: FloatArray, share: FloatArray) -> float:
+    """Ratio of a sensor's noise power to the supposed one, from the bins (F,) where its own noise counts."""
+    own = share > _OWN
+    if np.sum(own) < 2 * _BLOCKS:
+        return 1.0
+    surprise, share = surprise[own], share[own]
+    edges = np.linspace(0, len(surprise), _BLOCKS + 1).astype(int)
+    blocks = np.array([surprise[a:b].mean() for a, b in pairwise(edges)])
+    return max(1 + (_robust(blocks, np.diff(edges)) - 1) / float(np.median(share)), 0.05)
+
+
+def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise:
+    """Levels of the measured forces from the residual (F, S) of a fit, by Fisher scoring of its likelihood."""
+    if not len(noise.force):
+        return noise
+    band = forward.part.grid.band
+    response = forward.plant.sensor_of_measured_force[band] * forward.sensor_factor[band, :, None]
+    for _ in range(_ROUNDS):
+        factor = Whitener.of(forward, noise).factor
+        seen = factor @ response  # whitened response to each force, (F, S, forces)
+        copied = np.abs(np.einsum("fsi,fs->fi", seen.conj(), (factor @ spectrum[band, :, None])[:, :, 0])) ** 2
+        size = np.sum(np.abs(seen) ** 2, axis=1)  # mean of `copied` at the truth
+        score, fisher = np.sum(copied - size, axis=0), np.sum(size**2, axis=0)
+        power = noise.force**2
+        noise = replace(noise, force=np.sqrt(np.maximum(power + score / fisher, _LEAST * power)))
+    return noise
+
+
+def _robust(blocks: FloatArray, counts: np.ndarray) -> float:
+    """Level over blocks, (blocks,): the mean of those that agree with the quiet half."""
+    middle, quiet = np.median(blocks), np.quantile(blocks, 0.3)
     spread = 1 / np.sqrt(np.mean(counts))
-    base = np.minimum(middle, quiet * (1 + 2 * spread))
-    good = blocks <= base * (1 + 4 * spread)
-    return np.sum(blocks * good, axis=0) / np.maximum(np.sum(good, axis=0), 1)
+    base = min(middle, quiet * (1 + 2 * spread))
+    return float(np.mean(blocks[blocks <= base * (1 + 4 * spread)]))

@@ -175,7 +175,19 @@ class Plant:
     @cached_property
     def sensor_of_load(self) -> ComplexArray:
         """Sensor signal per load on a degree of freedom, shape (F, S, n)."""
-        return self.sensor_of_dof @ self.receptance
+        result = self.sensor_of_dof @ self.receptance
+        if self.floats:
+            s = self.structure
+            result[0] = np.where(s.sensor_kind[:, None] == VELOCITY, s.S @ self.steady_rate, 0.0)
+        return result
+
+    @cached_property
+    def steady_rate(self) -> FloatArray:
+        """Velocity under a steady unit load, of what no stiffness holds and a damper brakes, (n, n)."""
+        s = self.structure
+        values, shapes = np.linalg.eigh(s.K)
+        loose = shapes[:, np.abs(values) <= 1e-9 * max(float(np.abs(values).max()), 1e-300)]
+        return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
 
     @cached_property
     def sensor_of_force(self) -> ComplexArray:
@@ -214,6 +226,7 @@ class Plant:
 
     @cached_property
     def sensor_of_measured_force(self) -> ComplexArray:
+        """Sensor signal per measured force, shape (F, S, forces)."""
         return self.sensor_of_load @ self.structure.F
 
     @cached_property

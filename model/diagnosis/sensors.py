@@ -32,7 +32,7 @@ def measurement_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tu
 def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
     problem, fit, grid = projector.problem, projector.fit, projector.grid
     band = grid.band
-    truth = (problem.part.sensors - fit.spectrum)[band]  # as the model says, (F, S)
+    truth = problem.shown_by_motion(fit)[band]
     constant = np.zeros(len(truth), dtype=complex)
     constant[0] = np.sqrt(grid.samples)
     jw = 1j * grid.omega[band]
@@ -43,8 +43,8 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
             ("sensor_lag", -jw * truth[:, i]),
             ("sensor_bias", constant),
         ):
-            if effect not in laws:
-                continue
+            if effect not in laws or (effect == "sensor_bias" and problem.part.rated[i]):
+                continue  # a position that is compared by its rate shows no bias
             column = projector.pack(projector.factor[:, :, i] * signal[:, None])
             score, amplitude = projector.score(column)
             start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
@@ -108,7 +108,7 @@ def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
         response = projector.of_load @ direction
         effects = []
         if "sensor_gain" in laws:
-            effects.append(("sensor_gain", projector.pack(-response * part.force[band, i, None])))
+            effects.append(("sensor_gain", projector.pack(-response * fit.forward.part.force[band, i, None])))
         if "sensor_bias" in laws:
             load = np.zeros((part.force_polynomial.shape[0], len(direction)))
             load[0] = -direction  # the true force is the measured one less the offset
