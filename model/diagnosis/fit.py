@@ -379,7 +379,8 @@ class Columns:
         """All columns as whitened spectra, (F, S, columns)."""
         weight = self.problem.part.grid.weight[:, None, None]
         shape = (self.band.stop, -1, len(self.store))
-        return (self.store[:, : self.half] + 1j * self.store[:, self.half :]).T.reshape(shape) / weight
+        spectra = (self.store[:, : self.half] + 1j * self.store[:, self.half :]).T.reshape(shape) / weight
+        return np.asarray(spectra, dtype=complex)
 
     def _add(self, column: int, whitened: ComplexArray) -> None:
         self.store[column, : self.half] += whitened.real.ravel()
