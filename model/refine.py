@@ -73,10 +73,10 @@ class Refiner:
         self, windows: FloatArray, start: FloatArray | None = None, *, iterations: int = 12, states: bool = False
     ) -> Refined:
         """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors."""
-        present = ~np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1)
+        present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         everything = np.arange(len(windows))
         knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
-        progress = _Progress.begin(start, *present.shape, len(self.system.parameters), self.model.states_count)
+        progress = _Progress.begin(start, present.shape, len(self.system.parameters), self.model.states_count)
 
         def batch(at: IntArray) -> WindowBatch:
             return self.model.batch(knots[at], windows[at], present[at[0]])
@@ -180,7 +180,8 @@ class _Progress:
     iterations: Tensor  # shape (B,)
 
     @classmethod
-    def begin(cls, start: FloatArray | None, B: int, sensors: int, P: int, N: int) -> _Progress:
+    def begin(cls, start: FloatArray | None, shape: tuple[int, ...], P: int, N: int) -> _Progress:
+        B, sensors = shape
         x = torch.zeros(B, P, dtype=torch.float64)
         if start is not None:
             x += torch.as_tensor(start)

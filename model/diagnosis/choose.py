@@ -24,7 +24,7 @@ from model.chunks import share
 from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit, Point, Problem, advance
 from model.diagnosis.forward import BOTH
-from model.diagnosis.screen import Hit, Screening
+from model.diagnosis.screen import Hit, Screening, element_motion
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import SMALL, UNKNOWN
 from model.signals import FloatArray
@@ -144,8 +144,10 @@ def start_of(base: Fit, hit: Hit) -> Point:
     point = base.point
     state = point.state
     if hit.family == "mode":  # one more degree of freedom, at the end of q and of q'
-        n = len(state) // 2
-        state = np.concatenate([state[:n], [0.0], state[n:], [0.0]])
+        n = (len(state) - len(base.forward.plant.structure.branches)) // 2
+        state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
+    if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
+        state = np.append(state, 0.0)
     near = point.near
     if near and is_waveform(hit.term):
         near = (*near, np.zeros_like(near[0]))
@@ -153,21 +155,32 @@ def start_of(base: Fit, hit: Hit) -> Point:
 
 
 def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
-    """A damper that gives way was read as a weaker one: start from stronger dampers, too."""
-    if hit.effect != "series_stiffness":
-        return []
+    """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
+
+    At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's
+    mean frequency, ks and the change of the spring follow from the assumed c and from the damping that was read.
+    """
     names = [p.name for p in problem.system.parameters]
-    name = f"{hit.location}.damping"
-    if name not in names:
+    damping, stiffness = (f"{hit.location}.{quantity}" for quantity in ("damping", "stiffness"))
+    if hit.effect != "series_stiffness" or damping not in names:
         return []
-    starts = []
-    for factor in (1.6, 2.6):
-        start = start_of(base, hit)
-        theta = start.theta.copy()
-        theta[names.index(name)] += np.log(factor)
-        term = hit.term.at(np.array(hit.term.parameters) * factor)
-        starts.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
-    return starts
+    at = names.index(damping)
+    nominal = problem.system.parameters[at].nominal
+    element = problem.system.elements.index(hit.location)
+    deflection, rate = element_motion(base)
+    frequency = float(np.std(rate[:, element]) / np.std(deflection[:, element]))
+    start = start_of(base, hit)
+    read = nominal * float(np.exp(start.theta[at]))
+    assumed = max(2.6 * read, nominal)
+    ratio = np.sqrt(assumed / read - 1)
+    theta = start.theta.copy()
+    theta[at] += np.log(assumed / read)
+    if stiffness in names:
+        k = names.index(stiffness)
+        value = problem.system.parameters[k].nominal * np.exp(theta[k])
+        theta[k] += np.log(max(1 - frequency * read * ratio / value, 0.5))
+    term = hit.term.at(np.array([frequency * assumed / ratio]))
+    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
 
 
 def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:

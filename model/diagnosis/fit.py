@@ -72,7 +72,7 @@ class Point:
 
     theta: FloatArray  # (P,)
     terms: tuple[Term, ...]
-    state: FloatArray  # (2n,)
+    state: FloatArray  # (2n + b,)
     near: tuple[FloatArray, ...] = ()  # the laws' forces on a trajectory nearby, each (4N,), to start from
 
 
@@ -232,8 +232,12 @@ class Problem:
                 loads[i] = np.where(dofs, -structure.mass * motions.acceleration, 0.0)
                 continue
             value = parameter.nominal * np.exp(forward.theta[i])
+            element = self.system.elements.index(parameter.element)
             along = motions.rate if parameter.quantity == "damping" else motions.deflection
-            forces[:, i] = value * along[:, self.system.elements.index(parameter.element)]
+            forces[:, i] = value * along[:, element]
+            for branch in structure.branches if parameter.quantity == "damping" else ():
+                if branch.element == element and branch.replaces:  # c s / (1 + s c / ks) by log c
+                    forces[:, i] /= (1 + 1j * omega * branch.time) ** 2
         return forces, loads
 
     def _difference(
@@ -518,9 +522,9 @@ def _port_motions(
             e = forward.system.elements.index(parameter.element)
             spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
     spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
-    rows = ports @ structure.H
-    both = np.vstack([np.hstack([rows, np.zeros_like(rows)]), np.hstack([np.zeros_like(rows), rows])])
-    free = plant.free_motion(both, grid.step, grid.samples).reshape(grid.samples, 2, len(ports), states)
+    free = plant.free_motion(structure.motion_rows(ports), grid.step, grid.samples).reshape(
+        grid.samples, 2, len(ports), states
+    )
     result = np.empty((2, grid.samples, len(ports), P + p + states))
     result[0, :, :, : P + p] = grid.inverse(spectra)
     result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
@@ -681,12 +685,12 @@ def _motions(forward: Forward, forces: LawForces | None, state: FloatArray) -> M
         periodic = periodic + forces.deflections
         q_poly, d_poly = q_poly + forces.motion, d_poly + forces.motion @ s.H.T
     A = s.state_matrix()
-    free = propagate(A, np.eye(2 * n), state, grid.step, grid.samples)
+    free = propagate(A, np.eye(len(A)), state, grid.step, grid.samples)
     d = periodic + grid.monomial_spectra @ d_poly + grid.forward(free[:, :n] @ s.H.T)
-    v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n:] @ s.H.T)
+    v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n : 2 * n] @ s.H.T)
     q = _periodic_motion(forward, forces)
     bend = plant.derivative(plant.derivative(q_poly))
-    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n:].T)
+    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n : 2 * n].T)
     return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
 
 
@@ -701,13 +705,15 @@ def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray
 
 
 def _particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:
-    """State of the particular solution at the first sample; with the free state it is the true state, (2n,)."""
+    """State of the particular solution at the first sample; with the free state it is the true state, (2n + b,)."""
     plant, grid = forward.plant, forward.part.grid
     q = _periodic_motion(forward, forces)
     polynomial = forward.polynomial[0] + (0.0 if forces is None else forces.motion)
     position = grid.inverse(q)[0] + polynomial[0]
     rate = grid.inverse(1j * grid.omega[:, None] * q)[0] + plant.derivative(polynomial)[0]
-    return np.concatenate([position, rate])
+    deflections = forward.linear_deflection + (0.0 if forces is None else forces.deflections)
+    branches = grid.inverse(plant.structure.branch_forces(deflections, grid.omega))[0]
+    return np.concatenate([position, rate, branches])
 
 
 def _preloaded(problem: Problem, point: Point) -> Point:

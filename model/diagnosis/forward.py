@@ -24,7 +24,7 @@ from model.diagnosis.hysteresis import force_along
 from model.diagnosis.measured import Part
 from model.diagnosis.plant import Plant, Structure
 from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
-from model.diagnosis.terms import Term, impedance, split
+from model.diagnosis.terms import Term, branch_of, split
 from model.mechanics import VELOCITY
 from model.signals import FloatArray
 from model.system import System
@@ -79,13 +79,10 @@ class Forward:
                 e = self.system.elements.index(term.location)
                 stiffness[e] += term.preload[0]
                 damping[e] += term.preload[1]
-        extra = None
-        if linear:
-            extra = np.zeros((len(self.part.grid.omega), len(structure.stiffness)), dtype=complex)
-            for term in linear:
-                e = self.system.elements.index(term.location)
-                extra[:, e] += impedance(term, self.part.grid.omega, structure.damping[e])
-        return Plant(replace(structure, stiffness=stiffness, damping=damping), self.part.grid, extra)
+        places = [self.system.elements.index(term.location) for term in linear]
+        found = [branch_of(term, e, structure.damping[e]) for term, e in zip(linear, places, strict=True)]
+        branches = tuple(branch for branch in found if branch is not None)
+        return Plant(replace(structure, stiffness=stiffness, damping=damping, branches=branches), self.part.grid)
 
     def element_of(self, term: Term) -> SpringDamper:
         """Spring and damper that a law belongs to, at the present parameters."""
@@ -210,10 +207,8 @@ class Forward:
         powers = np.vander(grid.fine_time / grid.length, DEGREE + 1, increasing=True)
         d += powers @ polynomial
         v += powers @ plant.derivative(polynomial)
-        rows = ports @ H
-        both = np.vstack([np.hstack([rows, np.zeros_like(rows)]), np.hstack([np.zeros_like(rows), rows])])
-        A = plant.structure.state_matrix()
-        free = propagate(A, both, state, grid.step / OVERSAMPLING, len(d))
+        A, rows = plant.structure.state_matrix(), plant.structure.motion_rows(ports)
+        free = propagate(A, rows, state, grid.step / OVERSAMPLING, len(d))
         return d + free[:, : len(ports)], v + free[:, len(ports) :]
 
     def law_forces(self, state: FloatArray) -> LawForces | None:
@@ -339,13 +334,11 @@ class Loop:
         """
         plant = self.plant
         s = plant.structure
-        n = len(s.mass)
         known = ports @ plant.deflection_of_force @ ports.T
         fine = 2 * np.pi * np.fft.rfftfreq(OVERSAMPLING * self.grid.samples, self.grid.step / OVERSAMPLING)
         values, vectors = np.linalg.eig(s.state_matrix())
-        rows = np.hstack([ports @ s.H, np.zeros((len(ports), n))]) @ vectors
-        loads = np.vstack([np.zeros((n, len(ports))), -(ports @ s.H).T / s.mass[:, None]])
-        columns = np.linalg.lstsq(vectors, loads.astype(complex), rcond=None)[0]
+        rows = s.motion_rows(ports)[: len(ports)] @ vectors
+        columns = np.linalg.lstsq(vectors, s.force_columns(ports).astype(complex), rcond=None)[0]
         high = fine[len(known) :]
         above = (rows / (1j * high[:, None] - values)[:, None, :]) @ columns
         return np.concatenate([known, above])

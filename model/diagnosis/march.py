@@ -29,25 +29,22 @@ _SETTLED = 1e-3
 def march_forces(forward: Forward, state: FloatArray) -> tuple[FloatArray, ...]:
     """Force of every law along its trajectory less its preload, one (OVERSAMPLING N,) per law, in `forward`'s order.
 
-    state (2n,): the free motion at the first sample, as `forward` counts it.
+    state (2n + b,): the free motion at the first sample, as `forward` counts it.
     """
     terms = [term for term in forward.terms if is_waveform(term)]
     plant, grid = forward.plant, forward.part.grid
     s = plant.structure
-    n, m = len(s.mass), len(terms)
     ports = np.array([term.port(forward.system) for term in terms])
     d0, v0 = forward.fine_motion(ports, state)
-    along = np.pad(ports, ((0, 0), (0, len(s.H) - ports.shape[1]))) @ s.H  # (m, n)
-    A = s.state_matrix()
-    rows = np.vstack([np.hstack([along, np.zeros_like(along)]), np.hstack([np.zeros_like(along), along])])
-    pull = np.vstack([np.zeros((n, m)), -along.T / s.mass[:, None]])
+    wide = np.pad(ports, ((0, 0), (0, len(s.H) - ports.shape[1])))
+    A, rows = s.state_matrix(), s.motion_rows(wide)
     step = grid.step / _PARTS
-    steps = force_steps(A, pull, rows, step)
+    steps = force_steps(A, s.force_columns(wide), rows, step)
     fine = grid.step / OVERSAMPLING * np.arange(len(d0))
     nodes = step / 2 * np.arange(2 * _PARTS * (grid.samples - 1) + 1)
     inputs = np.hstack([CubicHermiteSpline(fine, d0, v0)(nodes), CubicSpline(fine, v0)(nodes)])
     sites = [Site(_preloaded(term), term.parameters, forward.element_of(term)) for term in terms]
-    first = np.zeros(2 * n)
+    first = np.zeros(s.states)
     for _ in range(_ROUNDS):
         known = inputs + propagate(A, rows, first, step / 2, len(nodes))
         solution = solve(
@@ -55,7 +52,7 @@ def march_forces(forward: Forward, state: FloatArray) -> tuple[FloatArray, ...]:
         )
         force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
         force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
-        before, first = first, _periodic_start(forward, along, force)
+        before, first = first, _periodic_start(forward, wide @ s.H, force)
         if np.max(np.abs(first - before)) <= _SETTLED * np.max(np.abs(solution.states)):
             break
     return tuple(force.T)
@@ -73,7 +70,7 @@ def _preloaded(term: Term) -> ElementLaw:
 
 
 def _periodic_start(forward: Forward, along: FloatArray, force: FloatArray) -> FloatArray:
-    """State at the first sample, (2n,), of the motion that a periodic force (OVERSAMPLING N, m) keeps up."""
+    """State at the first sample, (2n + b,), of the motion that a periodic force (OVERSAMPLING N, m) keeps up."""
     plant, grid = forward.plant, forward.part.grid
     line = np.zeros((DEGREE + 1, force.shape[1]))
     line[1] = force[-1] - force[0]
@@ -84,4 +81,5 @@ def _periodic_start(forward: Forward, along: FloatArray, force: FloatArray) -> F
     steady = plant.polynomial_response(-line @ along)
     position = grid.inverse(q)[0] + steady[0]
     rate = grid.inverse(1j * grid.omega[:, None] * q)[0] + plant.derivative(steady)[0]
-    return np.concatenate([position, rate])
+    branches = grid.inverse(plant.structure.branch_forces(q @ plant.structure.H.T, grid.omega))[0]
+    return np.concatenate([position, rate, branches])

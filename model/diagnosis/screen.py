@@ -19,7 +19,7 @@ from model.diagnosis.catalogue import ElementLaw, Law, Observed, SpringDamper, f
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
-from model.diagnosis.terms import Term, impedance, is_waveform
+from model.diagnosis.terms import Term, branch_of, is_waveform
 from model.diagnosis.unknown import static_law, trials
 from model.signals import FloatArray
 
@@ -285,8 +285,9 @@ def _force_spectrum(
         time = grid.start + grid.fine_time
         force = force_along(term.law, term.parameters, d, v, time, element)  # type: ignore[arg-type]
         return grid.coarse_spectrum(force)
-    factor = impedance(term, grid.omega, float(element.damping))
-    assert factor is not None
+    branch = branch_of(term, 0, float(element.damping))
+    assert branch is not None
+    factor = branch.impedance(grid.omega)
     # series impedances vanish at zero frequency, so the rate carries them and ends that do not meet do no harm
     per_rate = np.zeros_like(factor)
     per_rate[1:] = factor[1:] / (1j * grid.omega[1:])

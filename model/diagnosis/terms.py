@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from model.diagnosis.catalogue import BodyLaw, ElementLaw, Law, SensorLaw
+from model.diagnosis.plant import Branch
 from model.signals import FloatArray
 from model.system import System
 
@@ -66,17 +67,13 @@ class Term:
         return weights
 
 
-def impedance(term: Term, omega: FloatArray, damping: float) -> FloatArray | None:
-    """Extra impedance of laws that are linear with memory, N/m, complex (F,); None: the law is not linear.
-
-    Maxwell branch: c j w / (1 + j w c / ks) instead of c j w.  Air spring: k j w tau / (1 + j w tau).
-    """
-    s = 1j * omega
+def branch_of(term: Term, element: int, damping: float) -> Branch | None:
+    """The branch that a law with linear memory puts beside an element; None: the law is not linear."""
     if term.law.name == "series_stiffness":
-        return damping * s / (1 + s * damping / term.parameters[0]) - damping * s
+        return Branch(element, term.parameters[0], damping / term.parameters[0], damping)
     if term.law.name == "air_spring":
-        stiffness, tau = term.parameters
-        return stiffness * s * tau / (1 + s * tau)
+        stiffness, time = term.parameters
+        return Branch(element, stiffness, time, 0.0)
     return None
 
 
@@ -86,7 +83,7 @@ def is_waveform(term: Term) -> bool:
 
 
 def split(terms: tuple[Term, ...]) -> tuple[list[Term], list[Term], list[Term], list[Term]]:
-    """Terms by how they act: along the trajectory, as impedance, on a body, on a measurement."""
+    """Terms by how they act: along the trajectory, as branches, on a body, on a measurement."""
     waveform = [t for t in terms if is_waveform(t)]
     linear = [t for t in terms if isinstance(t.law, ElementLaw) and not is_waveform(t)]
     body = [t for t in terms if isinstance(t.law, BodyLaw)]
