@@ -1,8 +1,8 @@
 """`python -m benchmarks.paper_report [FOLDER] [DOCUMENT]`: measured rows into the tables of docs/paper.md.
 
 Reads the rows that `sprung bench paper` kept (runs/paper/quick by default) and replaces what stands between
-`<!-- rows TASK -->` and `<!-- end -->` in the document, so that figures there are never typed by hand.  Several seeds
-become mean and standard deviation.
+`<!-- rows TASK -->` or `<!-- targets -->` and `<!-- end -->` in the document, so that figures there are never typed by
+hand.  Several seeds become mean and standard deviation.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,47 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     ),
     "phase": ("magnitude", "phase", "balance", "guess"),
 }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Target:
+    """What a figure of a method must not exceed."""
+
+    task: str
+    method: str
+    column: str
+    paper: float | None
+    bound: float
+
+
+TARGETS = (
+    Target("pendulum", "alps", "SE", 86.48, 86.48),
+    Target("pendulum", "alps", "PE", 0.06, 0.05),
+    Target("mass_spring_damper", "alps", "SE", 0.29, 0.29),
+    Target("mass_spring_damper", "alps", "PE", 0.60e6, 0.5e6),
+    Target("two_body", "alps", "SE", 0.45, 0.45),
+    Target("two_body", "alps", "PE", 0.02, 0.02),
+    Target("train", "alps", "SE", 3.02, 3.02),
+    Target("train", "alps", "PE_relative", 0.0042, 0.0025),
+    Target("train_changing", "refined", "PE_relative", None, 0.0030),
+)
+
+
+def targets(rows: list[dict[str, Any]]) -> str:
+    """Markdown table of the targets and what the rows reach, mean over seeds."""
+    lines = ["| task | figure | paper | target | reached | |", "|---" * 6 + "|"]
+    for target in TARGETS:
+        same = [row for row in rows if (row["task"], row.get("method")) == (target.task, target.method)]
+        reached = "not run yet"
+        met = ""
+        if same:
+            mean = float(np.mean([row[target.column] for row in same]))
+            reached = _cell([row | {"paper": {}} for row in same], target.column)
+            met = "yes" if mean <= target.bound else "no"
+        paper = "-" if target.paper is None else f"{target.paper:.4g}"
+        what = f"{target.method} {target.column}"
+        lines.append(f"| {target.task} | {what} | {paper} | {target.bound:.4g} | {reached} | {met} |")
+    return "\n".join(lines)
 
 
 def table(task: str, rows: list[dict[str, Any]]) -> str:
@@ -60,15 +102,19 @@ def _cell(rows: list[dict[str, Any]], column: str) -> str:
 
 def main(folder: Path, document: Path) -> None:
     """Refresh the tables of the document."""
-    text = document.read_text()
+    found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
+    found = [row for row in found if "unfinished" not in row]
 
     def fill(match: re.Match[str]) -> str:
         task = match.group(1)
-        found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
-        rows = [row for row in found if row["task"] == task and "unfinished" not in row]
+        rows = [row for row in found if row["task"] == task]
         return f"<!-- rows {task} -->\n{table(task, rows) if rows else 'not run yet'}\n<!-- end -->"
 
-    document.write_text(re.sub(r"<!-- rows (\w+) -->.*?<!-- end -->", fill, text, flags=re.DOTALL))
+    text = document.read_text()
+    text = re.sub(r"<!-- rows (\w+) -->.*?<!-- end -->", fill, text, flags=re.DOTALL)
+    reached = f"<!-- targets -->\n{targets(found)}\n<!-- end -->"
+    text = re.sub(r"<!-- targets -->.*?<!-- end -->", lambda _: reached, text, flags=re.DOTALL)
+    document.write_text(text)
 
 
 if __name__ == "__main__":

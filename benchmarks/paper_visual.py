@@ -76,18 +76,19 @@ def rows(settings: Settings) -> Iterator[dict[str, Any]]:
     for method in METHODS:
         if not settings.wants(method):
             continue
-        begin = time.perf_counter()
+        begin, busy = time.perf_counter(), time.process_time()
         model = train_method(
             task, cast(MethodName, method), splits["train"], frames, config, sizes, settings.folder,
             settings.clock, settings.device,
         )  # fmt: skip
-        seconds = time.perf_counter() - begin
+        seconds, processor = time.perf_counter() - begin, time.process_time() - busy
         row, shown[method] = _row(task, method, model, splits)
         models[method] = model
         yield row | {
             "seed": settings.seed,
             "budget": settings.budget,
             "seconds": round(seconds, 1),
+            "processor_seconds": round(processor, 1),
             "weights": sum(p.numel() for p in model.network.parameters()),
             "settings": asdict(config),
         }

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from model.alps import mass_spring_damper
-from model.alps.config import NetworkConfig, TrainingConfig
+from model.alps.config import NetworkConfig, training_config
 from model.alps.fit import VisualModel
 from model.alps.frames import FrameAutoencoder
 from model.alps.losses import loss_of, picture_loss
@@ -107,7 +107,8 @@ def _update(
     begin, busy = time.perf_counter(), time.process_time()
     embeddings = model.frames.encode(pictures).unflatten(0, (batch, WINDOW))
     passed = model.network(embeddings, inputs)
-    loss = loss_of(model.network.task, passed, embeddings, TrainingConfig(), 1e-3).total
+    task = model.network.task
+    loss = loss_of(task, passed, embeddings, training_config(task.name, "full", 0), 1e-3).total
     loss = loss + picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
     optimiser.zero_grad()
     loss.backward()

@@ -12,10 +12,11 @@ import torch
 from benchmarks import paper
 from benchmarks.physics_overhead import _stepwise
 from model.alps import fit, mass_spring_damper, train_fit, two_body
-from model.alps.config import NetworkConfig, TrainingConfig, training_config
+from model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
 from model.alps.evaluate import every_window, predict, state_figures
 from model.alps.fit import Clock, OutOfTime, Split
 from model.alps.frames import FrameAutoencoder
+from model.alps.losses import tempered
 from model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
 from model.refine import Refiner
 from model.simulate.linear import LinearSimulator
@@ -24,7 +25,18 @@ from service.errors import UserError
 
 SIZES = NetworkConfig()
 TINY = TrainingConfig(
-    trajectories=6, test_trajectories=3, updates=6, batch=2, checkpoint_every=2, frame_updates=4, frame_batch=8
+    phases=(
+        Phase("states", 9, 2, (2e-3, 2e-3)),
+        Phase("estimator", 33, 2, (2e-3, 1e-3)),
+        Phase("all", 99, 2, (1e-3, 0)),
+    ),
+    trajectories=6,
+    test_trajectories=3,
+    batch=2,
+    estimator_batch=4,
+    checkpoint_every=2,
+    frame_updates=4,
+    frame_batch=8,
 )
 
 
@@ -85,7 +97,9 @@ def test_the_frame_autoencoder_learns_and_is_kept(tmp_path: Path) -> None:
 
 def test_end_to_end_training_reaches_the_convolutions(tmp_path: Path) -> None:
     task, data = mass_spring_damper.TASK, fake_split()
-    config = replace(TINY, updates=1, end_to_end=True)
+    config = replace(
+        TINY, phases=(Phase("all", 99, 1, (2e-3, 2e-3)), Phase("estimator", 99, 1, (2e-3, 2e-3))), end_to_end=True
+    )
     frames = FrameAutoencoder(SIZES)
     before = frames.embed.maps[0].weight.detach().clone()  # type: ignore[union-attr,operator]
     rollouts = fit.draw_rollouts(task, config, "train")
@@ -109,14 +123,46 @@ def test_opening_with_components_finds_the_orbits_up_to_their_turn() -> None:
     assert figures["PE"] is not None and figures["SE"] is not None
 
 
-def test_schedules_go_from_short_to_the_whole_window_and_the_prior_fades() -> None:
+def test_schedules_lengthen_the_horizon_and_the_prior_fades() -> None:
     for name in ("pendulum", "mass_spring_damper", "two_body"):
         config = training_config(name, "quick", 0)
-        assert sum(config.shares) == pytest.approx(1)
-        assert all(99 % horizon == 0 for horizon in config.horizons)
-        assert config.horizon(config.updates - 1) == 99
+        horizons = [phase.horizon for phase in config.phases]
+        assert horizons == sorted(horizons) and horizons[-1] == 99
+        assert all(99 % horizon == 0 for horizon in horizons)
         assert config.divergence(config.updates) == pytest.approx(config.divergence_weight)
         assert training_config(name, "full", 0).end_to_end
+
+
+def test_phases_follow_each_other_with_their_learning_rates() -> None:
+    found = [TINY.phase(step) for step in range(TINY.updates)]
+    assert [phase.trains for phase, _ in found] == ["states", "states", "estimator", "estimator", "all", "all"]
+    assert [rate for _, rate in found] == pytest.approx([2e-3, 2e-3, 2e-3, 1.5e-3, 1e-3, 0.5e-3])
+
+
+def test_only_the_estimator_moves_while_the_encoder_rests(tmp_path: Path) -> None:
+    task, frames = two_body.TASK, FrameAutoencoder(SIZES)
+    before = fit.train_method(
+        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:1]), SIZES, tmp_path, Clock()
+    )
+    path = tmp_path / "longer"
+    path.mkdir()
+    after = fit.train_method(
+        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:2]), SIZES, path, Clock()
+    )
+    for (name, left), right in zip(before.network.named_parameters(), after.network.parameters(), strict=True):
+        if not name.startswith("estimator"):
+            torch.testing.assert_close(left, right)
+    assert before.network.estimator is not None and after.network.estimator is not None
+    pairs = zip(before.network.estimator.parameters(), after.network.estimator.parameters(), strict=True)
+    assert any(not torch.equal(left, right) for left, right in pairs)
+
+
+def test_a_lost_simulation_counts_little() -> None:
+    squared = torch.tensor([[1e-4, 0.1, 10.0]])
+    small, knee, lost = (float(tempered(squared[:, i : i + 1], 0.1)) for i in range(3))
+    assert small == pytest.approx(1e-4, rel=1e-3)
+    assert knee == pytest.approx(0.1 * np.log(2))
+    assert lost < 0.5
 
 
 def test_train_trajectories_have_the_papers_sizes(train_data) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -25,50 +26,91 @@ class NetworkConfig:
 
 
 @dataclass(frozen=True)
-class TrainingConfig:
-    """One training run.  `horizons` (shooting lengths, samples) divide WINDOW - 1; the last is the paper's."""
+class Phase:
+    """A stretch of a training run.
 
+    `states`: parameters stay at mid-range (or are read off the states) while the encoder learns what a state is;
+    `estimator`: the encoder rests while the estimator learns from its states; `all`: everything moves.
+    Methods without an estimator train everything throughout.
+    """
+
+    trains: Literal["states", "estimator", "all"]
+    horizon: int  # shooting length, samples; divides WINDOW - 1
+    updates: int
+    learning_rate: tuple[float, float]  # at its beginning and its end
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """One training run."""
+
+    phases: tuple[Phase, ...]
     seed: int = 0
-    trajectories: int = 150  # for training
+    trajectories: int = 500  # for training
     test_trajectories: int = 60
-    updates: int = 400
     batch: int = 16
-    learning_rate: float = 2e-3
+    estimator_batch: int = 256  # windows are encoded beforehand there, and the simulator's cost hardly grows
+    learning_rate: float = 2e-3  # of the frame autoencoder
     checkpoint_every: int = 100
     frame_updates: int = 250  # of the frame autoencoder, shared by every method of a task
     frame_batch: int = 64
     end_to_end: bool = False  # train the convolutions with the rest, not only in the frame autoencoder
-    horizons: tuple[int, ...] = (3, 9, 33, 99)
-    shares: tuple[float, ...] = (0.15, 0.2, 0.3, 0.35)  # of the updates spent at each horizon
-    warm_up: float = 0.35  # share of the updates with the parameters held at mid-range
     divergence_start: float = 0.1  # weight of the KL (summed over states, mean over samples): large at first, so
     divergence_weight: float = 1e-3  # that the prior fixes origin and size, then small, so that states are sharp
-    divergence_share: float = 0.35  # of the updates over which it falls
+    divergence_fall: int = 200  # updates over which it falls
     observation_weight: float = 1.0  # squared error of the standardised embedding, mean
     pixel_weight: float = 20.0  # squared error of pixels in [0, 1], mean; end_to_end only
     state_weight: float = 1.0  # squared error of the chart, summed over its columns, mean over samples
+    outlier: float = 0.1  # squared error beyond which a sample counts less (see `losses.py`)
 
-    def horizon(self, step: int) -> int:
-        """Shooting length at an update."""
-        reached = 0.0
-        for horizon, share in zip(self.horizons, self.shares, strict=True):
-            reached += share * self.updates
-            if step < reached:
-                return horizon
-        return self.horizons[-1]
+    @property
+    def updates(self) -> int:
+        """Length of the run."""
+        return sum(phase.updates for phase in self.phases)
+
+    def phase(self, step: int) -> tuple[Phase, float]:
+        """Phase of an update, and its learning rate there."""
+        begin = 0
+        for phase in self.phases:
+            if step < begin + phase.updates:
+                break
+            begin += phase.updates
+        first, last = phase.learning_rate
+        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, (step - begin) / phase.updates)))
+        return phase, last + (first - last) * cosine
 
     def divergence(self, step: int) -> float:
         """Weight of the KL at an update: geometric fall, then constant."""
-        share = min(1.0, step / max(1.0, self.divergence_share * self.updates))
+        share = min(1.0, step / self.divergence_fall)
         return self.divergence_start * (self.divergence_weight / self.divergence_start) ** share
 
 
 _QUICK = {
-    "pendulum": TrainingConfig(warm_up=0.5, divergence_start=0.03, state_weight=0.2),
-    "mass_spring_damper": TrainingConfig(
-        horizons=(33, 99), shares=(0.4, 0.6), warm_up=0.5, divergence_start=0.01, state_weight=0.2
+    "pendulum": TrainingConfig(
+        phases=(
+            Phase("states", 3, 300, (2e-3, 2e-3)),
+            Phase("states", 9, 400, (2e-3, 5e-4)),
+            Phase("estimator", 33, 200, (2e-3, 5e-4)),
+            Phase("all", 33, 400, (1e-3, 1e-4)),
+            Phase("estimator", 99, 500, (2e-3, 1e-4)),
+        ),
+        divergence_start=0.03,
     ),
-    "two_body": TrainingConfig(shares=(0.2, 0.2, 0.3, 0.3), warm_up=0.5, divergence_start=1e-3),
+    "mass_spring_damper": TrainingConfig(
+        phases=(Phase("states", 33, 300, (2e-3, 2e-3)), Phase("all", 99, 1200, (2e-3, 2e-5))),
+        divergence_start=0.01,
+        state_weight=0.2,
+    ),
+    "two_body": TrainingConfig(
+        phases=(
+            Phase("states", 3, 200, (2e-3, 2e-3)),
+            Phase("states", 9, 200, (2e-3, 2e-3)),
+            Phase("states", 33, 100, (2e-3, 1e-3)),
+            Phase("all", 33, 500, (2e-3, 1e-4)),
+            Phase("estimator", 99, 200, (1e-3, 1e-4)),
+        ),
+        divergence_start=1e-3,
+    ),
 }
 
 
@@ -79,9 +121,9 @@ def training_config(task: str, budget: Budget, seed: int) -> TrainingConfig:
         return config
     return replace(
         config,
-        trajectories=500,
+        phases=tuple(replace(phase, updates=15 * phase.updates) for phase in config.phases),
+        divergence_fall=15 * config.divergence_fall,
         test_trajectories=500,
-        updates=20_000,
         batch=32,
         learning_rate=1e-3,
         frame_updates=4000,

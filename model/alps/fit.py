@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from model.alps.config import Method, NetworkConfig, TrainingConfig
 from model.alps.frames import FrameAutoencoder
-from model.alps.losses import loss_of, picture_loss
+from model.alps.losses import loss_of, picture_loss, state_loss
 from model.alps.network import Network
 from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 from model.training import Run
@@ -70,11 +70,11 @@ def draw_rollouts(task: Task, config: TrainingConfig, split: str) -> Rollouts:
     return task.sample(count, rng, task.unseen if split == "unseen" else task.seen)
 
 
-def pick_windows(config: TrainingConfig, step: int) -> tuple[Tensor, Tensor]:
-    """Rows and starts (B,) of the windows of an update."""
+def pick_windows(config: TrainingConfig, step: int, batch: int) -> tuple[Tensor, Tensor]:
+    """Rows and starts (batch,) of the windows of an update."""
     rng = np.random.default_rng([config.seed, 3, step])
-    rows = rng.integers(config.trajectories, size=config.batch)
-    starts = rng.integers(ROLLOUT - WINDOW + 1, size=config.batch)
+    rows = rng.integers(config.trajectories, size=batch)
+    starts = rng.integers(ROLLOUT - WINDOW + 1, size=batch)
     return torch.from_numpy(rows), torch.from_numpy(starts)
 
 
@@ -141,32 +141,61 @@ def train_method(
     run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))
     run.resume()
     model.train()
+    encoded: Tensor | None = None  # only while the encoder rests
     while run.step < config.updates:
         clock.check(run)
-        run.rate(config.updates)
-        run.update(_update_loss(task, model, data, config, run.step, device))
+        phase, rate = config.phase(run.step)
+        run.optimiser.param_groups[0]["lr"] = rate
+        torch.manual_seed(config.seed * 1_000_003 + run.step)
+        if phase.trains == "estimator" and model.network.estimator is not None:
+            encoded = _encode_all(task, model, data, config, device) if encoded is None else encoded
+            run.update(_estimator_loss(task, model.network, encoded, data, config, run.step, device))
+        else:
+            encoded = None
+            run.update(_update_loss(task, model, data, config, run.step, device))
         if run.step == config.updates:
             run.save()
     return model.eval()
 
 
 def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingConfig, step: int, device: str) -> Tensor:
-    rows, starts = pick_windows(config, step)
-    torch.manual_seed(config.seed * 1_000_003 + step)
+    """The three-term loss on the windows of an update."""
+    phase, _ = config.phase(step)
+    rows, starts = pick_windows(config, step, config.batch)
     inputs = windows(data.rollouts.inputs, starts, rows).to(device)
     pictures = None
     if config.end_to_end:
         assert task.render is not None
-        states = windows(data.rollouts.states, starts, rows).to(device)
-        pictures = task.render(states.flatten(0, 1))
+        pictures = task.render(windows(data.rollouts.states, starts, rows).to(device).flatten(0, 1))
         embeddings = model.frames.encode(pictures).unflatten(0, (config.batch, WINDOW))
     else:
         embeddings = windows(data.embeddings, starts, rows).to(device)
-    passed = model.network(embeddings, inputs, config.horizon(step), warm_up=step < config.warm_up * config.updates)
+    passed = model.network(embeddings, inputs, phase.horizon, warm_up=phase.trains == "states")
     loss = loss_of(task, passed, embeddings, config, config.divergence(step)).total
     if pictures is not None:
         loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
     return loss
+
+
+def _estimator_loss(
+    task: Task, network: Network, encoded: Tensor, data: Split, config: TrainingConfig, step: int, device: str
+) -> Tensor:
+    """The state term alone, which is what reaches the estimator while the encoder rests; `encoded` by `_encode_all`."""
+    phase, _ = config.phase(step)
+    rows, starts = pick_windows(config, step, config.estimator_batch)
+    states = encoded[rows.to(device), starts.to(device)]
+    inputs = windows(data.rollouts.inputs, starts, rows).to(device)
+    return state_loss(task, states, network.simulated(states, inputs, phase.horizon), config.outlier)
+
+
+@torch.no_grad()
+def _encode_all(task: Task, model: VisualModel, data: Split, config: TrainingConfig, device: str) -> Tensor:
+    """Posterior means of every window by trajectory and start, (R, 26, WINDOW, N)."""
+    embeddings = data.embeddings.to(device)
+    if config.end_to_end:
+        embeddings = model.frames.encode_rollouts(task, data.rollouts.states.to(device))
+    starts = range(ROLLOUT - WINDOW + 1)
+    return torch.stack([model.network.encoder(embeddings[:, at : at + WINDOW]).mean for at in starts], dim=1)
 
 
 def _frames_name(task: Task, config: TrainingConfig) -> str:

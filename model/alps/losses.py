@@ -25,15 +25,29 @@ class Loss:
 def loss_of(task: Task, passed: Passed, embeddings: Tensor, config: TrainingConfig, divergence_weight: float) -> Loss:
     """KL + |o - decoded(simulated)|^2 + |encoded - simulated|^2, on embeddings (B, T, E).
 
-    The paper sums over the window; means keep the weights independent of its length.  The simulated states are the
-    encoded ones where a method has no dynamics, so that its last term is zero.
+    The paper sums over the window; means keep the weights independent of its length.  Both errors are `tempered`.  The
+    simulated states are the encoded ones where a method has no dynamics, so that its last term is zero.
     """
     divergence = passed.encoded.divergence.mean()
-    observation = (passed.observed - embeddings).square().mean()
-    gap = task.to_chart(passed.encoded.draw) - task.to_chart(passed.simulated)
-    state = gap.square().sum(-1).mean()
+    observation = tempered((passed.observed - embeddings).square().mean(-1), config.outlier)
+    state = state_loss(task, passed.encoded.draw, passed.simulated, config.outlier)
     total = divergence_weight * divergence + config.observation_weight * observation + config.state_weight * state
     return Loss(total, divergence, observation, state)
+
+
+def state_loss(task: Task, encoded: Tensor, simulated: Tensor, outlier: float) -> Tensor:
+    """|encoded - simulated|^2 on the chart of the states, both (B, T, N)."""
+    gap = task.to_chart(encoded) - task.to_chart(simulated)
+    return tempered(gap.square().sum(-1), outlier)
+
+
+def tempered(squared: Tensor, outlier: float) -> Tensor:
+    """Mean of squared errors (B, T), each as a log(1 + e / a): a Cauchy likelihood.
+
+    A simulation that falls to the other side of an unstable equilibrium is wrong by the size of the whole motion, and
+    plain squares let such windows decide the parameters: damping makes them rarer.
+    """
+    return (outlier * torch.log1p(squared / outlier)).mean()
 
 
 def picture_loss(drawn: Tensor, pictures: Tensor) -> Tensor:

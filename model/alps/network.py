@@ -71,6 +71,11 @@ class Network(nn.Module):
         observed = self.decoder(self.task.to_chart(simulated, self.shown), straight)
         return Passed(encoded, parameters, simulated, observed)
 
+    def simulated(self, states: Tensor, inputs: Tensor, horizon: int) -> Tensor:
+        """Simulation of encoded states (B, T, N) with the parameters that they give."""
+        assert self.estimator is not None
+        return self._rollout(states, self.estimator(states), inputs, horizon, warm_up=False)
+
     def _rollout(
         self, states: Tensor, parameters: Tensor | None, inputs: Tensor, horizon: int, warm_up: bool
     ) -> Tensor:
