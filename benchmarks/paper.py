@@ -1,8 +1,8 @@
 """`sprung bench paper [TASK]`: every table row and figure of the paper, from nothing, beside the paper's values.
 
-Tasks: the three visual systems, the train with constant and with changing parameters, the kernels of Fig. 3 and the
-experiment on phases.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a command that was
-stopped, or that ran out of `--minutes`, goes on where it was when it is given again.
+Tasks: the three visual systems, the train with constant and with changing parameters, the kernels of Fig. 3, the
+experiments on phases and on features.  Checkpoints lie under `--out` (`runs/paper`, not kept in the repository): a
+command that was stopped, or that ran out of `--minutes`, goes on where it was when it is given again.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ TASKS: dict[str, tuple[Callable[[Settings], Iterator[dict[str, Any]]], tuple[str
     "train_changing": (paper_train.changing_rows, paper_train.CHANGING_METHODS),
     "kernels": (paper_analysis.kernel_rows, ()),
     "phase": (paper_analysis.phase_rows, ()),
+    "features": (paper_analysis.feature_rows, ()),
 }
 
 

@@ -1,15 +1,24 @@
-"""Rows of the analysis: kernels of Fig. 3, and when magnitudes lose the parameters."""
+"""Rows of the analysis: kernels of Fig. 3, when magnitudes lose the parameters, and what the two features allow."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from typing import Any
 
+import torch
+
 from benchmarks import paper_pictures
 from benchmarks.paper_settings import Settings
-from model.alps import kernels, phase
+from benchmarks.paper_visual import TASKS
+from model.alps import kernels, metrics, phase
+from model.alps.config import NetworkConfig, TrainingConfig, training_config
+from model.alps.estimator import Estimator, Features, log_magnitudes, raw
+from model.alps.fit import draw_rollouts, pick_windows
+from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 
 INPUTS = (1, 2, 4, 8)
+FEATURE_UPDATES = 1000
+FEATURE_BATCH = 64
 
 
 def kernel_rows(settings: Settings) -> Iterator[dict[str, Any]]:
@@ -45,3 +54,39 @@ def phase_rows(settings: Settings) -> Iterator[dict[str, Any]]:
         }
     if settings.seed == 0:
         paper_pictures.phases(rows, settings.pictures / "phase.png")
+
+
+def feature_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+    """PE of the estimator from true states, trained with labels: a bound on what its features allow."""
+    for task in TASKS.values():
+        config = training_config(task.name, settings.budget, settings.seed)
+        row: dict[str, Any] = {"task": "features", "method": task.name, "seed": settings.seed}
+        for kind, features in (("magnitudes", log_magnitudes), ("raw", raw)):
+            estimator = _labelled(task, config, features)
+            for split, name in (("test", "PE"), ("unseen", "PE_unseen")):
+                error = _parameter_error(estimator, draw_rollouts(task, config, split))
+                row[f"{name}_{kind}"] = float(f"{error:.4g}")
+        yield row | {"updates": FEATURE_UPDATES, "batch": FEATURE_BATCH}
+
+
+def _labelled(task: Task, config: TrainingConfig, features: Features) -> Estimator:
+    torch.manual_seed(config.seed)
+    estimator = Estimator(task, NetworkConfig(), features)
+    rollouts = draw_rollouts(task, config, "train")
+    optimiser = torch.optim.Adam(estimator.parameters(), lr=2e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FEATURE_UPDATES)
+    for step in range(FEATURE_UPDATES):
+        rows, starts = pick_windows(config, step, FEATURE_BATCH)
+        error = (estimator(windows(rollouts.states, starts, rows)) - rollouts.parameters[rows]) / estimator.span
+        optimiser.zero_grad()
+        error.square().mean().backward()
+        optimiser.step()
+        schedule.step()
+    return estimator
+
+
+@torch.no_grad()
+def _parameter_error(estimator: Estimator, rollouts: Rollouts) -> float:
+    rows = torch.arange(len(rollouts.states))
+    shown = windows(rollouts.states, rows % (ROLLOUT - WINDOW + 1), rows)
+    return metrics.parameter_error(estimator(shown), rollouts.parameters)

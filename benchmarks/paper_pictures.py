@@ -17,7 +17,7 @@ from model.alps.fit import VisualModel
 from model.alps.kernels import SAMPLE_RATE, KernelView, six_sines
 from model.alps.task import Task
 
-DPI = 70
+DPI = 100
 METHOD_NAMES = {
     "alps": "ALPS",
     "no_fourier": "w/o Fourier",
@@ -57,6 +57,7 @@ def states(task: Task, shown: dict[str, Predicted], path: Path, window: int = 0)
             if column == 0:
                 ax.set_ylabel(task.states[state], fontsize=7)
         axes[0, column].set_title(METHOD_NAMES[method], fontsize=8)
+        axes[-1, column].set_xlabel("time [s]", fontsize=7)
     axes[0, 0].legend(fontsize=6)
     _save(figure, path)
 
@@ -140,6 +141,7 @@ def train_states(time: np.ndarray, lines: dict[str, dict[str, np.ndarray]], path
         ax.set_ylabel(state, fontsize=7)
         ax.tick_params(labelsize=6)
     axes[0].legend(fontsize=6, ncols=4)
+    axes[-1].set_xlabel("time [s]", fontsize=7)
     _save(figure, path)
 
 

@@ -30,6 +30,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "row_minimum",
     ),
     "phase": ("magnitude", "phase", "balance", "guess"),
+    "features": ("PE_magnitudes", "PE_raw", "PE_unseen_magnitudes", "PE_unseen_raw"),
 }  # fmt: skip
 
 

@@ -35,7 +35,7 @@ CHANGING_METHODS = (
 )
 PAPER = {"alps": {"SE": 3.02, "PE": 0.44e4, "PE_relative": 0.0042}, "cdm": {"SE": 56.04}}
 UPDATES = {
-    "quick": {"alps": 400, "alps_smoothed": 400, "no_fourier": 400, "cdm": 600, "alps_from_sensors": 400},
+    "quick": {"alps": 400, "alps_smoothed": 400, "no_fourier": 400, "cdm": 600, "alps_from_sensors": 800},
     "full": {"alps": 5000, "alps_smoothed": 5000, "no_fourier": 5000, "cdm": 20_000, "alps_from_sensors": 20_000},
 }
 

@@ -105,13 +105,18 @@ class SensorAutoencoder(nn.Module):
         self.estimator = LogRatioEstimator((WINDOW // 2 + 1) * len(task.states), len(task.parameters))
         self.decoder = StateDecoder(len(task.states) + inputs, sensors, config)
 
-    def forward(self, observations: Tensor, knots: Tensor):  # type: ignore[no-untyped-def]
-        """(B, T, 12), (B, T, 16) -> posterior, log-ratios, simulated states, decoded observations / scale."""
+    def forward(self, observations: Tensor, knots: Tensor, nominal: bool = False):  # type: ignore[no-untyped-def]
+        """(B, T, 12), (B, T, 16) -> posterior, log-ratios, simulated states, decoded observations / scale.
+
+        `nominal` holds the parameters there: until states mean something, the estimator would learn to hide motion.
+        """
         drive = knots / self.drive
         encoded = self.encoder(self.embed(torch.cat([observations / self.scale, drive], dim=-1).float()))
         states = encoded.draw if self.training else encoded.mean
         chart = self.task.to_chart(states)
         log_ratio = self.estimator(torch.log1p(magnitudes(chart))).double()
+        if nominal:
+            log_ratio = torch.zeros_like(log_ratio)
         simulated = self.task.simulate(states[:, 0].double(), log_ratio, knots)
         seen = torch.cat([self.task.to_chart(simulated).float(), drive.float()], dim=-1)
         return encoded, log_ratio, simulated, self.decoder(seen)
@@ -166,7 +171,7 @@ def _loss(model: nn.Module, data: TrainData, rows: Tensor, starts: Tensor, confi
         return ((model(measured, known, horizon) - measured) / data.size).square().mean()
     observations, knots = windows(data.observations, starts, rows), windows(data.knots, starts, rows)
     assert isinstance(model, SensorAutoencoder)
-    encoded, _, simulated, decoded = model(observations, knots)
+    encoded, _, simulated, decoded = model(observations, knots, nominal=step < config.updates // 2)
     divergence = encoded.divergence.mean()
     observation = (decoded - observations / model.scale).square().mean()
     state = ((encoded.draw - simulated) / data.size).square().sum(-1).mean()
