@@ -8,7 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from model.diagnosis.catalogue import CATALOGUE, Law
+from model.diagnosis.catalogue import CATALOGUE, ElementLaw, Law
 from model.diagnosis.channels import Prepared, prepare
 from model.diagnosis.choose import Trial, compete, preferred, shortlist
 from model.diagnosis.fit import Fit, Point, Problem
@@ -18,6 +18,7 @@ from model.diagnosis.measured import Noise, Signals, declared_noise, drifting, t
 from model.diagnosis.noise import force_noise, input_noise, sensor_noise
 from model.diagnosis.report import Report
 from model.diagnosis.screen import Screening, screen
+from model.diagnosis.surface import with_surface
 from model.diagnosis.unknown import UNKNOWN
 from model.signals import FloatArray
 from model.system import System
@@ -25,6 +26,10 @@ from model.system import System
 _NOISE_ROUNDS = 3  # of force noise and fit, which weighs by it
 
 Progress = Callable[[float, str], None]
+
+# a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
+_MINOR_BESIDE, _MINOR_ELSEWHERE = 0.05, 0.002
+_ASTRAY = 1.5  # rise of the reduced chi-square from the first part to the whole recording
 
 
 class Recorded(Protocol):
@@ -72,13 +77,14 @@ class Course:
     noise: Noise
     problem: Problem
     base: Fit
-    fit: Fit
+    fit: Fit  # on the first part; what is judged on the held-out part
     held: HeldOut
     first: Screening
     last: Screening
     found: list[Found] = field(default_factory=list)
     input_faults: list[InputFault] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
+    final: Fit | None = None  # the same model on the whole recording; what is reported
 
 
 def diagnose(
@@ -128,7 +134,22 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     for number in range(options.most_findings):
         if not _next_finding(course, number, tell):
             break
+    tell(0.93, "the model on the whole recording")
+    course.final = _on_everything(course)
     return course
+
+
+def _on_everything(course: Course) -> Fit:
+    """The model fitted to the whole recording, once it has been judged; the first part's where that goes astray."""
+    rated = drifting(course.system, course.signals.sensor_index)
+    part = transform(course.signals, course.problem.noise, rated=rated)
+    problem = replace(course.problem, part=part, whitener=None, smoothed=None)
+    try:
+        with np.errstate(all="ignore"):
+            fit = problem.fit(course.held.run(course.fit.point).point, iterations=4)
+    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+        return course.fit
+    return fit if fit.reduced < _ASTRAY * course.fit.reduced else course.fit
 
 
 def baseline(system: System, signals: Signals, declared: Noise, options: Options) -> tuple[Problem, Fit]:
@@ -195,6 +216,7 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     share = 0.25 + 0.17 * number
     trials = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
     trials = preferred([t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)])
+    trials.sort(key=lambda t: t.hit.family != "force")  # faults of the inputs first, of forces as of motions
     for trial in trials[:1]:
         if options.held_out and not _holds(course, trial):
             return False
@@ -204,11 +226,21 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
             return False
         rivals = [t for t in trials if t is not trial]
         course.found.append(Found(trial, rivals, p_value))
-        course.problem, course.fit = refreshed(course.problem, trial.fit)
+        fit = trial.fit if trial.named else _smoother(course, trial.fit)
+        course.problem, course.fit = refreshed(course.problem, fit)
         tell(share + 0.12, "screening what is left")
         course.last = screen(course.problem, course.fit, options.catalogue, options.project)
         return True
     return False
+
+
+def _smoother(course: Course, fit: Fit) -> Fit:
+    """The unnamed force of a fit as an estimated surface, if that serves the held-out part better."""
+    surface = with_surface(course.problem, fit)
+    if surface is None:
+        return fit
+    chi_square = course.held.run(surface.point).chi_square
+    return surface if chi_square < course.held.run(fit.point).chi_square else fit
 
 
 def _repeats(course: Course, hit) -> bool:
@@ -223,13 +255,26 @@ def _repeats(course: Course, hit) -> bool:
 
 def _minor(course: Course, trial: Trial) -> bool:
     """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
-    for found in course.found:
-        same = found.trial.term.location == trial.term.location
-        if trial.gain < (0.05 if same else 0.002) * found.trial.gain:
-            return True
-        if same and not trial.named:
+    fall = course.fit.chi_square - trial.fit.chi_square
+    for index, found in enumerate(course.found):
+        if found.trial.term.location != trial.term.location:
+            if trial.gain < _MINOR_ELSEWHERE * found.trial.gain:
+                return True
+        elif not trial.named or fall < _MINOR_BESIDE * _worth(course.fit, index):
             return True
     return False
+
+
+def _worth(fit: Fit, index: int) -> float:
+    """By how much chi-square would rise without a term of a fit, by its strength and that one's deviation (Wald)."""
+    term = fit.point.terms[index]
+    first = len(fit.point.theta) + sum(len(t.parameters) for t in fit.point.terms[:index])
+    strength = (term.law.strength if isinstance(term.law, ElementLaw) else None) or 0
+    if not term.parameters:
+        return 0.0
+    absent = term.law.absent[strength] if isinstance(term.law, ElementLaw) else 0.0
+    size = term.parameters[strength] - (absent if np.isfinite(absent) else 0.0)
+    return float(size**2 / max(fit.covariance[first + strength, first + strength], 1e-300))
 
 
 def _holds(course: Course, trial: Trial) -> bool:

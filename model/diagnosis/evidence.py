@@ -11,6 +11,7 @@ from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit
 from model.diagnosis.heldout import FreeRun
 from model.diagnosis.hysteresis import force_along
+from model.diagnosis.latent import SurfaceLaw
 from model.diagnosis.screen import Projector, element_motion
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import StaticLaw
@@ -77,6 +78,10 @@ def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]
     }
     if isinstance(term.law, StaticLaw):
         result.update(_surface(course, term, term.law, key, d, v))
+    elif isinstance(term.law, SurfaceLaw) and term.law.latent is not None:
+        drawn_map = term.law.latent.map((_BINS, _BINS))
+        result[f"{key}.map_d"], result[f"{key}.map_v"] = drawn_map.deflection, drawn_map.rate
+        result[f"{key}.map_force"], result[f"{key}.map_std"] = drawn_map.force, drawn_map.std
     else:
         result[f"{key}.curve_law"] = drawn
     if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):

@@ -24,6 +24,7 @@ class FreeRun:
     chi_square: float  # whitened, of the held-out residual
     count: int
     per_sensor: FloatArray  # rms(error) / rms(measured), (S,)
+    point: Point  # the model, with its starting state over the whole recording
 
     @property
     def nrmse(self) -> float:
@@ -54,7 +55,7 @@ class HeldOut:
         for _ in range(4):
             now = Point(point.theta, point.terms, state)
             shown, forward, forces = problem.predict(now, waveform or ())
-            if forces is not None and not forces.converged:
+            if forces is not None and not forces.converged and not forward.plant.floats:  # those never forget
                 shown, forward, forces = problem.predict(now, march_forces(forward, state))
             waveform = None if forces is None else tuple(forces.force.T)
             rows = forward.free_rows_at_start()
@@ -70,7 +71,7 @@ class HeldOut:
                 break
         A = forward.plant.structure.state_matrix()
         simulated = particular + propagate(A, rows, state, self.whole.grid.step, self.signals.samples)
-        return self._judge(simulated[self.split :], point)
+        return self._judge(simulated[self.split :], replace(point, state=state, near=waveform or ()))
 
     def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
@@ -85,7 +86,7 @@ class HeldOut:
         residual = self.whitener(self.grid.forward(compared), self.later)
         size = np.sqrt(np.mean(measured**2, axis=0))
         per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
-        return FreeRun(simulated, measured, float(residual @ residual), len(residual), per_sensor)
+        return FreeRun(simulated, measured, float(residual @ residual), len(residual), per_sensor, point)
 
     def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""

@@ -146,13 +146,14 @@ class LatentForce:
         variance = np.einsum("tk,kl,tl->t", basis, self.covariance, basis, optimize=True)
         return np.sqrt(np.maximum(variance, 0)).reshape(np.shape(d))
 
-    def law(self, name: str = "unknown") -> ElementLaw:
+    def law(self, name: str = "unknown") -> SurfaceLaw:
         """The surface as a law of one parameter, its share: 1 is the surface as estimated."""
 
         def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-            return p[0] * self.force(motion.deflection, motion.rate)
+            return p[0] * self.force(np.asarray(motion.deflection), np.asarray(motion.rate))
 
-        return ElementLaw(
+        return SurfaceLaw(
+            latent=self,
             name=name,
             title="a force that no law of the catalogue explains",
             parameters=(ParameterSpec("share", "1", -5.0, 5.0, "of the estimated surface", lambda seen: 1.0),),
@@ -216,6 +217,13 @@ class LatentForce:
         edges = [np.concatenate([[-np.inf], 0.5 * (a[1:] + a[:-1]), [np.inf]]) for a in (y, x)]
         counts, *_ = np.histogram2d(v, d, bins=edges)
         return counts / len(d)
+
+
+@dataclass(frozen=True)
+class SurfaceLaw(ElementLaw):
+    """An estimated surface in the place of a law."""
+
+    latent: LatentForce | None = None
 
 
 def estimate_force(

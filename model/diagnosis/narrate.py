@@ -33,12 +33,14 @@ if TYPE_CHECKING:
 _NAMING_MARGIN = 6.0  # evidence by which a law must beat its look-alikes to be named alone (odds of 20 to 1)
 _CHANGED = 0.25  # a parameter this far from nominal, and surely so, is listed as changed
 _STRANGE = 0.6  # nrmse of the final model from which the system file does not describe this recording
+_NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
 _LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts as undecided
 
 
 def narrate(course: Course, record: Recorded) -> Report:
     """The report of an investigation."""
     before = course.held.run(course.base.point)
+    final = course.final or course.fit
     after = course.held.run(course.fit.point) if course.found else before
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
@@ -68,7 +70,7 @@ def narrate(course: Course, record: Recorded) -> Report:
         baseline=_parameters(course.system, course.base),
         baseline_validation=_figures(names, before.per_sensor),
         findings=tuple(findings),
-        augmented=_parameters(course.system, course.fit),
+        augmented=_parameters(course.system, final),
         augmented_validation=_figures(names, after.per_sensor),
         noise_floor=_figures(names, floor_figures),
         localization=course.first.localization(),
@@ -141,7 +143,7 @@ def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], Flo
     at = P + sum(len(t.parameters) for t in fit.point.terms[:index])
     term = fit.point.terms[index]
     block = fit.covariance[at : at + len(term.parameters), at : at + len(term.parameters)]
-    sigma = np.sqrt(np.maximum(np.diag(block), 0))
+    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
     hidden = term.law.name == UNKNOWN
     parameters = tuple(
         LawParameter(spec.name, float(value), float(s), spec.unit)
@@ -156,7 +158,7 @@ def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
     findings = []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[index]
-        parameters, block = _law_parameters(course.fit, index)
+        parameters, block = _law_parameters(course.final or course.fit, index)
         rival = next((t for t in found.trials if t.term.law.name != term.law.name), None)
         family, advice = _look_alikes(found)
         finding = Finding(
@@ -223,8 +225,9 @@ def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, aft
 
 def _worst_bias(course: Course) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
-    sigma = _deviations(course.system, course.fit)
-    shift = course.base.point.theta - course.fit.point.theta
+    final = course.final or course.fit
+    sigma = _deviations(course.system, final)
+    shift = course.base.point.theta - final.point.theta
     if not len(shift):
         return None
     shift = np.where(np.abs(shift) > 5 * sigma, shift, 0.0)
@@ -287,9 +290,9 @@ def _undecided(course: Course) -> list[str]:
 
 def _changes(course: Course) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
-    sigma = _deviations(course.system, course.fit)
+    final = course.final or course.fit
+    sigma, theta = _deviations(course.system, final), final.point.theta
     words = []
-    theta = course.fit.point.theta
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
     for i in order:
         if abs(theta[i]) > np.log1p(_CHANGED) and abs(theta[i]) > 5 * sigma[i]:

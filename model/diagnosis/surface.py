@@ -1,0 +1,58 @@
+"""The force of an unknown law as a smooth surface over deflection and rate, put into the simulation and refitted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from model.diagnosis.fit import Fit, Problem
+from model.diagnosis.hysteresis import force_along
+from model.diagnosis.latent import LatentForce, Surface, estimate_force
+from model.diagnosis.screen import Projector, element_motion
+from model.diagnosis.terms import Term
+from model.signals import FloatArray
+
+_ROUNDS = 2  # of estimate and refit: the surface is estimated along the motion that it shapes itself
+
+
+def with_surface(problem: Problem, fit: Fit) -> Fit | None:
+    """A fit whose last term is an unnamed force, with an estimated surface in its place; None where that diverges."""
+    current = fit
+    for _ in range(_ROUNDS):
+        latent = _estimate(problem, current)
+        term = Term(latent.law(), current.point.terms[-1].location, (1.0,), scales=(1.0,))
+        point = replace(current.point, terms=(*current.point.terms[:-1], term))
+        try:
+            with np.errstate(all="ignore"):  # a surface that diverges is judged by its chi-square
+                current = replace(problem, smoothed=None).fit(point, iterations=6)
+        except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+            return None
+    return current if np.isfinite(current.chi_square) else None
+
+
+def _estimate(problem: Problem, fit: Fit) -> LatentForce:
+    """The surface that the residual without the last term asks for."""
+    projector = Projector(problem, fit)
+    grid, term = projector.grid, fit.point.terms[-1]
+    element = problem.system.elements.index(term.location)
+    d, v = (motion[:, element] for motion in element_motion(fit))
+    present = force_along(
+        term.law,  # type: ignore[arg-type]
+        term.parameters,
+        d,
+        v,
+        grid.start + grid.fine_time,
+        fit.forward.element_of(term),
+    )
+
+    def respond(forces: FloatArray) -> FloatArray:
+        spectra = grid.coarse_spectrum(forces)[grid.band]  # (F, m)
+        answers = [projector.pack(projector.of_force[:, :, element] * column[:, None]) for column in spectra.T]
+        return np.stack(answers, axis=1)
+
+    own = np.zeros(fit.jacobian.shape[1], dtype=bool)
+    last = len(own) - len(fit.point.state)
+    own[last - len(term.parameters) : last] = True
+    residual = fit.residual + respond(present[:, None])[:, 0]
+    return estimate_force(Surface.over(d, v), (d, v), respond, residual, fit.jacobian[:, ~own])
