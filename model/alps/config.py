@@ -106,7 +106,7 @@ _QUICK = {
             Phase("states", 3, 200, (2e-3, 2e-3)),
             Phase("states", 9, 200, (2e-3, 2e-3)),
             Phase("states", 33, 100, (2e-3, 1e-3)),
-            Phase("all", 33, 500, (2e-3, 1e-4)),
+            Phase("all", 33, 900, (2e-3, 1e-4)),
             Phase("estimator", 99, 200, (1e-3, 1e-4)),
         ),
         divergence_start=1e-3,
