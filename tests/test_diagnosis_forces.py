@@ -8,8 +8,9 @@ from scipy.signal import resample
 from model.diagnosis.catalogue import find_law
 from model.diagnosis.channels import prepare
 from model.diagnosis.diagnose import Options, baseline, refreshed
-from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.measured import declared_noise, drifting, rate_of
+from model.diagnosis.point import Point
 from model.diagnosis.spectra import Grid
 from model.diagnosis.terms import Term
 from model.system import System, load_system, parse_system

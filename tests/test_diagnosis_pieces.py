@@ -9,11 +9,12 @@ from diagnosis_cases import DAMPING, STIFFNESS, quarter_car, simulate
 from model.diagnosis.catalogue import SpringDamper, find_law
 from model.diagnosis.catalogue.trajectory import along
 from model.diagnosis.channels import prepare
-from model.diagnosis.fit import Point, Problem
+from model.diagnosis.fit import Problem
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.measured import declared_noise, transform
 from model.diagnosis.noise import input_noise
 from model.diagnosis.plant import Branch, Plant, Structure
+from model.diagnosis.point import Point
 from model.diagnosis.screen import screen
 from model.diagnosis.spectra import Grid
 from model.diagnosis.terms import Term

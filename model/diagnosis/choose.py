@@ -22,8 +22,9 @@ from scipy import stats
 
 from model.chunks import share
 from model.diagnosis.catalogue import ElementLaw
-from model.diagnosis.fit import Fit, Point, Problem, advance
+from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import BOTH
+from model.diagnosis.point import Point, advance
 from model.diagnosis.screen import Hit, Screening, element_motion
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import SMALL, UNKNOWN

@@ -11,11 +11,12 @@ import numpy as np
 from model.diagnosis.catalogue import CATALOGUE, ElementLaw, Law
 from model.diagnosis.channels import Prepared, prepare
 from model.diagnosis.choose import Trial, compete, preferred, shortlist
-from model.diagnosis.fit import Fit, Point, Problem
+from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.heldout import HeldOut
 from model.diagnosis.inputs import InputFault, best_input_fault, input_faults_of
 from model.diagnosis.measured import Noise, Signals, declared_noise, drifting, transform
 from model.diagnosis.noise import force_noise, input_noise, sensor_noise
+from model.diagnosis.point import Point
 from model.diagnosis.report import Report
 from model.diagnosis.screen import Screening, screen
 from model.diagnosis.surface import with_surface

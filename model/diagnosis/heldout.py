@@ -6,11 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.diagnosis.fit import Fit, Point, Problem, Whitener
+from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import propagate
 from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
+from model.diagnosis.point import Point
 from model.diagnosis.spectra import Grid
+from model.diagnosis.whiten import Whitener
 from model.signals import FloatArray
 from model.system import System
 

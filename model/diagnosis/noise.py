@@ -15,10 +15,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from model.diagnosis.fit import Whitener
 from model.diagnosis.forward import Forward
 from model.diagnosis.measured import Noise, Part
 from model.diagnosis.spectra import ComplexArray
+from model.diagnosis.whiten import Whitener
 from model.signals import FloatArray
 
 _BLOCKS = 24

@@ -1,0 +1,77 @@
+"""The equivalent linear law, which the plant carries so that only the curvature is left to the iteration."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from model.diagnosis.forward import Forward, LawForces
+from model.diagnosis.motions import particular_start
+from model.diagnosis.point import Point
+from model.diagnosis.spectra import OVERSAMPLING
+from model.diagnosis.tangent import law_force
+from model.diagnosis.terms import Term, is_waveform
+
+if TYPE_CHECKING:
+    from model.diagnosis.fit import Problem
+
+_PRELOADS = 4  # rounds of equivalent law and motion
+
+
+def preloaded(problem: Problem, point: Point) -> Point:
+    """The point with the laws' equivalent stiffness and damping moved into the plant.
+
+    The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges.
+    """
+    for _ in range(_PRELOADS):
+        if not any(is_waveform(t) and "|" not in t.location for t in point.terms):
+            return point
+        forward = problem.forward(point)
+        forces = forward.law_forces(point.state)
+        assert forces is not None
+        start = particular_start(forward, forces)
+        terms, change = [], 0.0
+        for term in point.terms:
+            if is_waveform(term) and "|" not in term.location:
+                k, c = _equivalent(forward, forces, term)
+                element = forward.element_of(term)
+                size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
+                change = max(
+                    change,
+                    abs(k - term.preload[0]) / (size[0] + abs(k)),
+                    abs(c - term.preload[1]) / (size[1] + abs(c)),
+                )
+                terms.append(replace(term, preload=(k, c)))
+            else:
+                terms.append(term)
+        point = replace(point, terms=tuple(terms))
+        if change < 1e-3:
+            break
+        # the free state counts from the plant's particular solution, which has changed: keep the true state
+        state = start + point.state
+        for _ in range(2):
+            moved = problem.forward(point)
+            point = replace(point, state=state - particular_start(moved, moved.law_forces(point.state)))
+        if forces.converged and change < 0.2:
+            break
+    return point
+
+
+def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float, float]:
+    """Stiffness and damping that are nearest to a law along its motion."""
+    i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    thin = slice(None, None, OVERSAMPLING)
+    regressors = np.column_stack([forces.deflection[thin, i], forces.rate[thin, i]])
+    sizes = np.maximum(np.std(regressors, axis=0), 1e-300)
+    reach = 4.0 * sizes
+    f = law_force(forward, term, forces)[thin]
+    inside = np.all(np.abs(regressors) < reach, axis=1)
+    k, c = np.linalg.lstsq(regressors[inside] / sizes, f[inside], rcond=None)[0] / sizes
+    element = forward.element_of(term)
+    k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0  # a body that floats stays afloat
+    c = max(c, -0.9 * element.damping) if element.damping else max(c, 0.0)
+    if not forces.converged:
+        k, c = (k + term.preload[0]) / 2, (c + term.preload[1]) / 2
+    return float(k), float(c)

@@ -1,0 +1,44 @@
+"""Residuals weighed by their covariance: noise of the sensors and of the inputs, through the plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.diagnosis.forward import Forward
+from model.diagnosis.measured import Noise, Part
+from model.diagnosis.spectra import ComplexArray
+from model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Whitener:
+    """Inverse Cholesky factors of the residual's covariance on the compared bins."""
+
+    factor: ComplexArray  # (F, S, S)
+    blame: ComplexArray  # whitened residual to the inputs' share of it, supports then forces, (F, inputs, S)
+
+    @classmethod
+    def of(cls, forward: Forward, noise: Noise) -> Whitener:
+        """Covariance from the sensors' noise and from the inputs' noise through the model."""
+        part, plant = forward.part, forward.plant
+        band = part.grid.band
+        G = plant.sensor_of_support[band]
+        variance = noise.support_variance(part.grid.omega[band])
+        G = np.concatenate([G, plant.sensor_of_measured_force[band]], axis=2)
+        variance = np.concatenate([variance, np.broadcast_to(noise.force**2, (len(G), len(noise.force)))], axis=1)
+        G = G * forward.sensor_factor[band, :, None]
+        weighted = G * variance[:, None, :]
+        R = weighted @ G.conj().transpose(0, 2, 1)
+        index = np.arange(R.shape[1])
+        R[:, index, index] += noise.sensor_variance(part.grid, part.rated)[band]
+        factor = np.linalg.inv(np.linalg.cholesky(R))
+        return cls(factor, (factor @ weighted).conj().transpose(0, 2, 1))
+
+    def __call__(self, spectrum: ComplexArray, part: Part) -> FloatArray:
+        """(F, S) or (F, S, m) -> real unit-noise vectors (2 F S,) or (2 F S, m)."""
+        band = spectrum[part.grid.band]
+        if band.ndim == 2:
+            return part.grid.pack((self.factor @ band[:, :, None])[:, :, 0])
+        return part.grid.pack(self.factor @ band)
