@@ -55,12 +55,6 @@ def force_steps(A: FloatArray, b: FloatArray, rows: FloatArray, h: float) -> For
     return ForceSteps(h, whole, rows @ held, rows @ half @ held, np.ascontiguousarray(gain.reshape(N, 4 * L)))
 
 
-def force_gains(A: FloatArray, b: FloatArray, h: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """exp(A h), and how a force that is linear within a step acts by its value at the start and at the end, (N, L)."""
-    E, one, two, _ = _phi_times(A * h, b)
-    return E, h * (one - two), h * two
-
-
 def _phi_times(Ah: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """exp(Ah), and phi_1 b, phi_2 b, phi_3 b from one exponential (Al-Mohy and Higham 2011)."""
     N, L = b.shape
