@@ -211,11 +211,7 @@ class Problem:
         step = step_of(term, parameter)
         moved = term.moved(parameter, step)
         terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
-        if len(self.noise.force):  # laws act along the motion that the sensors saw, whatever the model's would be
-            other_forward = self.forward(replace(point, terms=terms))
-            other = self._shown(other_forward, forces)
-        else:
-            other, other_forward, _ = self.predict(replace(point, terms=terms), _start(forces))
+        other, other_forward, _ = self.predict(replace(point, terms=terms), _start(forces))
         free = other_forward.free_rows() - forward.free_rows()
         return (other - shown + self.part.grid.forward(free @ point.state)) / step
 
