@@ -39,6 +39,8 @@ _RARE = frozenset({"air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"})
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
+_UNUSUAL = 4.0  # evidence that a factor e outside the usual range of a parameter costs
+_STRONGER = 1.1
 _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
@@ -156,6 +158,22 @@ def start_of(base: Fit, hit: Hit) -> Point:
 
 
 def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
+    """Starts at other values of the element than those that were read without the law."""
+    if hit.effect == "series_stiffness":
+        return _behind_a_spring(problem, base, hit)
+    name = f"{hit.location}.damping"
+    names = [p.name for p in problem.system.parameters]
+    if hit.beyond == 1.0 or name not in names or not isinstance(hit.term.law, ElementLaw):
+        return []
+    # A law in shares of the damper asks for more than all of it: the damper is stronger than it was read.
+    start = start_of(base, hit)
+    theta = start.theta.copy()
+    theta[names.index(name)] += np.log(_STRONGER * hit.beyond)
+    term = hit.term.at(hit.term.law.scaled(hit.term.parameters, 1 / _STRONGER))
+    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
+
+
+def _behind_a_spring(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
     """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
 
     At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's
@@ -163,7 +181,7 @@ def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
     """
     names = [p.name for p in problem.system.parameters]
     damping, stiffness = (f"{hit.location}.{quantity}" for quantity in ("damping", "stiffness"))
-    if hit.effect != "series_stiffness" or damping not in names:
+    if damping not in names:
         return []
     at = names.index(damping)
     nominal = problem.system.parameters[at].nominal
@@ -225,7 +243,8 @@ def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -
         return None
     fall = base.chi_square - fit.chi_square
     gain = min(fall, profile_gain(base.residual, fit.residual, len(problem.sensors)))
-    return Trial(hit, fit, gain, gain - cost(fit, len(hit.term.parameters)) - _prior_cost(hit))
+    dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
+    return Trial(hit, fit, gain, gain - dear)
 
 
 def preferred(trials: list[Trial]) -> list[Trial]:
@@ -261,6 +280,16 @@ def cost(fit: Fit, count: int) -> float:
         width = _LOG_WIDTH if spec.log else _WIDTHS * scale
         if s > 0:
             total += max(0.0, 2 * float(np.log(width / (s * np.sqrt(2 * np.pi)))))
+    return total
+
+
+def _unusual(term: Term) -> float:
+    """What values outside a law's usual range cost in evidence: look-alikes pass into each other there."""
+    total = 0.0
+    for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
+        low, high = spec.usual
+        relative = max(abs(value) / scale, 1e-12)
+        total += _UNUSUAL * float(np.log(max(1.0, low / relative, relative / high)))
     return total
 
 

@@ -33,6 +33,7 @@ class Hit:
     freedom: int
     family: str  # which group of tests it belongs to: "law", "mode", "line", "mass", "sensor", "input"
     p_single: float
+    beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
     step: FloatArray | None = None  # what the fit's parameters and state would move by, (P + p + 2n,)
 
     @property
@@ -247,9 +248,14 @@ def _best_shape(
     i = int(np.argmax(scores))
     if scores[i] <= 0:
         return absent, len(trials)
-    found = law.clip(list(law.scaled(list(trials[i]), float(amplitudes[i]))))
+    asked = law.scaled(list(trials[i]), float(amplitudes[i]))
+    found = law.clip(list(asked))
     term = Term(law, location, tuple(float(value) for value in found), scales=scales)
-    return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1))), len(trials)
+    beyond = 1.0
+    if law.strength is not None and found[law.strength] != law.absent[law.strength]:
+        absent_value = law.absent[law.strength]
+        beyond = max(1.0, (asked[law.strength] - absent_value) / (found[law.strength] - absent_value))
+    return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1)), float(beyond)), len(trials)
 
 
 def _unnamed(
@@ -295,10 +301,15 @@ def _force_spectrum(
 
 
 def _admissible(law: ElementLaw, trial: FloatArray, amplitude: float) -> bool:
-    """Whether the amplitude found leaves the law's strength within its bounds."""
+    """Whether the amplitude found has the law's sign."""
     if law.strength is None:
         return amplitude > 0
     value = float(law.scaled(list(trial), amplitude)[law.strength])
     spec = law.parameters[law.strength]
-    slack = 0.0 if spec.low == 0 and law.absent[law.strength] == 0 else abs(spec.high - spec.low)
-    return spec.low - 0.5 * min(slack, 1.0) <= value <= spec.high + 0.5 * min(slack, 1.0)
+    absent = law.absent[law.strength]
+    # More than the bound says that the element was misread; only the other sign is none of the law's.
+    return (
+        spec.low <= value <= spec.high
+        or (value < absent and spec.low < absent)
+        or (value > absent and spec.high > absent)
+    )

@@ -96,6 +96,7 @@ class ParameterSpec:
     meaning: str
     typical: Callable[[Observed], float]  # size at which the law would matter, for scaling a fit
     log: bool = False  # positive by nature and of unknown order: fitted as a logarithm
+    usual: tuple[float, float] = (0.0, float("inf"))  # range in multiples of `typical`, beyond which it is rare
 
     def admits(self, value: float) -> bool:
         return bool(self.low <= value <= self.high)

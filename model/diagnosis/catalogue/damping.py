@@ -33,6 +33,7 @@ COULOMB_FRICTION = ElementLaw(
             "rate over which the force changes sign",
             lambda seen: 0.05 * seen.rate_rms,
             log=True,
+            usual=(0.0, 4.0),  # wider, it is a damper that saturates
         ),
     ),
     force=_coulomb,
@@ -54,7 +55,16 @@ DAMPER_BLOWOFF = ElementLaw(
     name="damper_blowoff",
     title="damper blow-off",
     parameters=(
-        ParameterSpec("knee", "m/s", 1e-7, 100.0, "rate at which the valve opens", lambda s: s.rate[50], log=True),
+        ParameterSpec(
+            "knee",
+            "m/s",
+            1e-7,
+            100.0,
+            "rate at which the valve opens",
+            lambda seen: seen.rate[50],
+            log=True,
+            usual=(0.45, float("inf")),  # a valve that opens long before usual rates acts as friction
+        ),
         ParameterSpec("ratio", "1", 0.0, 0.98, "slope beyond the knee over slope below it", lambda seen: 0.3),
     ),
     force=_blowoff,
