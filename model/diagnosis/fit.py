@@ -10,7 +10,7 @@ attenuation bias that noisy regressors cause (Soderstrom 2007).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -78,7 +78,6 @@ class Problem:
     noise: Noise
     whitener: Whitener | None = None
     smoothed: Part | None = None  # the part with its inputs after smoothing
-    cache: dict = field(default_factory=dict)
 
     def forward(self, point: Point, start: tuple[FloatArray, ...] = ()) -> Forward:
         part = self.smoothed or self.part

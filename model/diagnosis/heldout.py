@@ -104,8 +104,3 @@ def _normal(free: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[
     """Normal equations of target (N, S) = weights * free (N, S, 2n) @ state."""
     columns = (free * weights[None, :, None]).reshape(-1, free.shape[2])
     return columns.T @ columns, columns.T @ target.ravel()
-
-
-def without(point: Point, index: int) -> Point:
-    """The point with one term left out."""
-    return replace(point, terms=tuple(t for i, t in enumerate(point.terms) if i != index))

@@ -19,13 +19,10 @@ from functools import cached_property
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from model.diagnosis.catalogue.base import ElementLaw, Motion, ParameterSpec, SpringDamper, Values
 from model.signals import FloatArray
-
-ComplexArray = NDArray[np.complex128]
 
 _INTERVALS = (10, 8)  # of the splines over deflection and rate
 # Least weights of roughness and size over 1 / force^2: a surface that bends by more than thrice the force's rms from
@@ -173,40 +170,6 @@ class LatentForce:
         d, v = np.meshgrid(x, y)
         return ForceMap(x, y, self.force(d, v), self.std(d, v), self._visited(x, y))
 
-    def compare(self, force: FloatArray, points: tuple[int, int] = (61, 41)) -> ForceMap:
-        """The map of a named law: its force (T,) along the same motion, seen through the same splines.
-
-        The part that spring and damper could take is left out here as it is in the surface; a memory shows as the
-        mean over its states, with their spread as `std`.
-        """
-        d, v = self.surface.motion
-        basis = self.surface.forces(d, v) @ self.surface.free
-        ridge = 1e-6 * np.trace(basis.T @ basis) / basis.shape[1]
-        rough = sum(self.surface.roughness)
-        inverse = np.linalg.inv(basis.T @ basis + ridge * (np.eye(basis.shape[1]) + rough))
-        linear = np.stack([np.ones(len(d)), d, v], axis=1)
-        rest = force - linear @ np.linalg.lstsq(linear, force, rcond=None)[0]
-        free = inverse @ (basis.T @ rest)
-        spread = float(np.std(rest - basis @ free))
-        x, y = self._grid(points)
-        grid_d, grid_v = np.meshgrid(x, y)
-        values = self.surface.value(self.surface.free @ free, grid_d, grid_v)
-        return ForceMap(x, y, values, np.full_like(values, spread), self._visited(x, y))
-
-    def curve(self, axis: str, points: int = 101) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Force over "deflection" or "rate", averaged over the other one as it was met: x, mean, std, (points,)."""
-        d, v = self.surface.motion
-        mine, other = (d, v) if axis == "deflection" else (v, d)
-        x = np.linspace(float(np.quantile(mine, 0.002)), float(np.quantile(mine, 0.998)), points)
-        rows = np.empty((points, self.surface.count))
-        met = np.quantile(other, np.linspace(0.05, 0.95, 19))
-        for i, value in enumerate(x):
-            at = np.full(len(met), value)
-            pair = (at, met) if axis == "deflection" else (met, at)
-            rows[i] = self.surface.forces(*pair).mean(axis=0)
-        variance = np.einsum("tk,kl,tl->t", rows, self.covariance, rows, optimize=True)
-        return x, rows @ self.coefficients, np.sqrt(np.maximum(variance, 0))
-
     def _grid(self, points: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         reach = (self.surface.deflection.reach, self.surface.rate.reach)
         x, y = (np.linspace(-r, r, count) / _MARGIN for r, count in zip(reach, points, strict=True))
@@ -338,24 +301,3 @@ class _Evidence:
         mean = np.sum([share * m for share, (m, _) in zip(shares, parts, strict=True)], axis=0)
         spread = [c + np.outer(m - mean, m - mean) for m, c in parts]
         return mean, np.sum([share * c for share, c in zip(shares, spread, strict=True)], axis=0)
-
-
-def force_series(
-    response: ComplexArray, residual: ComplexArray, omega: FloatArray, *, noise: float = 1.0
-) -> tuple[ComplexArray, FloatArray]:
-    """Spectrum of the force at one place that explains a residual, and its standard deviation per bin, both (F,).
-
-    response (F, S): whitened answer of the sensors to a unit force in each bin; residual (F, S) whitened; both complex.
-    Wiener estimate: where the sensors hardly answer, it falls to zero instead of blowing up the noise.  The force's
-    power is taken as smooth, its level per third of an octave from the excess over the noise.
-    """
-    gain = np.sum(np.abs(response) ** 2, axis=1)
-    variance = noise**2 / np.maximum(gain, 1e-300)
-    plain = np.sum(response.conj() * residual, axis=1) / np.maximum(gain, 1e-300)
-    band = np.floor(3 * np.log2(np.maximum(omega, omega[1] / 2) / omega[1])).astype(np.int64)
-    band -= band.min()
-    weight = 1 / variance**2
-    excess = np.bincount(band, weight * (np.abs(plain) ** 2 - variance)) / np.maximum(np.bincount(band, weight), 1e-300)
-    prior = np.maximum(excess, 0)[band]
-    share = prior / (prior + variance)
-    return share * plain, np.sqrt(share * variance)

@@ -8,7 +8,7 @@ freedom.  Letters: F bins, S sensors, E elements, n degrees of freedom.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -71,21 +71,6 @@ class Structure:
             L=mechanics.L[sensors],
             sensor_kind=mechanics.sensor_kind[sensors],
             body_of_dof=mechanics.body_of_dof,
-        )
-
-    def with_mode(
-        self, mass: float, omega: float, ratio: float, at_elements: FloatArray, at_sensors: FloatArray
-    ) -> Structure:
-        """One elastic mode more: its coordinate moves the element ends and sensors by the given shape."""
-        return replace(
-            self,
-            mass=np.append(self.mass, mass),
-            own_stiffness=np.append(self.own_stiffness, mass * omega**2),
-            own_damping=np.append(self.own_damping, 2 * ratio * omega * mass),
-            H=np.hstack([self.H, at_elements[:, None]]),
-            F=np.vstack([self.F, np.zeros((1, self.F.shape[1]))]),
-            S=np.hstack([self.S, at_sensors[:, None]]),
-            body_of_dof=np.append(self.body_of_dof, -1),
         )
 
     @property

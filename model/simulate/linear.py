@@ -78,7 +78,6 @@ class LinearSimulator:
         self.S, self.L = constant(mechanics.S), constant(mechanics.L)
         self.outer = torch.einsum("ea,eb->eab", self.H, self.H).reshape(len(self.nominal_k), -1)
         self.kind = torch.as_tensor(mechanics.sensor_kind, device=device)
-        self.value_knots, self.slope_knots = knot_columns(system)
         self.supports = torch.as_tensor([_knot_of(system, u) for u in mechanics.support_drive], dtype=torch.long)
         self.forces = torch.as_tensor([_knot_of(system, u) for u in mechanics.force_drive], dtype=torch.long)
         self.W = 2 * (len(self.supports) + len(self.forces))
