@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from diagnosis_cases import Recorded, quarter_car, simulate
+from diagnosis_cases import DAMPING, STIFFNESS, Recorded, quarter_car, simulate
 
 from model.diagnosis.channels import DiagnosisError
 from model.diagnosis.diagnose import Options, diagnose
@@ -94,3 +94,22 @@ def test_report_is_json_with_the_contracts_keys():
     keys = {"system", "recording", "verdict", "baseline", "findings", "augmented", "noise_floor", "localization"}
     assert keys <= set(data)
     assert set(data["baseline"]["validation"]) == {"nrmse", "per_sensor"}
+
+
+def test_valve_that_takes_nearly_all_of_the_damping_is_no_friction():
+    """Read without the law, the damper is weaker than what the valve takes away: more than all of it is asked for."""
+    knee, ratio, damping = 0.02, 0.1, DAMPING["secondary"]
+    report = _diagnose(simulate(lambda d, v: (ratio - 1) * damping * (v - np.clip(v, -knee, knee)), seed=28))
+    assert [(f.location, f.effect) for f in report.findings] == [("secondary", "damper_blowoff")]
+    for parameter, truth in zip(report.findings[0].parameters, (knee, ratio), strict=True):
+        assert abs(parameter.value - truth) < max(4 * parameter.std, 0.03 * truth)
+
+
+def test_force_without_a_name_is_mapped_and_widens_its_spring():
+    report = _diagnose(simulate(lambda d, v: 120 * np.sin(d / 6e-4), seed=29))
+    assert report.verdict == "unknown_physics"
+    assert [f.location for f in report.findings] == ["secondary"]
+    assert report.explained is not None and report.explained > 0.9
+    assert {"finding.0.map_force", "finding.0.map_std"} <= set(report.evidence)
+    spring = next(p for p in report.augmented if p.name == "secondary.stiffness")
+    assert abs(spring.value - STIFFNESS["secondary"]) < 3 * spring.std
