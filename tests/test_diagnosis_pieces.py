@@ -11,6 +11,7 @@ from model.diagnosis.catalogue.trajectory import along
 from model.diagnosis.channels import prepare
 from model.diagnosis.fit import Problem
 from model.diagnosis.hysteresis import force_along
+from model.diagnosis.march import march_forces
 from model.diagnosis.measured import declared_noise, transform
 from model.diagnosis.noise import input_noise
 from model.diagnosis.plant import Branch, Plant, Structure
@@ -128,6 +129,24 @@ def test_law_with_true_values_explains_a_recording_that_the_linear_model_cannot(
     assert plain.reduced > 2
     assert fit.reduced < 1.1
     assert abs(value - 4e9) < 4 * sigma
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "settles"), [("coulomb_friction", (300.0, 0.01), True), ("bump_stop", (4e-3, 1e6), False)]
+)
+def test_forces_marched_in_time_are_those_of_the_whole_trajectory(law, values, settles):
+    """Steps in time lead to the forces of the iteration, also where that does not settle from its own start."""
+    problem = _problem(simulate(seed=6))
+    point = Point(_truth(quarter_car()), (Term(find_law(law), "secondary", values),), np.zeros(4))
+    forward = problem.forward(point)
+    alone = forward.law_forces(point.state)
+    assert alone is not None and alone.converged is settles
+    marched = march_forces(forward, point.state)
+    led = problem.forward(point, marched).law_forces(point.state)
+    assert led is not None and led.converged
+    inside = slice(400, -100)  # the marched one is not periodic at the ends
+    difference = marched[0][inside] - led.force[inside, 0]
+    assert np.std(difference) < 0.02 * np.std(led.force[inside, 0])
 
 
 def test_input_noise_is_told_by_the_second_measurement():
