@@ -151,6 +151,7 @@ def diagnose(
     json_lines: Json = False,
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
+    one_thread_each()  # candidates are fitted beside each other
     from service.cli.diagnose import run
 
     return run(file, system, dbc, out, json_lines)
