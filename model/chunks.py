@@ -10,7 +10,7 @@ import numpy as np
 
 from model.signals import BoolArray, IntArray
 
-CHUNK = 32  # windows; twice as many take half as long again each
+CHUNK = 32  # windows
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 

@@ -233,13 +233,8 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
 
 
 def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
-    own = replace(problem, smoothed=None)
-    try:
-        with np.errstate(all="ignore"):  # a candidate that diverges is judged by its chi-square
-            fit = own.fit(start, iterations=iterations)
-    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return None
-    if not np.isfinite(fit.chi_square):
+    fit = replace(problem, smoothed=None).try_fit(start, iterations)
+    if fit is None:
         return None
     fall = base.chi_square - fit.chi_square
     gain = min(fall, profile_gain(base.residual, fit.residual, len(problem.sensors)))

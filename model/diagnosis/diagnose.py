@@ -85,7 +85,12 @@ class Course:
     found: list[Found] = field(default_factory=list)
     input_faults: list[InputFault] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
-    final: Fit | None = None  # the same model on the whole recording; what is reported
+    final: Fit | None = None  # the same model on the whole recording
+
+    @property
+    def reported(self) -> Fit:
+        """The fit whose values the report gives."""
+        return self.final or self.fit
 
 
 def diagnose(
@@ -145,12 +150,8 @@ def _on_everything(course: Course) -> Fit:
     rated = drifting(course.system, course.signals.sensor_index)
     part = transform(course.signals, course.problem.noise, rated=rated)
     problem = replace(course.problem, part=part, whitener=None, smoothed=None)
-    try:
-        with np.errstate(all="ignore"):
-            fit = problem.fit(course.held.run(course.fit.point).point, iterations=4)
-    except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-        return course.fit
-    return fit if fit.reduced < _ASTRAY * course.fit.reduced else course.fit
+    fit = problem.try_fit(course.held.run(course.fit.point).point, 4)
+    return fit if fit is not None and fit.reduced < _ASTRAY * course.fit.reduced else course.fit
 
 
 def baseline(system: System, signals: Signals, declared: Noise, options: Options) -> tuple[Problem, Fit]:
@@ -269,13 +270,13 @@ def _minor(course: Course, trial: Trial) -> bool:
 def _worth(fit: Fit, index: int) -> float:
     """By how much chi-square would rise without a term of a fit, by its strength and that one's deviation (Wald)."""
     term = fit.point.terms[index]
-    first = len(fit.point.theta) + sum(len(t.parameters) for t in fit.point.terms[:index])
     strength = (term.law.strength if isinstance(term.law, ElementLaw) else None) or 0
     if not term.parameters:
         return 0.0
     absent = term.law.absent[strength] if isinstance(term.law, ElementLaw) else 0.0
     size = term.parameters[strength] - (absent if np.isfinite(absent) else 0.0)
-    return float(size**2 / max(fit.covariance[first + strength, first + strength], 1e-300))
+    place = fit.place(index).start + strength
+    return float(size**2 / max(fit.covariance[place, place], 1e-300))
 
 
 def _holds(course: Course, trial: Trial) -> bool:

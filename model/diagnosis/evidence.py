@@ -97,12 +97,9 @@ def _surface(
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
     mesh_d, mesh_v = np.meshgrid(axis_d, axis_v)
     values = np.stack([np.broadcast_to(b, mesh_d.shape) for b in law.values(mesh_d, mesh_v)])
-    at = len(course.fit.point.theta)
-    for other in course.fit.point.terms:
-        if other.key == term.key:
-            break
-        at += len(other.parameters)
-    block = course.fit.covariance[at : at + len(values), at : at + len(values)]
+    keys = [other.key for other in course.fit.point.terms]
+    place = course.fit.place(keys.index(term.key))
+    block = course.fit.covariance[place, place]
     variance = np.einsum("ivd,ij,jvd->vd", values, block, values)
     return {
         f"{key}.map_d": axis_d,

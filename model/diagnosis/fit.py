@@ -63,6 +63,12 @@ class Fit:
     iterations: int
     bounded: bool = False  # a law's parameter stopped at its bound
 
+    def place(self, index: int) -> slice:
+        """Where the parameters of a term stand in the covariance."""
+        counts = [len(term.parameters) for term in self.point.terms]
+        first = len(self.point.theta) + sum(counts[:index])
+        return slice(first, first + counts[index])
+
     @property
     def reduced(self) -> float:
         return self.chi_square / max(1, self.count - self.jacobian.shape[1])
@@ -282,6 +288,15 @@ class Problem:
         steady[0] += np.real(force[0] - part.force[0]) / np.sqrt(part.grid.samples)
         force[0] = part.force[0]
         return replace(part, support=support, force=force, force_polynomial=steady)
+
+    def try_fit(self, start: Point, iterations: int) -> Fit | None:
+        """A fit that may go astray: None where the numbers do."""
+        try:
+            with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
+                fit = self.fit(start, iterations=iterations)
+        except (np.linalg.LinAlgError, FloatingPointError, ValueError):
+            return None
+        return fit if np.isfinite(fit.chi_square) else None
 
     def fit(self, start: Point, iterations: int = 12, tolerance: float = 1e-3) -> Fit:
         """Gauss-Newton with Levenberg damping from `start`; stops when no parameter moves by `tolerance` std."""

@@ -14,9 +14,10 @@ from scipy.linalg import expm
 
 from model.diagnosis.catalogue import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from model.diagnosis.catalogue.base import Values
-from model.diagnosis.forward import Forward, propagate
-from model.diagnosis.spectra import DEGREE, OVERSAMPLING
-from model.diagnosis.terms import Term, is_waveform
+from model.diagnosis.forward import Forward, LawForces, propagate
+from model.diagnosis.plant import Plant
+from model.diagnosis.spectra import OVERSAMPLING
+from model.diagnosis.terms import Term
 from model.signals import FloatArray
 from model.simulate.etd import Site, force_steps
 from model.simulate.segments import solve
@@ -31,19 +32,19 @@ def march_forces(forward: Forward, state: FloatArray) -> tuple[FloatArray, ...]:
 
     state (2n + b,): the free motion at the first sample, as `forward` counts it.
     """
-    terms = [term for term in forward.terms if is_waveform(term)]
-    plant, grid = forward.plant, forward.part.grid
-    s = plant.structure
-    ports = np.array([term.port(forward.system) for term in terms])
-    d0, v0 = forward.fine_motion(ports, state)
-    wide = np.pad(ports, ((0, 0), (0, len(s.H) - ports.shape[1])))
-    A, rows = s.state_matrix(), s.motion_rows(wide)
+    loop = forward.loop(state)
+    assert loop is not None
+    grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0, loop.v0
+    A, rows = s.state_matrix(), s.motion_rows(loop.wide)
     step = grid.step / _PARTS
-    steps = force_steps(A, s.force_columns(wide), rows, step)
+    steps = force_steps(A, s.force_columns(loop.wide), rows, step)
     fine = grid.step / OVERSAMPLING * np.arange(len(d0))
     nodes = step / 2 * np.arange(2 * _PARTS * (grid.samples - 1) + 1)
     inputs = np.hstack([CubicHermiteSpline(fine, d0, v0)(nodes), CubicSpline(fine, v0)(nodes)])
-    sites = [Site(_preloaded(term), term.parameters, forward.element_of(term)) for term in terms]
+    sites = [
+        Site(_preloaded(term), term.parameters, element)
+        for term, element in zip(loop.terms, loop.elements, strict=True)
+    ]
     first = np.zeros(s.states)
     for _ in range(_ROUNDS):
         known = inputs + propagate(A, rows, first, step / 2, len(nodes))
@@ -52,7 +53,7 @@ def march_forces(forward: Forward, state: FloatArray) -> tuple[FloatArray, ...]:
         )
         force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
         force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
-        before, first = first, _periodic_start(forward, wide @ s.H, force)
+        before, first = first, _periodic_start(loop.plant, loop.answer(force))
         if np.max(np.abs(first - before)) <= _SETTLED * np.max(np.abs(solution.states)):
             break
     return tuple(force.T)
@@ -69,17 +70,10 @@ def _preloaded(term: Term) -> ElementLaw:
     return replace(law, force=force)
 
 
-def _periodic_start(forward: Forward, along: FloatArray, force: FloatArray) -> FloatArray:
-    """State at the first sample, (2n + b,), of the motion that a periodic force (OVERSAMPLING N, m) keeps up."""
-    plant, grid = forward.plant, forward.part.grid
-    line = np.zeros((DEGREE + 1, force.shape[1]))
-    line[1] = force[-1] - force[0]
-    swinging = force - (grid.fine_time / grid.length)[:, None] * line[1]
-    line[0] = swinging.mean(axis=0)
-    spectrum = grid.coarse_spectrum(swinging - line[0])
-    q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ along)
-    steady = plant.polynomial_response(-line @ along)
-    position = grid.inverse(q)[0] + steady[0]
-    rate = grid.inverse(1j * grid.omega[:, None] * q)[0] + plant.derivative(steady)[0]
-    branches = grid.inverse(plant.structure.branch_forces(q @ plant.structure.H.T, grid.omega))[0]
+def _periodic_start(plant: Plant, forces: LawForces) -> FloatArray:
+    """State at the first sample, (2n + b,), of the motion that periodic forces keep up."""
+    grid = plant.grid
+    position = grid.inverse(forces.q)[0] + forces.motion[0]
+    rate = grid.inverse(1j * grid.omega[:, None] * forces.q)[0] + plant.derivative(forces.motion)[0]
+    branches = grid.inverse(plant.structure.branch_forces(forces.deflections, grid.omega))[0]
     return np.concatenate([position, rate, branches])

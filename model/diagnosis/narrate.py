@@ -40,7 +40,6 @@ _LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts 
 def narrate(course: Course, record: Recorded) -> Report:
     """The report of an investigation."""
     before = course.held.run(course.base.point)
-    final = course.final or course.fit
     after = course.held.run(course.fit.point) if course.found else before
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
@@ -70,7 +69,7 @@ def narrate(course: Course, record: Recorded) -> Report:
         baseline=_parameters(course.system, course.base),
         baseline_validation=_figures(names, before.per_sensor),
         findings=tuple(findings),
-        augmented=_parameters(course.system, final),
+        augmented=_parameters(course.system, course.reported),
         augmented_validation=_figures(names, after.per_sensor),
         noise_floor=_figures(names, floor_figures),
         localization=course.first.localization(),
@@ -139,10 +138,8 @@ def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
 
 
 def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
-    P = len(fit.point.theta)
-    at = P + sum(len(t.parameters) for t in fit.point.terms[:index])
-    term = fit.point.terms[index]
-    block = fit.covariance[at : at + len(term.parameters), at : at + len(term.parameters)]
+    term, place = fit.point.terms[index], fit.place(index)
+    block = fit.covariance[place, place]
     sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
     hidden = term.law.name == UNKNOWN
     parameters = tuple(
@@ -158,7 +155,7 @@ def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
     findings = []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[index]
-        parameters, block = _law_parameters(course.final or course.fit, index)
+        parameters, block = _law_parameters(course.reported, index)
         rival = next((t for t in found.trials if t.term.law.name != term.law.name), None)
         family, advice = _look_alikes(found)
         finding = Finding(
@@ -225,7 +222,7 @@ def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, aft
 
 def _worst_bias(course: Course) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
-    final = course.final or course.fit
+    final = course.reported
     sigma = _deviations(course.system, final)
     shift = course.base.point.theta - final.point.theta
     if not len(shift):
@@ -290,7 +287,7 @@ def _undecided(course: Course) -> list[str]:
 
 def _changes(course: Course) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
-    final = course.final or course.fit
+    final = course.reported
     sigma, theta = _deviations(course.system, final), final.point.theta
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))

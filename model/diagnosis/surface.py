@@ -18,17 +18,15 @@ _ROUNDS = 2  # of estimate and refit: the surface is estimated along the motion 
 
 def with_surface(problem: Problem, fit: Fit) -> Fit | None:
     """A fit whose last term is an unnamed force, with an estimated surface in its place; None where that diverges."""
-    current = fit
+    current: Fit | None = fit
     for _ in range(_ROUNDS):
+        if current is None:
+            break
         latent = _estimate(problem, current)
         term = Term(latent.law(), current.point.terms[-1].location, (1.0,), scales=(1.0,))
         point = replace(current.point, terms=(*current.point.terms[:-1], term))
-        try:
-            with np.errstate(all="ignore"):  # a surface that diverges is judged by its chi-square
-                current = replace(problem, smoothed=None).fit(point, iterations=6)
-        except (np.linalg.LinAlgError, FloatingPointError, ValueError):
-            return None
-    return current if np.isfinite(current.chi_square) else None
+        current = replace(problem, smoothed=None).try_fit(point, 6)
+    return current
 
 
 def _estimate(problem: Problem, fit: Fit) -> LatentForce:
@@ -52,7 +50,6 @@ def _estimate(problem: Problem, fit: Fit) -> LatentForce:
         return np.stack(answers, axis=1)
 
     own = np.zeros(fit.jacobian.shape[1], dtype=bool)
-    last = len(own) - len(fit.point.state)
-    own[last - len(term.parameters) : last] = True
+    own[fit.place(len(fit.point.terms) - 1)] = True
     residual = fit.residual + respond(present[:, None])[:, 0]
     return estimate_force(Surface.over(d, v), (d, v), respond, residual, fit.jacobian[:, ~own])
