@@ -14,14 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from model.diagnosis.spectra import ComplexArray, Grid, detrend_ends
+from model.diagnosis.plant import loose_shapes
+from model.diagnosis.spectra import ComplexArray, Grid, derivative, detrend_ends
 from model.mechanics import DISPLACEMENT
 from model.schema import SupportInput
 from model.signals import FloatArray
 from model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
-_HELD = 1e-9  # of the largest stiffness: less holds nothing
+_SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 
 
@@ -131,9 +132,7 @@ def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
     """
     mechanics = system.mechanics
     stiffness = (mechanics.H.T * mechanics.stiffness) @ mechanics.H
-    values, shapes = np.linalg.eigh(stiffness)
-    loose = shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)]
-    seen = np.any(np.abs(mechanics.S[sensors] @ loose) > _HELD, axis=1)
+    seen = np.any(np.abs(mechanics.S[sensors] @ loose_shapes(stiffness)) > _SEEN, axis=1)
     return seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
 
 
@@ -143,9 +142,8 @@ def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
     slopes = [np.linalg.lstsq(ends, stretch, rcond=None)[0][1] for stretch in (position[:_END], position[::-1][:_END])]
     polynomial = detrend_ends(position, (slopes[0], -slopes[1]), grid)
     rest = grid.forward(position - grid.monomials @ polynomial)
-    slope = np.zeros_like(polynomial)
-    slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
-    return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + grid.monomials @ slope)
+    slope = grid.monomials @ derivative(polynomial, grid.length)
+    return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
 
 
 def transform(signals: Signals, noise: Noise, start: float = 0.0, rated: np.ndarray | None = None) -> Part:

@@ -13,9 +13,17 @@ from functools import cached_property
 
 import numpy as np
 
-from model.diagnosis.spectra import DEGREE, ComplexArray, Grid
+from model.diagnosis.spectra import DEGREE, ComplexArray, Grid, derivative
 from model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, Mechanics
 from model.signals import FloatArray
+
+_HELD = 1e-9  # of the largest stiffness: less holds nothing
+
+
+def loose_shapes(stiffness: FloatArray) -> FloatArray:
+    """Motions (n, m) that a stiffness matrix (n, n) does not hold."""
+    values, shapes = np.linalg.eigh(stiffness)
+    return np.asarray(shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)])
 
 
 @dataclass(frozen=True)
@@ -225,8 +233,7 @@ class Plant:
     def steady_rate(self) -> FloatArray:
         """Velocity under a steady unit load, of what no stiffness holds and a damper brakes, (n, n)."""
         s = self.structure
-        values, shapes = np.linalg.eigh(s.K)
-        loose = shapes[:, np.abs(values) <= 1e-9 * max(float(np.abs(values).max()), 1e-300)]
+        loose = loose_shapes(s.K)
         return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
 
     @cached_property
@@ -301,10 +308,7 @@ class Plant:
 
     def derivative(self, polynomial: FloatArray) -> FloatArray:
         """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
-        result = np.zeros_like(polynomial)
-        orders = np.arange(1, len(polynomial)).reshape((-1,) + (1,) * (polynomial.ndim - 1))
-        result[:-1] = polynomial[1:] * orders / self.grid.length
-        return result
+        return derivative(polynomial, self.grid.length)
 
     def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
         """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""

@@ -102,6 +102,14 @@ class Grid:
         return np.concatenate([real.reshape(flat), imag.reshape(flat)])
 
 
+def derivative(polynomial: FloatArray, length: float) -> FloatArray:
+    """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
+    result = np.zeros_like(polynomial)
+    orders = np.arange(1, len(polynomial)).reshape((-1,) + (1,) * (polynomial.ndim - 1))
+    result[:-1] = polynomial[1:] * orders / length
+    return result
+
+
 def detrend_ends(series: FloatArray, slopes: tuple[FloatArray, FloatArray] | None, grid: Grid) -> FloatArray:
     """Polynomial coefficients over t / length that make the remainder continue around the record.
 
