@@ -141,6 +141,17 @@ def test_every_method_learns_from_a_batch_through_all_its_parts(task, method) ->
     assert parts | ({"context"} if method == "cdm" else set()) == reached
 
 
+@pytest.mark.parametrize("method", ["alps", "no_attention"])
+def test_with_physics_positions_are_an_affine_image_of_the_embedding(method) -> None:
+    task = two_body.TASK
+    network = Network(task, method, SIZES).requires_grad_(False)
+    left, right = torch.randn(2, 1, WINDOW, SIZES.embedding)
+    means = [network.encoder(e).mean[..., :4] for e in (left, right, 0.5 * (left + right))]
+    torch.testing.assert_close(means[2], 0.5 * (means[0] + means[1]))
+    rates = [network.encoder(e).mean[..., 4:] for e in (left, right, 0.5 * (left + right))]
+    assert torch.allclose(rates[2], 0.5 * (rates[0] + rates[1]), atol=1e-4) is (method == "no_attention")
+
+
 def test_over_the_whole_window_the_simulation_starts_at_the_encoded_state() -> None:
     task = pendulum.TASK
     network = Network(task, "alps", SIZES).eval()

@@ -49,6 +49,26 @@ def test_the_simulation_depends_differentiably_on_start_and_parameters(task: Tas
     assert all(bool(torch.isfinite(slope).all()) and float(slope.abs().max()) > 0 for slope in slopes)
 
 
+@pytest.mark.parametrize("task", [pendulum.TASK, two_body.TASK], ids=lambda task: task.name)
+def test_the_adjoint_of_a_path_is_its_gradient(task: Task) -> None:
+    drawn = rollouts(task, 2)
+    inputs = torch.zeros(2, 5, 0)
+    start = drawn.states[:, 0].clone().requires_grad_()
+    parameters = drawn.parameters.clone().requires_grad_()
+    assert torch.autograd.gradcheck(lambda x, p: task.simulate(x, p, inputs), (start, parameters))
+
+
+def test_the_pendulum_opens_with_its_angle_up_to_the_sense_of_turning() -> None:
+    angle = torch.from_numpy(np.random.default_rng(0).normal(0, 1, 500))
+    seen = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
+    mixed = seen @ torch.tensor([[0.7, -1.1], [2.0, 0.4]], dtype=torch.float64) + 0.3
+    weights, offsets = pendulum.opening(mixed)
+    opened = mixed @ weights.T + offsets
+    torch.testing.assert_close(opened[:, 0], seen[:, 0], atol=0.1, rtol=0)
+    torch.testing.assert_close(opened[:, 1].abs(), seen[:, 1].abs(), atol=0.2, rtol=0)
+    torch.testing.assert_close(opened.norm(dim=1), torch.ones_like(angle))
+
+
 def test_runge_kutta_converges_with_order_four() -> None:
     start = torch.tensor([[1.0, 0.0]], dtype=torch.float64)
 

@@ -47,7 +47,7 @@ class TrainingConfig:
     phases: tuple[Phase, ...]
     seed: int = 0
     trajectories: int = 500  # for training
-    test_trajectories: int = 60
+    test_trajectories: int = 200
     batch: int = 16
     estimator_batch: int = 256  # windows are encoded beforehand there, and the simulator's cost hardly grows
     learning_rate: float = 2e-3  # of the frame autoencoder
@@ -56,8 +56,8 @@ class TrainingConfig:
     frame_batch: int = 64
     end_to_end: bool = False  # train the convolutions with the rest, not only in the frame autoencoder
     divergence_start: float = 0.1  # weight of the KL (summed over states, mean over samples): large at first, so
-    divergence_weight: float = 1e-3  # that the prior fixes origin and size, then small, so that states are sharp
-    divergence_fall: int = 200  # updates over which it falls
+    divergence_weight: float = 1e-4  # that the prior fixes origin and size, then small, so that states are sharp
+    divergence_fall: int = 400  # updates over which it falls
     observation_weight: float = 1.0  # squared error of the standardised embedding, mean
     pixel_weight: float = 20.0  # squared error of pixels in [0, 1], mean; end_to_end only
     state_weight: float = 1.0  # squared error of the chart, summed over its columns, mean over samples
@@ -88,11 +88,11 @@ class TrainingConfig:
 _QUICK = {
     "pendulum": TrainingConfig(
         phases=(
-            Phase("states", 3, 300, (2e-3, 2e-3)),
-            Phase("states", 9, 400, (2e-3, 5e-4)),
-            Phase("estimator", 33, 200, (2e-3, 5e-4)),
-            Phase("all", 33, 400, (1e-3, 1e-4)),
-            Phase("estimator", 99, 500, (2e-3, 1e-4)),
+            Phase("states", 3, 600, (2e-3, 2e-3)),
+            Phase("estimator", 9, 150, (2e-3, 1e-3)),
+            Phase("all", 9, 700, (2e-3, 1e-4)),
+            Phase("estimator", 33, 500, (2e-3, 5e-4)),
+            Phase("estimator", 99, 400, (1e-3, 1e-4)),
         ),
         divergence_start=0.03,
     ),
@@ -106,7 +106,8 @@ _QUICK = {
             Phase("states", 3, 200, (2e-3, 2e-3)),
             Phase("states", 9, 200, (2e-3, 2e-3)),
             Phase("states", 33, 100, (2e-3, 1e-3)),
-            Phase("all", 33, 900, (2e-3, 1e-4)),
+            Phase("all", 33, 300, (2e-3, 1e-3)),
+            Phase("all", 99, 300, (1e-3, 1e-4)),
             Phase("estimator", 99, 200, (1e-3, 1e-4)),
         ),
         divergence_start=1e-3,

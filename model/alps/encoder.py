@@ -36,6 +36,8 @@ class Encoded:
 class PosteriorHead(nn.Module):
     """Features (..., W) -> posterior of chosen states: two numbers and log k for an angle, else mean and log std."""
 
+    bent: Tensor  # (columns,): 0 where the embedding alone decides
+
     def __init__(self, task: Task, states: tuple[int, ...], width: int, embedding: int) -> None:
         super().__init__()
         self.opening = task.opening
@@ -45,41 +47,56 @@ class PosteriorHead(nn.Module):
         self.out = nn.Linear(width, columns)
         with torch.no_grad():
             self.out.weight *= 3  # states of about unit size from the start
-        self.direct = nn.Linear(embedding, columns)  # feature points are nearly affine in positions
+        self.direct = nn.Linear(embedding, columns)
         nn.init.zeros_(self.direct.weight)
         nn.init.zeros_(self.direct.bias)
+        self.register_buffer("bent", torch.ones(columns))
+
+    @torch.no_grad()
+    def straighten(self, positions: tuple[int, ...]) -> None:
+        """Read these positions (an angle's cosine and sine) off the embedding by an affine map, and by nothing else.
+
+        A camera sees positions through an affine map, and feature points keep it so, to a hundredth of a pixel.  A
+        network in between bends it: large orbits come out small, and the physics needs long to bend it back.
+        """
+        for index, columns in self._mean_columns().items():
+            if index in positions:
+                self.bent[columns] = 0
+                nn.init.normal_(self.direct.weight[columns], std=self.direct.in_features**-0.5)
 
     @torch.no_grad()
     def open_with_components(self, embeddings: Tensor) -> None:
-        """Start the means of the positions from principal components of embeddings (M, E), where the task says how.
+        """Start the means of the positions from two principal components of embeddings (M, E), where the task says how.
 
-        Row i of `Task.opening` holds the weights of the whitened components in position i.  Feature points are nearly
-        affine in positions, so that components span what the picture shows; only their turn is left to find.
+        Components span what the picture shows; `Task.opening` makes positions of them.
         """
         if self.opening is None:
             return
-        weights = torch.tensor(self.opening, device=embeddings.device)  # (positions, components)
         mean = embeddings.mean(0)
         _, size, directions = torch.linalg.svd(embeddings - mean, full_matrices=False)
-        count = weights.shape[1]
-        whiten = directions[:count] / (size[:count, None] / len(embeddings) ** 0.5)
-        rows = weights @ whiten  # (positions, E)
-        for row, column in enumerate(self._mean_columns()[: len(rows)]):
-            self.out.weight[column] *= 0.1
-            self.direct.weight[column] = rows[row]
-            self.direct.bias[column] = -rows[row] @ mean
+        whiten = directions[:2] / (size[:2, None] / len(embeddings) ** 0.5)
+        weights, bias = self.opening((embeddings - mean) @ whiten.mT)
+        rows, offsets = weights @ whiten, bias - weights @ whiten @ mean
+        at = 0
+        for columns in self._mean_columns().values():
+            here = slice(at, at + columns.stop - columns.start)
+            if here.stop > len(rows):
+                break
+            self.direct.weight[columns], self.direct.bias[columns] = rows[here], offsets[here]
+            at = here.stop
 
-    def _mean_columns(self) -> list[int]:
-        """Column of each translation's mean in the output."""
-        columns, at = [], 0
+    def _mean_columns(self) -> dict[int, slice]:
+        """Columns of each state's mean in the output: cosine and sine of an angle, else one."""
+        columns, at = {}, 0
         for index in self.states:
-            columns.append(at)
-            at += 3 if index in self.angles else 2
+            width = 2 if index in self.angles else 1
+            columns[index] = slice(at, at + width)
+            at += width + 1
         return columns
 
     def forward(self, features: Tensor, embeddings: Tensor) -> Encoded:
         """(B, T, W) and (B, T, E) -> posterior of `states`, in their order."""
-        raw = self.out(features) + self.direct(embeddings)
+        raw = self.bent * self.out(features) + self.direct(embeddings)
         means, draws, divergence, at = [], [], torch.zeros_like(raw[..., 0]), 0
         for index, scale in zip(self.states, self.scales, strict=True):
             if index in self.angles:

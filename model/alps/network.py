@@ -53,6 +53,7 @@ class Network(nn.Module):
             self.context = ContextDynamics(task, config)
         elif method != "autoencoder":
             self.estimator = Estimator(task, config, raw if method == "no_fourier" else log_magnitudes)
+            self.encoder.head.straighten(task.placed)
 
     def forward(self, embeddings: Tensor, inputs: Tensor, horizon: int = WINDOW - 1, warm_up: bool = False) -> Passed:
         """Embeddings (B, T, E), inputs (B, T, I); `horizon` divides T - 1 (multiple shooting).
@@ -67,7 +68,7 @@ class Network(nn.Module):
         if self.estimator is not None:
             parameters = self.estimator.at_middle(len(states)) if warm_up else self.estimator(states)
         simulated = self._rollout(states, parameters, inputs, horizon, warm_up)
-        straight = warm_up and self.estimator is not None and not self.task.curved
+        straight = warm_up and self.estimator is not None
         observed = self.decoder(self.task.to_chart(simulated, self.shown), straight)
         return Passed(encoded, parameters, simulated, observed)
 

@@ -34,14 +34,14 @@ def derivative(state: Tensor, friction: Tensor) -> Tensor:
 
 def simulate(start: Tensor, friction: Tensor, inputs: Tensor) -> Tensor:
     """(B, 2), (B, 1), (B, T, 0) -> (B, T, 2)."""
-    return runge_kutta(lambda x: derivative(x, friction), start, inputs.shape[1], 1 / SAMPLE_RATE)
+    return runge_kutta(derivative, start, inputs.shape[1], 1 / SAMPLE_RATE, friction)
 
 
 def sample(count: int, rng: np.random.Generator, bounds: Range) -> Rollouts:
     """Draw rollouts as the paper does; the truth is integrated with a quarter of the step."""
     friction = torch.from_numpy(bounds.draw(count, rng))
     start = torch.from_numpy(np.stack([rng.uniform(-math.pi, math.pi, count), rng.uniform(0.5, 4, count)], axis=1))
-    fine = runge_kutta(lambda x: derivative(x, friction), start, 4 * ROLLOUT, 0.25 / SAMPLE_RATE)
+    fine = runge_kutta(derivative, start, 4 * ROLLOUT, 0.25 / SAMPLE_RATE, friction)
     return Rollouts(fine[:, ::4], torch.zeros(count, ROLLOUT, 0, dtype=torch.float64), friction)
 
 
@@ -65,6 +65,23 @@ def align(encoded: Tensor, true: Tensor) -> Callable[[Tensor], Tensor]:
     return lambda states: sign * states
 
 
+def opening(components: Tensor) -> tuple[Tensor, Tensor]:
+    """Cosine and sine: the ellipse on which components (M, 2) lie made a circle, its angle zero where most of them are.
+
+    Conic x'Qx + l'x = 1 by least squares; the prior too puts the angle's mode at zero.
+    """
+    x, y = components.T
+    conic = torch.linalg.lstsq(torch.stack([x * x, x * y, y * y, x, y], dim=1), torch.ones_like(x)).solution
+    form = torch.stack([conic[0], conic[1] / 2, conic[1] / 2, conic[2]]).reshape(2, 2)
+    centre = -torch.linalg.solve(form, conic[3:]) / 2
+    size, axes = torch.linalg.eigh(form / (1 + centre @ form @ centre))
+    root = axes @ torch.diag(size.clamp_min(1e-6).sqrt()) @ axes.T
+    cosine, sine = (root @ (components.mean(0) - centre)) / (root @ (components.mean(0) - centre)).norm()
+    turn = torch.stack([cosine, sine, -sine, cosine]).reshape(2, 2)
+    weights = turn @ root
+    return weights, -weights @ centre
+
+
 TASK = Task(
     name="pendulum",
     sample_rate=SAMPLE_RATE,
@@ -80,6 +97,6 @@ TASK = Task(
     sample=sample,
     align=align,
     render=render,
-    curved=True,
+    opening=opening,
     pixel_scale=1.0,
 )

@@ -12,19 +12,61 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+Derivative = Callable[..., Tensor]  # (state (..., N), *parameters (..., P)) -> (..., N)
 
-def runge_kutta(derivative: Callable[[Tensor], Tensor], start: Tensor, samples: int, step: float) -> Tensor:
-    """Solve x' = derivative(x) from `start` (B, N) -> (B, samples, N), the first sample being `start`."""
-    path = [start]
-    state = start
-    for _ in range(samples - 1):
-        k1 = derivative(state)
-        k2 = derivative(state + 0.5 * step * k1)
-        k3 = derivative(state + 0.5 * step * k2)
-        k4 = derivative(state + step * k3)
-        state = state + (step / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
-        path.append(state)
-    return torch.stack(path, dim=1)
+
+def runge_kutta(derivative: Derivative, start: Tensor, samples: int, step: float, *parameters: Tensor) -> Tensor:
+    """Solve x' = derivative(x, *parameters) from `start` (B, N) -> (B, samples, N), the first sample being `start`.
+
+    Differentiable in `start` and `parameters` (B, P).
+    """
+    path: Tensor = _Path.apply(derivative, samples, step, start, *parameters)
+    return path
+
+
+class _Path(torch.autograd.Function):
+    """Steps forward without a graph; backward, the Jacobians of all steps at once and then the adjoint recursion.
+
+    lambda[k] = dL/dx[k] + J[k]' lambda[k+1]: the same gradient as through every operation of every step, several
+    times faster, since the many small operations along the path leave the graph.
+    """
+
+    @staticmethod
+    def forward(  # type: ignore[no-untyped-def,override]
+        ctx, derivative: Derivative, samples: int, step: float, start: Tensor, *parameters: Tensor
+    ) -> Tensor:
+        states = [start]
+        for _ in range(samples - 1):
+            states.append(_step(derivative, states[-1], step, *parameters))
+        path = torch.stack(states, dim=1)
+        ctx.derivative, ctx.step = derivative, step
+        ctx.save_for_backward(path, *parameters)
+        return path
+
+    @staticmethod
+    def backward(ctx, grad: Tensor):  # type: ignore[no-untyped-def,override]
+        path, *parameters = ctx.saved_tensors
+        with torch.enable_grad():
+            before = path[:, :-1].detach().requires_grad_()  # (B, T - 1, N)
+            leaves = [value.detach().requires_grad_() for value in parameters]
+            after = _step(ctx.derivative, before, ctx.step, *[leaf[:, None] for leaf in leaves])
+            columns = after.sum((0, 1)).unbind()
+        rows = [torch.autograd.grad(column, before, retain_graph=True)[0] for column in columns]
+        transposed = torch.stack(rows, dim=-1)  # J', (B, T - 1, N, N)
+        adjoint = [grad[:, -1, :, None]]
+        for jacobian, here in zip(transposed.unbind(1)[::-1], grad[..., None].unbind(1)[-2::-1], strict=True):
+            adjoint.append(torch.baddbmm(here, jacobian, adjoint[-1]))
+        adjoints = torch.stack(adjoint[::-1], dim=1)[..., 0]  # (B, T, N)
+        slopes = torch.autograd.grad(after, leaves, adjoints[:, 1:]) if leaves else ()
+        return None, None, None, adjoints[:, 0], *slopes
+
+
+def _step(derivative: Derivative, state: Tensor, step: float, *parameters: Tensor) -> Tensor:
+    k1 = derivative(state, *parameters)
+    k2 = derivative(state + 0.5 * step * k1, *parameters)
+    k3 = derivative(state + 0.5 * step * k2, *parameters)
+    k4 = derivative(state + step * k3, *parameters)
+    return state + (step / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 def held(a: Tensor, b: Tensor, start: Tensor, inputs: Tensor, step: float) -> Tensor:

@@ -19,6 +19,8 @@ ROLLOUT = 125  # steps of one visual trajectory: 26 windows each
 Simulate = Callable[[Tensor, Tensor, Tensor], Tensor]
 Sample = Callable[[int, np.random.Generator, "Range"], "Rollouts"]
 
+Opening = Callable[[Tensor], tuple[Tensor, Tensor]]  # whitened components (M, 2) -> weights (P, 2), offsets (P,)
+
 
 @dataclass(frozen=True)
 class Range:
@@ -59,8 +61,7 @@ class Task:
     sample: Sample  # (rollouts, rng, range) -> Rollouts of ROLLOUT steps
     align: Callable[[Tensor, Tensor], Callable[[Tensor], Tensor]]  # see `metrics.py`
     render: Callable[[Tensor], Tensor] | None = None  # (M, N) -> (M, 3, 64, 64) in [0, 1]
-    curved: bool = False  # positions are no affine image of what a picture shows (see `decoder.StateDecoder`)
-    opening: tuple[tuple[float, ...], ...] | None = None  # see `encoder.PosteriorHead.open_with_components`
+    opening: Opening | None = None  # how a picture's two principal components start the positions
     read_off: Callable[[Tensor], Tensor] | None = None  # (B, N) -> (B, P): parameters that a state implies, if it does
     pixel_scale: float = 255.0  # of the observation error (1 or 255), as the paper's printed values imply
 

@@ -115,6 +115,12 @@ def align(encoded: Tensor, true: Tensor) -> Callable[[Tensor], Tensor]:
     return best[1]
 
 
+def opening(components: Tensor) -> tuple[Tensor, Tensor]:
+    """Bodies opposite each other about the middle."""
+    eye = torch.eye(2).to(components)
+    return torch.cat([eye, -eye]), components.new_zeros(4)
+
+
 TASK = Task(
     name="two_body",
     sample_rate=SAMPLE_RATE,
@@ -130,6 +136,6 @@ TASK = Task(
     sample=sample,
     align=align,
     render=render,
-    opening=((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)),  # bodies opposite each other about the middle
+    opening=opening,
     read_off=lambda states: energy(states)[..., None],
 )
