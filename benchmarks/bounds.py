@@ -63,3 +63,36 @@ def _input_covariance(system: System, simulator: LinearSimulator, x: torch.Tenso
         outputs = simulator.simulate(x.expand(2 * T, -1), knots, still)[0].flatten(1).numpy()
         total += outputs.T @ outputs
     return total
+
+
+def shared_bound(
+    system: System, log_ratio: torch.Tensor, states: torch.Tensor, knots: torch.Tensor, *, free: bool
+) -> FloatArray:
+    """Standard deviations (P,) for parameters that many windows share: states (B, T, N), knots (B, T, W), exact inputs.
+
+    Every window's first state is unknown.  free: the linear map from states and knots to the sensors is unknown too,
+    the same for all windows.
+    """
+    simulator = LinearSimulator(system)
+    P, S, step = len(log_ratio), len(system.sensors), 1e-5
+    discrete = simulator.discretise(simulator.element_values(log_ratio[None]))
+    offsets = torch.cat([torch.eye(P), -torch.eye(P)]).double() * step
+    response = simulator.free_response(discrete, states.shape[1])[0].numpy()  # (T, S, N)
+    noise = system.sensor_noise
+    sizes = torch.cat([states, knots], dim=2).square().mean((0, 1)).sqrt().numpy()
+    information = 0.0
+    for x, w in zip(states, knots, strict=True):
+        outputs, paths = simulator.simulate(log_ratio + offsets, w.expand(2 * P, -1, -1), x[:1].expand(2 * P, -1))
+        moved = paths @ discrete.C[0].mT if free else outputs
+        J = ((moved[:P] - moved[P:]) / (2 * step)).permute(1, 2, 0).numpy()  # (T, S, P)
+        if free:
+            seen = np.concatenate([x.numpy(), w.numpy()], axis=1) / sizes  # (T, N + W)
+            maps = np.einsum("tk,sr->tsrk", seen, np.eye(S)).reshape(*J.shape[:2], -1)
+            J = np.concatenate([J, maps], axis=2)
+        J, basis = ((v / noise[:, None]).reshape(-1, v.shape[2]) for v in (J, response))
+        q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
+        J = J - q @ (q.T @ J)
+        information = information + J.T @ J
+    size = np.sqrt(np.diag(information))
+    covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-14, hermitian=True)
+    return (np.sqrt(np.diag(covariance)) / size)[:P]

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 ORDER = (
-    "alps", "no_fourier", "no_attention", "autoencoder", "cdm", "alps_smoothed", "alps_from_sensors", "guess_nominal",
-    "force_balance",
+    "alps", "no_fourier", "no_attention", "autoencoder", "cdm", "alps_smoothed", "alps_known_sensors",
+    "alps_from_sensors", "bound_known_sensors", "bound_from_sensors", "guess_nominal", "force_balance",
     "refined", "output_error", "refined_noisy_inputs", "refined_trajectory", "sensors_refined", "sensors_output_error",
 )  # fmt: skip
 COLUMNS: dict[str, tuple[str, ...]] = {

@@ -238,7 +238,7 @@ def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path:
     assert figures["SE"] < 0.2 * untrained["SE"]
 
 
-@pytest.mark.parametrize("method", ["cdm", "alps_smoothed", "alps_from_sensors", "no_fourier"])
+@pytest.mark.parametrize("method", ["cdm", "alps_smoothed", "alps_from_sensors", "alps_known_sensors", "no_fourier"])
 def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> None:
     config = train_fit.TrainConfig(updates=2, batch=2, checkpoint_every=50)
     model = train_fit.fit(method, train_data, config, tmp_path, Clock(), "test")

@@ -26,7 +26,7 @@ from model.simulate.linear import LinearSimulator
 from model.system import load_system
 from model.training import Run
 
-TrainMethod = Literal["alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors"]
+TrainMethod = Literal["alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors", "alps_known_sensors"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class TrainConfig:
     learning_rate: float = 6e-3
     decay: float = 30.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
     checkpoint_every: int = 100
-    divergence_weight: float = 1e-4
+    divergence_weight: float = 1e-5
     observation_weight: float = 1.0
 
 
@@ -89,12 +89,15 @@ class StateContext(nn.Module):
 
 
 class SensorAutoencoder(nn.Module):
-    """ALPS from 12 accelerometers and the wheels: embedding, attention, estimator, simulator, decoder."""
+    """ALPS from 12 accelerometers and the wheels: embedding, attention, estimator, simulator, decoder.
 
-    def __init__(self, task: Task, data: TrainData) -> None:
+    The decoder is a network, or, where it is `known` what the sensors measure, the sensors' own equation.
+    """
+
+    def __init__(self, task: Task, data: TrainData, known: bool) -> None:
         super().__init__()
         config = NetworkConfig()
-        self.task = task
+        self.task, self.simulator = task, LinearSimulator(load_system())
         self.register_buffer("scale", data.observations.square().mean((0, 1)).sqrt())
         self.register_buffer("drive", data.knots.square().mean((0, 1)).sqrt())
         self.scale: Tensor
@@ -103,7 +106,7 @@ class SensorAutoencoder(nn.Module):
         self.embed = FeedForwardEmbedding(sensors + inputs, config)
         self.encoder = AttentionEncoder(task, config)
         self.estimator = LogRatioEstimator((WINDOW // 2 + 1) * len(task.states), len(task.parameters))
-        self.decoder = StateDecoder(len(task.states) + inputs, sensors, config)
+        self.decoder = None if known else StateDecoder(len(task.states) + inputs, sensors, config)
 
     def forward(self, observations: Tensor, knots: Tensor, nominal: bool = False):  # type: ignore[no-untyped-def]
         """(B, T, 12), (B, T, 16) -> posterior, log-ratios, simulated states, decoded observations / scale.
@@ -117,7 +120,9 @@ class SensorAutoencoder(nn.Module):
         log_ratio = self.estimator(torch.log1p(magnitudes(chart))).double()
         if nominal:
             log_ratio = torch.zeros_like(log_ratio)
-        simulated = self.task.simulate(states[:, 0].double(), log_ratio, knots)
+        measured, simulated = self.simulator.simulate(log_ratio, knots, states[:, 0].double())
+        if self.decoder is None:
+            return encoded, log_ratio, simulated, measured / self.scale
         seen = torch.cat([self.task.to_chart(simulated).float(), drive.float()], dim=-1)
         return encoded, log_ratio, simulated, self.decoder(seen)
 
@@ -133,8 +138,8 @@ def build(method: TrainMethod, data: TrainData) -> nn.Module:
     task = train_task(data)
     if method == "cdm":
         return StateContext(task, data)
-    if method == "alps_from_sensors":
-        return SensorAutoencoder(task, data)
+    if method in ("alps_from_sensors", "alps_known_sensors"):
+        return SensorAutoencoder(task, data, known=method == "alps_known_sensors")
     smooth = data.noise if method == "alps_smoothed" else None
     return StateEstimator(task, fourier=method != "no_fourier", smooth=smooth)
 
