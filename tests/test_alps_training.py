@@ -36,6 +36,7 @@ TINY = TrainingConfig(
     estimator_batch=4,
     checkpoint_every=2,
     frame_updates=4,
+    drawing_updates=4,
     frame_batch=8,
 )
 

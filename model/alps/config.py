@@ -53,6 +53,7 @@ class TrainingConfig:
     learning_rate: float = 2e-3  # of the frame autoencoder
     checkpoint_every: int = 100
     frame_updates: int = 250  # of the frame autoencoder, shared by every method of a task
+    drawing_updates: int = 500  # of its decoder alone afterwards: pictures take longer to learn than feature points
     frame_batch: int = 64
     end_to_end: bool = False  # train the convolutions with the rest, not only in the frame autoencoder
     divergence_start: float = 0.1  # weight of the KL (summed over states, mean over samples): large at first, so
@@ -128,5 +129,6 @@ def training_config(task: str, budget: Budget, seed: int) -> TrainingConfig:
         batch=32,
         learning_rate=1e-3,
         frame_updates=4000,
+        drawing_updates=4000,
         end_to_end=True,
     )

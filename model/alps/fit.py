@@ -102,6 +102,17 @@ def train_frames(
         if run.step == config.frame_updates:
             frames.standardise(draw(1000, 5), before=False)
             run.save()
+    drawing = Run(frames.draw, folder / "drawing", config, f"{_frames_name(task, config)} {config.drawing_updates}")
+    drawing.resume()
+    while drawing.step < config.drawing_updates:
+        clock.check(drawing)
+        pictures = draw(config.frame_batch, 9, drawing.step)
+        with torch.no_grad():
+            embeddings = frames.encode(pictures)
+        drawing.rate(config.drawing_updates)
+        drawing.update(picture_loss(frames.decode(embeddings), pictures))
+        if drawing.step == config.drawing_updates:
+            drawing.save()
     return frames
 
 
