@@ -42,13 +42,14 @@ def states(task: Task, shown: dict[str, Predicted], path: Path, window: int = 0)
         for row, state in enumerate(picked):
             ax = axes[row, column]
             turns = state in task.angles  # drawn as points: a line would cross the picture at every turn
-            for values, style, label in (
-                (found.true, "k." if turns else "k-", "true"),
-                (found.encoded, "C0.", "encoded"),
-                (found.simulated, "C1." if turns else "C1--", "simulated"),
+            for values, style, size, label in (
+                (found.true, "k." if turns else "k-", 5, "true"),
+                (found.encoded, "C0.", 2.5, "encoded"),
+                (found.simulated, "C1." if turns else "C1--", 1, "simulated"),
             ):
                 line = values[window, :, state].numpy()
-                ax.plot(time, (line + np.pi) % (2 * np.pi) - np.pi if turns else line, style, ms=2, lw=1, label=label)
+                line = (line + np.pi) % (2 * np.pi) - np.pi if turns else line
+                ax.plot(time, line, style, ms=size, lw=1, label=label)
             spread = found.true[window, :, state]
             low, high, more = float(spread.min()), float(spread.max()), float(spread.std())
             ax.set_ylim((-np.pi, np.pi) if turns else (low - more, high + more))
@@ -56,7 +57,7 @@ def states(task: Task, shown: dict[str, Predicted], path: Path, window: int = 0)
                 ax.set_ylabel(task.states[state])
         axes[0, column].set_title(METHOD_NAMES[method])
         axes[-1, column].set_xlabel("time [s]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), ncols=3, loc="outside upper center")
+    figure.legend(*axes[-1, 0].get_legend_handles_labels(), ncols=3, loc="outside upper center")
     _save(figure, path)
 
 

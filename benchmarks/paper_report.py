@@ -1,14 +1,15 @@
-"""`python -m benchmarks.paper_report [FOLDER] [DOCUMENT]`: measured rows into the tables of docs/paper.md.
+"""`python -m benchmarks.paper_report [FOLDER] [DOCUMENT]`: measured rows and pictures into docs/paper.md.
 
 Reads the rows that `sprung bench paper` kept (runs/paper/quick by default) and replaces what stands between
 `<!-- rows TASK -->` or `<!-- targets -->` and `<!-- end -->` in the document, so that figures there are never typed by
-hand.  Several seeds become mean and standard deviation.
+hand.  Several seeds become mean and standard deviation.  Pictures go to `img/paper/` beside the document.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,7 @@ def _cell(rows: list[dict[str, Any]], column: str) -> str:
 
 
 def main(folder: Path, document: Path) -> None:
-    """Refresh the tables of the document."""
+    """Refresh the tables of the document and its pictures."""
     found = [json.loads(path.read_text()) for path in sorted((folder / "rows").glob("*.json"))]
     found = [row for row in found if "unfinished" not in row]
 
@@ -116,6 +117,10 @@ def main(folder: Path, document: Path) -> None:
     reached = f"<!-- targets -->\n{targets(found)}\n<!-- end -->"
     text = re.sub(r"<!-- targets -->.*?<!-- end -->", lambda _: reached, text, flags=re.DOTALL)
     document.write_text(text)
+    images = document.parent / "img" / "paper"
+    images.mkdir(parents=True, exist_ok=True)
+    for picture in (folder / "pictures").glob("*.png"):
+        shutil.copy(picture, images)
 
 
 if __name__ == "__main__":
