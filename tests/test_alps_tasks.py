@@ -10,9 +10,12 @@ import torch
 from scipy.integrate import solve_ivp
 
 from model.alps import mass_spring_damper, pendulum, two_body
+from model.alps.config import NetworkConfig
+from model.alps.encoder import AttentionEncoder
 from model.alps.rollout import held, runge_kutta
 from model.alps.task import ROLLOUT, WINDOW, Task, windows
 
+SIZES = NetworkConfig()
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
 each_task = pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
 
@@ -59,14 +62,15 @@ def test_the_adjoint_of_a_path_is_its_gradient(task: Task) -> None:
 
 
 def test_the_pendulum_opens_with_its_angle_up_to_the_sense_of_turning() -> None:
-    angle = torch.from_numpy(np.random.default_rng(0).normal(0, 1, 500))
-    seen = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1)
-    mixed = seen @ torch.tensor([[0.7, -1.1], [2.0, 0.4]], dtype=torch.float64) + 0.3
-    weights, offsets = pendulum.opening(mixed)
-    opened = mixed @ weights.T + offsets
-    torch.testing.assert_close(opened[:, 0], seen[:, 0], atol=0.1, rtol=0)
-    torch.testing.assert_close(opened[:, 1].abs(), seen[:, 1].abs(), atol=0.2, rtol=0)
-    torch.testing.assert_close(opened.norm(dim=1), torch.ones_like(angle))
+    torch.manual_seed(0)
+    angle = torch.from_numpy(np.random.default_rng(0).normal(0, 0.8, 500)).float()
+    mix = torch.randn(2, SIZES.embedding)
+    embeddings = torch.stack([torch.cos(angle), torch.sin(angle)], dim=1) @ mix + 0.3
+    encoder = AttentionEncoder(pendulum.TASK, SIZES).requires_grad_(False)
+    encoder.head.straighten(pendulum.TASK.placed)
+    encoder.head.open_with_components(embeddings)
+    opened = encoder(embeddings.unflatten(0, (5, WINDOW))).mean[..., 0].flatten()
+    torch.testing.assert_close(opened.abs(), angle.abs(), atol=0.1, rtol=0)
 
 
 def test_runge_kutta_converges_with_order_four() -> None:

@@ -17,6 +17,7 @@ from model.alps.evaluate import every_window, predict, state_figures
 from model.alps.fit import Clock, OutOfTime, Split
 from model.alps.frames import FrameAutoencoder
 from model.alps.losses import tempered
+from model.alps.task import WINDOW
 from model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
 from model.refine import Refiner
 from model.simulate.linear import LinearSimulator
@@ -277,3 +278,16 @@ def test_the_bench_gives_the_kernels_and_their_picture(tmp_path: Path) -> None:
 def test_a_bench_without_time_says_how_to_go_on(tmp_path: Path) -> None:
     (row,) = list(paper.run("pendulum", method="alps", out=tmp_path, minutes=0.0))
     assert "run the same command again" in row["unfinished"]
+
+
+def test_positions_rest_as_opened_while_rates_are_learned(tmp_path: Path) -> None:
+    task, data, frames = two_body.TASK, fake_split(), FrameAutoencoder(SIZES)
+    config = replace(TINY, phases=(Phase("rates", 9, 2, (2e-3, 2e-3)),))
+    trained = fit.train_method(task, "alps", data, frames, config, SIZES, tmp_path, Clock()).network.encoder
+    torch.manual_seed(config.seed)
+    opened = fit.Network(task, "alps", SIZES).encoder
+    opened.head.open_with_components(data.embeddings.flatten(0, 1)[::7])
+    seen = data.embeddings[:, :WINDOW]
+    torch.testing.assert_close(trained(seen).mean[..., :4], opened(seen).mean[..., :4])
+    moved = (trained(seen).mean - opened(seen).mean)[..., 4:]
+    assert float(moved.detach().abs().max()) > 1e-4

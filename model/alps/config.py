@@ -30,11 +30,12 @@ class Phase:
     """A stretch of a training run.
 
     `states`: parameters stay at mid-range (or are read off the states) while the encoder learns what a state is;
+    `rates`: the same, and positions stay as they were opened, for random rates would undo them;
     `estimator`: the encoder rests while the estimator learns from its states; `all`: everything moves.
     Methods without an estimator train everything throughout.
     """
 
-    trains: Literal["states", "estimator", "all"]
+    trains: Literal["rates", "states", "estimator", "all"]
     horizon: int  # shooting length, samples; divides WINDOW - 1
     updates: int
     learning_rate: tuple[float, float]  # at its beginning and its end
@@ -89,7 +90,7 @@ class TrainingConfig:
 _QUICK = {
     "pendulum": TrainingConfig(
         phases=(
-            Phase("states", 3, 600, (2e-3, 2e-3)),
+            Phase("rates", 3, 600, (2e-3, 2e-3)),
             Phase("estimator", 9, 150, (2e-3, 1e-3)),
             Phase("all", 9, 700, (2e-3, 1e-4)),
             Phase("estimator", 33, 500, (2e-3, 5e-4)),

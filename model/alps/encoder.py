@@ -51,10 +51,11 @@ class PosteriorHead(nn.Module):
         nn.init.zeros_(self.direct.weight)
         nn.init.zeros_(self.direct.bias)
         self.register_buffer("bent", torch.ones(columns))
+        self.resting = False  # straight positions stay as they are
 
     @torch.no_grad()
     def straighten(self, positions: tuple[int, ...]) -> None:
-        """Read these positions (an angle's cosine and sine) off the embedding by an affine map, and by nothing else.
+        """Read these positions (an angle's sine and cosine) off the embedding by an affine map, and by nothing else.
 
         A camera sees positions through an affine map, and feature points keep it so, to a hundredth of a pixel.  A
         network in between bends it: large orbits come out small, and the physics needs long to bend it back.
@@ -86,7 +87,7 @@ class PosteriorHead(nn.Module):
             at = here.stop
 
     def _mean_columns(self) -> dict[int, slice]:
-        """Columns of each state's mean in the output: cosine and sine of an angle, else one."""
+        """Columns of each state's mean in the output: sine and cosine of an angle, else one."""
         columns, at = {}, 0
         for index in self.states:
             width = 2 if index in self.angles else 1
@@ -96,7 +97,10 @@ class PosteriorHead(nn.Module):
 
     def forward(self, features: Tensor, embeddings: Tensor) -> Encoded:
         """(B, T, W) and (B, T, E) -> posterior of `states`, in their order."""
-        raw = self.bent * self.out(features) + self.direct(embeddings)
+        straight = self.direct(embeddings)
+        if self.resting:
+            straight = torch.where(self.bent == 0, straight.detach(), straight)
+        raw = self.bent * self.out(features) + straight
         means, draws, divergence, at = [], [], torch.zeros_like(raw[..., 0]), 0
         for index, scale in zip(self.states, self.scales, strict=True):
             if index in self.angles:

@@ -163,6 +163,7 @@ def train_method(
             run.update(_estimator_loss(task, model.network, encoded, data, config, run.step, device))
         else:
             encoded = None
+            model.network.encoder.head.resting = phase.trains == "rates"
             run.update(_update_loss(task, model, data, config, run.step, device))
         if run.step == config.updates:
             run.save()
@@ -181,7 +182,7 @@ def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingCo
         embeddings = model.frames.encode(pictures).unflatten(0, (config.batch, WINDOW))
     else:
         embeddings = windows(data.embeddings, starts, rows).to(device)
-    passed = model.network(embeddings, inputs, phase.horizon, warm_up=phase.trains == "states")
+    passed = model.network(embeddings, inputs, phase.horizon, warm_up=phase.trains in ("rates", "states"))
     loss = loss_of(task, passed, embeddings, config, config.divergence(step)).total
     if pictures is not None:
         loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)

@@ -66,7 +66,7 @@ def align(encoded: Tensor, true: Tensor) -> Callable[[Tensor], Tensor]:
 
 
 def opening(components: Tensor) -> tuple[Tensor, Tensor]:
-    """Cosine and sine: the ellipse on which components (M, 2) lie made a circle, its angle zero where most of them are.
+    """Sine and cosine: the ellipse on which components (M, 2) lie made a circle, its angle zero where most of them are.
 
     Conic x'Qx + l'x = 1 by least squares; the prior too puts the angle's mode at zero.
     """
@@ -76,9 +76,9 @@ def opening(components: Tensor) -> tuple[Tensor, Tensor]:
     centre = -torch.linalg.solve(form, conic[3:]) / 2
     size, axes = torch.linalg.eigh(form / (1 + centre @ form @ centre))
     root = axes @ torch.diag(size.clamp_min(1e-6).sqrt()) @ axes.T
-    cosine, sine = (root @ (components.mean(0) - centre)) / (root @ (components.mean(0) - centre)).norm()
-    turn = torch.stack([cosine, sine, -sine, cosine]).reshape(2, 2)
-    weights = turn @ root
+    most = root @ (components.mean(0) - centre)
+    across, along = most / most.norm()
+    weights = torch.stack([along, -across, across, along]).reshape(2, 2) @ root
     return weights, -weights @ centre
 
 
