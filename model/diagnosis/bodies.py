@@ -45,7 +45,8 @@ def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Hit:
     dofs = structure.body_of_dof == index
     load = np.where(dofs, -structure.mass * fit.motions.acceleration, 0.0)[grid.band]
     column = projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load))
-    score, amplitude = projector.score(column)
+    spread = projector.spread(column, fit.forward.inputs_by_mass(dofs)[grid.band])
+    score, amplitude = projector.score(column, (spread, 0.0))
     ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
     term = Term(law, name, (ratio,), variant="", scales=(0.1,))
     return Hit(term, score, 1, "mass", float(stats.chi2.sf(score, 1)))

@@ -24,8 +24,9 @@ from model.chunks import share
 from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import BOTH
+from model.diagnosis.noise import refreshed
 from model.diagnosis.point import Point, advance
-from model.diagnosis.screen import Hit, Screening, element_motion
+from model.diagnosis.screen import Hit, Screening
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import SMALL, UNKNOWN
 from model.signals import FloatArray
@@ -55,12 +56,18 @@ class Trial:
     hit: Hit
     fit: Fit
     gain: float  # twice the log-likelihood ratio against the model without it
+    worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
     evidence: float  # gain less what its parameters cost
     finished: bool = True
 
     @property
     def term(self) -> Term:
         return self.fit.point.terms[-1]
+
+    @property
+    def explains(self) -> float:
+        """How much of what was missing: evidence, or power of forces that nobody measured."""
+        return self.worth if len(self.fit.noise.force) else self.gain
 
     @property
     def named(self) -> bool:
@@ -129,15 +136,13 @@ def compete(
         return []
     best = trials[0].evidence
 
-    def finish(trial: Trial) -> Trial:
-        return _try(problem, base, trial.hit, trial.fit.point, 10) or trial
-
     def close(rank: int, trial: Trial) -> bool:
-        return rank < _LAST or (rank < _MOST_FINISHED and trial.evidence > best - max(_NEAR, 0.3 * abs(best)))
+        near = problem.follows or trial.evidence > best - max(_NEAR, 0.3 * abs(best))
+        return rank < _LAST or (rank < _MOST_FINISHED and near)
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
-    finished = [*share(finish, leading, _WORKERS), *behind]
+    finished = [*share(lambda trial: _finished(problem, base, trial), leading, _WORKERS), *behind]
     finished.sort(key=lambda t: -t.evidence)
     return finished
 
@@ -152,8 +157,8 @@ def start_of(base: Fit, hit: Hit) -> Point:
     if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
         state = np.append(state, 0.0)
     near = point.near
-    if near and is_waveform(hit.term):
-        near = (*near, np.zeros_like(near[0]))
+    if is_waveform(hit.term):
+        near = (*near, base.force_along(hit.term))
     return Point(point.theta, (*point.terms, hit.term), state, near)
 
 
@@ -186,7 +191,7 @@ def _behind_a_spring(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
     at = names.index(damping)
     nominal = problem.system.parameters[at].nominal
     element = problem.system.elements.index(hit.location)
-    deflection, rate = element_motion(base)
+    deflection, rate = base.element_motion
     frequency = float(np.std(rate[:, element]) / np.std(deflection[:, element]))
     start = start_of(base, hit)
     read = nominal * float(np.exp(start.theta[at]))
@@ -213,7 +218,7 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
     if not isinstance(law, ElementLaw) or law.strength is None or law.name == UNKNOWN:
         return start
     hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
-    faint = replace(start, terms=(*base.point.terms, hint))
+    faint = start_of(base, replace(hit, term=hint))
     with np.errstate(all="ignore"):
         own = replace(problem, smoothed=None)
         faint = own.smooth(faint)
@@ -234,12 +239,28 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
 
 def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
     fit = replace(problem, smoothed=None).try_fit(start, iterations)
-    if fit is None:
-        return None
-    fall = base.chi_square - fit.chi_square
-    gain = min(fall, profile_gain(base.residual, fit.residual, len(problem.sensors)))
+    return None if fit is None else _judged(problem, base, hit, fit)
+
+
+def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
+    """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
+    finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
+    if not problem.follows or finished.fit.deviance > base.deviance:
+        return finished
+    _, fit = refreshed(replace(problem, smoothed=None), finished.fit)
+    return _judged(problem, base, trial.hit, fit)
+
+
+def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit) -> Trial:
+    sensors = len(problem.sensors)
+    if problem.follows:  # how noisy the forces are is what candidates differ in
+        gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
+        worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
+    else:
+        worth = base.chi_square - fit.chi_square
+        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, _QUIET))
     dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
-    return Trial(hit, fit, gain, gain - dear)
+    return Trial(hit, fit, gain, worth, gain - dear)
 
 
 def preferred(trials: list[Trial]) -> list[Trial]:
@@ -247,22 +268,22 @@ def preferred(trials: list[Trial]) -> list[Trial]:
     if not trials or trials[0].named:
         return trials
     named = [t for t in trials if t.named]
-    if named and trials[0].gain < _UNNAMED_RATIO * named[0].gain:
+    if named and trials[0].explains < _UNNAMED_RATIO * named[0].explains:
         return [named[0], *[t for t in trials if t is not named[0]]]
     return trials
 
 
-def profile_gain(before: FloatArray, after: FloatArray, sensors: int) -> float:
+def profile_gain(before: FloatArray, after: FloatArray, sensors: int, quiet: float) -> float:
     """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out.
 
-    A block much quieter than the estimated noise, which is white, owes that to its colour and is no evidence.
+    A block quieter than `quiet` times the estimated noise, which is white, owes that to its colour: no evidence.
     """
     power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
     bins = len(power[0])
     edges = np.unique(np.round(np.geomspace(_FIRST_BLOCK, bins, _BLOCKS)).astype(int))
     edges = np.concatenate([[0], edges[edges > 0]])
     counts = 2.0 * np.diff(edges)[:, None]
-    levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, _QUIET) for p in power]
+    levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, quiet) for p in power]
     return float(np.sum(counts * np.log(levels[0] / levels[1])))
 
 

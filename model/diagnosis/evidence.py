@@ -12,7 +12,7 @@ from model.diagnosis.fit import Fit
 from model.diagnosis.heldout import FreeRun
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.latent import SurfaceLaw
-from model.diagnosis.screen import Projector, element_motion
+from model.diagnosis.screen import Projector
 from model.diagnosis.terms import Term, is_waveform
 from model.diagnosis.unknown import StaticLaw
 from model.signals import FloatArray
@@ -51,7 +51,7 @@ def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]
     """Motion of the element, the force that was missed before and after, and the law through it."""
     fit, grid = course.fit, course.problem.part.grid
     port = term.port(course.system)
-    d_all, v_all = element_motion(fit)
+    d_all, v_all = fit.element_motion
     d, v = (d_all @ port)[::4], (v_all @ port)[::4]
     thin = slice(None, None, max(1, len(d) // _MOST))
     time = grid.start + grid.time

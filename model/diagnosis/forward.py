@@ -11,6 +11,7 @@ equivalent linear law (`Term.preload`, carried by the plant), so that only the l
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import comb
@@ -115,16 +116,47 @@ class Forward:
     @cached_property
     def force_faults(self) -> tuple[FloatArray, FloatArray]:
         """Gain and offset of every measured force, each (forces,)."""
-        names = [n for n, source in self.system.file.inputs.items() if source.kind == "force"]
-        gain, offset = np.ones(len(names)), np.zeros(len(names))
+        count = self.part.force.shape[1]
+        gain, offset = np.ones(count), np.zeros(count)
         for term in self.terms:
-            if isinstance(term.law, SensorLaw) and term.location in names:
-                i = names.index(term.location)
+            i = self.faulty_force(term)
+            if i is not None:
                 if term.law.name == "sensor_gain":
                     gain[i] *= term.parameters[0]
                 elif term.law.name == "sensor_bias":
                     offset[i] += term.parameters[0]
         return gain, offset
+
+    def faulty_force(self, term: Term) -> int | None:
+        """Which measured force a term finds at fault."""
+        names = [n for n, source in self.system.file.inputs.items() if source.kind == "force"]
+        return names.index(term.location) if isinstance(term.law, SensorLaw) and term.location in names else None
+
+    def fault_load(self, term: Term) -> ComplexArray:
+        """Load on the degrees of freedom per rise of a measured force's gain or offset, (F, n)."""
+        i = self.faulty_force(term)
+        assert i is not None
+        gain = self.force_faults[0][i]
+        if term.law.name == "sensor_gain":
+            change = -(self.force + self.part.grid.monomial_spectra @ self.force_polynomial)[:, i] / gain
+        else:
+            change = np.zeros(len(self.part.grid.omega), dtype=complex)
+            change[0] = -np.sqrt(self.part.grid.samples) / gain
+        return change[:, None] * self.plant.structure.F[:, i]
+
+    @property
+    def of_inputs(self) -> ComplexArray:
+        """What the sensors show of supports and measured forces, (F, S, inputs)."""
+        both = np.concatenate([self.plant.sensor_of_support, self.plant.sensor_of_measured_force], axis=2)
+        return both * self.sensor_factor[:, :, None]
+
+    def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
+        """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
+        plant, s = self.plant, self.plant.structure
+        load = -(plant.impedance[:, None, :] * s.H.T) @ s.G
+        moved = plant.receptance @ np.concatenate([load, np.broadcast_to(s.F, (len(load), *s.F.shape))], axis=2)
+        inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
+        return plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
 
     @property
     def force(self) -> ComplexArray:
@@ -217,7 +249,7 @@ class Forward:
         if loop is None:
             return None
         start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
-        return loop.answer(*_fixed_point(lambda force: loop.law(*loop.motion(force)), start))
+        return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start))
 
     def loop(self, state: FloatArray) -> Loop | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""
@@ -245,6 +277,10 @@ class LawForces:
     deflections: ComplexArray  # what they add to the deflections, periodic part, (F, E)
     q: ComplexArray  # what they add to the degrees of freedom, periodic part, (F, n)
     motion: FloatArray  # polynomial motion that they add, (DEGREE + 1, n)
+
+    def index(self, term: Term) -> int:
+        """Which of the laws a term is, whatever its values."""
+        return next(i for i, own in enumerate(self.terms) if own.key == term.key)
 
 
 def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
@@ -295,13 +331,22 @@ class Loop:
         self.terms, self.ports = terms, np.array([t.port(forward.system) for t in terms])
         self.wide = np.pad(self.ports, ((0, 0), (0, len(H) - self.ports.shape[1])))
         self.elements = [forward.element_of(term) for term in terms]
-        self.d0, self.v0 = forward.fine_motion(self.ports, state)
-        self.reach = _REACH * np.abs(self.d0).max(axis=0), _REACH * np.abs(self.v0).max(axis=0)
+        self._drive(forward, state)
         self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
         self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
         self.lines = np.array([self.plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
         self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+
+    def _drive(self, forward: Forward, state: FloatArray) -> None:
+        self.d0, self.v0 = forward.fine_motion(self.ports, state)
+        self.reach = _REACH * np.abs(self.d0).max(axis=0), _REACH * np.abs(self.v0).max(axis=0)
+
+    def driven(self, forward: Forward, state: FloatArray) -> Loop:
+        """The same loop under other inputs and from another state."""
+        other = copy(self)
+        other._drive(forward, state)
+        return other
 
     def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
         """Forces along a motion (4N, m), without what the plant carries."""
@@ -365,7 +410,9 @@ class Loop:
         return d, v + self.powers @ self.plant.derivative(polynomial)
 
 
-def _fixed_point(step: Callable[[FloatArray], FloatArray], start: FloatArray) -> tuple[FloatArray, bool]:
+def fixed_point(
+    step: Callable[[FloatArray], FloatArray], start: FloatArray, tolerance: float = _TOLERANCE
+) -> tuple[FloatArray, bool]:
     """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
     shape = start.shape
     x = start.ravel()
@@ -380,7 +427,7 @@ def _fixed_point(step: Callable[[FloatArray], FloatArray], start: FloatArray) ->
             break
         if size < best_size:
             best, best_size = image, size
-        if size <= _TOLERANCE * max(float(np.linalg.norm(image)), 1e-300):
+        if size <= tolerance * max(float(np.linalg.norm(image)), 1e-300):
             return image.reshape(shape), True
         sizes.append(best_size)
         if iteration >= _PATIENCE and best_size > _PROGRESS * sizes[-_PATIENCE]:

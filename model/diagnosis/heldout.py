@@ -6,15 +6,19 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from model.diagnosis.choose import profile_gain
 from model.diagnosis.fit import Fit, Problem
-from model.diagnosis.forward import propagate
+from model.diagnosis.forward import Forward, LawForces, propagate
 from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
 from model.diagnosis.point import Point
-from model.diagnosis.spectra import Grid
+from model.diagnosis.spectra import ComplexArray, Grid
 from model.diagnosis.whiten import Whitener
 from model.signals import FloatArray
 from model.system import System
+
+_STILL = 0.05  # of the motion in the fitted part
+_ROUNDS = 4  # of laws' forces and the state at the start
 
 
 @dataclass(frozen=True)
@@ -39,9 +43,21 @@ class HeldOut:
     def __init__(self, system: System, signals: Signals, noise: Noise, split: int) -> None:
         self.system, self.signals, self.noise, self.split = system, signals, noise, split
         self.whole = transform(signals, noise)
+        self.tracked = transform(signals, noise, rated=drifting(system, signals.sensor_index))
         self.grid = Grid(signals.samples - split, 1 / signals.sample_rate, split / signals.sample_rate)
         self.whitener: Whitener | None = None
-        self.later: Part | None = None
+        rest = signals.part(split, signals.samples)
+        self.later = transform(rest, noise, rated=drifting(system, signals.sensor_index))
+
+    @property
+    def still(self) -> bool:
+        """Whether the held-out part hardly moves, so that nothing can be judged on it."""
+        first, later = (np.std(part, axis=0) for part in np.split(self.signals.sensors, [self.split]))
+        return bool(np.all(later < _STILL * first))
+
+    def weigh(self, noise: Noise) -> None:
+        """Noise levels by which later runs are judged."""
+        self.noise, self.whitener = noise, None
 
     def run(self, point: Point) -> FreeRun:
         """Simulate with the measured inputs from the state that the fitted part ends in.
@@ -49,38 +65,92 @@ class HeldOut:
         The periodic solution over the whole recording is another one than over the fitted part, so the free motion
         is fitted again, to the fitted part alone.
         """
-        problem = Problem(self.system, self.whole, self.signals.sensor_index, self.noise)
+        point, part = self._up_to_split(point)
+        problem = Problem(self.system, part, self.signals.sensor_index, self.noise)
         state = np.zeros_like(point.state)
         trained = slice(0, self.split)
         weights = 1 / self.noise.sensors
-        waveform = None
-        for _ in range(4):
-            now = Point(point.theta, point.terms, state)
-            shown, forward, forces = problem.predict(now, waveform or ())
-            if forces is not None and not forces.converged and not forward.plant.floats:  # those never forget
-                shown, forward, forces = problem.predict(now, march_forces(forward, state))
-            waveform = None if forces is None else tuple(forces.force.T)
+        near = point.near if problem.follows else ()
+        for number in range(2 if problem.follows else _ROUNDS):
+            forward = problem.forward(replace(point, state=state, near=near))
+            shown, forces = self._free_run(problem, forward, state, number > 0)
+            near = () if forces is None else tuple(forces.force.T)
             rows = forward.free_rows_at_start()
-            free = forward.plant.free_motion(rows, self.whole.grid.step, self.split)
-            particular = self.whole.grid.inverse(shown)
+            free = forward.plant.free_motion(rows, part.grid.step, self.split)
+            particular = part.grid.inverse(shown)
             target = (self.signals.sensors[trained] - particular[trained]) * weights
             normal, right = _normal(free, target, weights)
             scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
             solved = np.linalg.lstsq(normal * scale * scale[:, None], right * scale, rcond=1e-12)[0] * scale
             moved = float(np.max(np.abs(solved - state) / np.maximum(np.abs(solved), 1e-12)))
             state = solved
-            if forces is None or moved < 1e-3:
+            if forces is None or (moved < 1e-3 and not problem.follows):
                 break
         A = forward.plant.structure.state_matrix()
-        simulated = particular + propagate(A, rows, state, self.whole.grid.step, self.signals.samples)
-        return self._judge(simulated[self.split :], replace(point, state=state, near=waveform or ()))
+        simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
+        return self._judge(simulated[self.split :], replace(point, state=state, near=near))
+
+    def gain(self, before: Fit, after: Fit) -> float:
+        """By how much the second fit says more of the held-out part, as twice the log-likelihood ratio or alike.
+
+        Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
+        good the model.
+        """
+        if not len(before.noise.force):
+            return self.run(before.point).chi_square - self.run(after.point).chi_square
+        (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
+        return profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0) + first_log_det - second_log_det
+
+    def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
+        """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
+        problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
+        point = problem.smooth(replace(fit.point, near=()))
+        shown, forward, _ = problem.predict(point)
+        assert problem.whitener is not None
+        free = self.later.grid.forward(forward.free_rows() @ point.state)
+        return problem.whitener(self.later.sensors - shown - free, self.later), problem.whitener.log_det
+
+    def _up_to_split(self, point: Point) -> tuple[Point, Part]:
+        """The inputs as measured, but where laws follow the sensors' motion up to the split: smoothed until there.
+
+        With the point, whose `near` are then the laws' forces along that motion.
+        """
+        signals = self.signals
+        follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
+        if not follower.follows:
+            return point, self.whole
+        point = follower.smooth(replace(point, near=()))
+        assert follower.smoothed is not None
+        followed = follower.smoothed.part
+        force = followed.grid.inverse(followed.force) + followed.grid.monomials @ followed.force_polynomial
+        force[self.split :] = signals.force[self.split :]
+        return point, transform(replace(signals, force=force), self.noise)
+
+    def _free_run(
+        self, problem: Problem, forward: Forward, state: FloatArray, started: bool
+    ) -> tuple[ComplexArray, LawForces | None]:
+        """Shown sensor signals (F, S) and the laws' forces of a run that is free from the split on.
+
+        Forces that follow the sensors until there tell the state (`started`) from which the run goes on.
+        """
+        loop = forward.loop(state)
+        if loop is None:
+            return problem.shown(forward, None), None
+        forces = None
+        if problem.follows:
+            known = np.column_stack(forward.start_force)
+            forces = loop.answer(march_forces(forward, state, self.split) if started else known)
+        else:
+            forces = forward.law_forces(state)
+            assert forces is not None
+            if not forces.converged and not forward.plant.floats:  # those never forget
+                led = replace(forward, start_force=tuple(march_forces(forward, state).T))
+                forces = led.law_forces(state)
+        return problem.shown(forward, forces), forces
 
     def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
         error = measured - simulated
-        if self.later is None:
-            part = self.signals.part(self.split, self.signals.samples)
-            self.later = transform(part, self.noise, rated=drifting(self.system, self.signals.sensor_index))
         if self.whitener is None or len(self.noise.force):
             problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
             self.whitener = Whitener.of(problem.forward(point), self.noise)

@@ -14,7 +14,7 @@ from scipy.linalg import expm
 
 from model.diagnosis.catalogue import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from model.diagnosis.catalogue.base import Values
-from model.diagnosis.forward import Forward, LawForces, propagate
+from model.diagnosis.forward import Forward, LawForces, Loop, propagate
 from model.diagnosis.plant import Plant
 from model.diagnosis.spectra import OVERSAMPLING
 from model.diagnosis.terms import Term
@@ -27,53 +27,75 @@ _ROUNDS = 4  # for the start: the periodic motion that `forward` works with begi
 _SETTLED = 1e-3
 
 
-def march_forces(forward: Forward, state: FloatArray) -> tuple[FloatArray, ...]:
-    """Force of every law along its trajectory less its preload, one (OVERSAMPLING N,) per law, in `forward`'s order.
+def march_forces(forward: Forward, state: FloatArray, first: int | None = None) -> FloatArray:
+    """Force of every law along its trajectory less its preload, (OVERSAMPLING N, laws).
 
-    state (2n + b,): the free motion at the first sample, as `forward` counts it.
+    state (2n + b,): the free motion at the first sample, as `forward` counts it.  From sample `first` on, the forces
+    up to there being known: those that `forward` starts from.  By default over the whole trajectory, which is periodic.
     """
     loop = forward.loop(state)
     assert loop is not None
-    grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0, loop.v0
+    if first is None:
+        return _periodic(loop)
+    force = np.column_stack(forward.start_force)
+    held = slice(first * OVERSAMPLING, None)
+    begin = _state_at(loop.plant, loop.answer(force), first)
+    force[held] = _march(loop, held, begin)[0]
+    return force
+
+
+def _periodic(loop: Loop) -> FloatArray:
+    """Forces over the whole trajectory, which begins where it ends."""
+    begin = np.zeros(loop.plant.structure.states)
+    for _ in range(_ROUNDS):
+        force, size = _march(loop, slice(0, None), begin)
+        before, begin = begin, _state_at(loop.plant, loop.answer(force), 0)
+        if np.max(np.abs(begin - before)) <= _SETTLED * size:
+            break
+    return force
+
+
+def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, float]:
+    """Forces along a part of the fine axis, (4N', laws), from the state of their motion, and its largest size."""
+    grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0[part], loop.v0[part]
     A, rows = s.state_matrix(), s.motion_rows(loop.wide)
     step = grid.step / _PARTS
-    steps = force_steps(A, s.force_columns(loop.wide), rows, step)
     fine = grid.step / OVERSAMPLING * np.arange(len(d0))
-    nodes = step / 2 * np.arange(2 * _PARTS * (grid.samples - 1) + 1)
+    nodes = step / 2 * np.arange(2 * _PARTS * (len(d0) // OVERSAMPLING - 1) + 1)
     inputs = np.hstack([CubicHermiteSpline(fine, d0, v0)(nodes), CubicSpline(fine, v0)(nodes)])
-    sites = [
-        Site(_preloaded(term), term.parameters, element)
-        for term, element in zip(loop.terms, loop.elements, strict=True)
-    ]
-    first = np.zeros(s.states)
-    for _ in range(_ROUNDS):
-        known = inputs + propagate(A, rows, first, step / 2, len(nodes))
-        solution = solve(
-            steps, expm(A * grid.step), sites, known[..., None], parts=_PARTS, start=grid.start + CLOCK_LEAD
-        )
-        force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
-        force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
-        before, first = first, _periodic_start(loop.plant, loop.answer(force))
-        if np.max(np.abs(first - before)) <= _SETTLED * np.max(np.abs(solution.states)):
-            break
-    return tuple(force.T)
+    solution = solve(
+        force_steps(A, s.force_columns(loop.wide), rows, step),
+        expm(A * grid.step),
+        [
+            Site(_preloaded(term, reach), term.parameters, element)
+            for term, element, reach in zip(loop.terms, loop.elements, np.transpose(loop.reach), strict=True)
+        ],
+        (inputs + propagate(A, rows, begin, step / 2, len(nodes)))[..., None],
+        parts=_PARTS,
+        start=grid.start + part.start * grid.step / OVERSAMPLING + CLOCK_LEAD,
+    )
+    force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
+    force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
+    return force, float(np.max(np.abs(solution.states)))
 
 
-def _preloaded(term: Term) -> ElementLaw:
-    """The law less the linear part that the plant carries."""
+def _preloaded(term: Term, reach: FloatArray) -> ElementLaw:
+    """The law less the linear part that the plant carries, flat beyond its reach (deflection, rate)."""
     assert isinstance(term.law, ElementLaw)
     law, (stiffness, damping) = term.law, term.preload
 
     def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-        return np.asarray(law.force(motion, p, element) - stiffness * motion.deflection - damping * motion.rate)
+        d, v = np.clip(motion.deflection, -reach[0], reach[0]), np.clip(motion.rate, -reach[1], reach[1])
+        return np.asarray(law.force(motion._replace(deflection=d, rate=v), p, element) - stiffness * d - damping * v)
 
     return replace(law, force=force)
 
 
-def _periodic_start(plant: Plant, forces: LawForces) -> FloatArray:
-    """State at the first sample, (2n + b,), of the motion that periodic forces keep up."""
+def _state_at(plant: Plant, forces: LawForces, sample: int) -> FloatArray:
+    """State at a sample, (2n + b,), of the motion that periodic forces keep up."""
     grid = plant.grid
-    position = grid.inverse(forces.q)[0] + forces.motion[0]
-    rate = grid.inverse(1j * grid.omega[:, None] * forces.q)[0] + plant.derivative(forces.motion)[0]
-    branches = grid.inverse(plant.structure.branch_forces(forces.deflections, grid.omega))[0]
+    q, bend = (grid.monomials[sample] @ p for p in (forces.motion, plant.derivative(forces.motion)))
+    position = grid.inverse(forces.q)[sample] + q
+    rate = grid.inverse(1j * grid.omega[:, None] * forces.q)[sample] + bend
+    branches = grid.inverse(plant.structure.branch_forces(forces.deflections, grid.omega))[sample]
     return np.concatenate([position, rate, branches])

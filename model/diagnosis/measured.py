@@ -22,6 +22,7 @@ from model.signals import FloatArray
 from model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
+_LEAST = 0.2  # of a sensor's declared noise
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 
@@ -64,6 +65,7 @@ class Noise:
     velocity: FloatArray  # m/s, infinite where not measured, shape (supports,)
     force: FloatArray  # N, shape (forces,)
     sensors: FloatArray  # shape (S,)
+    least: FloatArray  # of the sensors' levels: far below what was declared, another noise has taken their place, (S,)
 
     def support_variance(self, omega: FloatArray) -> FloatArray:
         """Variance of the fused displacement per bin, shape (F, supports)."""
@@ -117,7 +119,8 @@ def declared_noise(system: System, signals: Signals) -> Noise:
     sensors = [
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
-    return Noise(np.array(displacement), np.array(velocity), np.array(force), np.array(sensors))
+    levels = np.array(sensors)
+    return Noise(np.array(displacement), np.array(velocity), np.array(force), levels, _LEAST * levels)
 
 
 def _size(series: FloatArray) -> float:

@@ -52,13 +52,16 @@ def narrate(course: Course, record: Recorded) -> Report:
     findings.sort(key=lambda f: f.delta_bic)
     advice = [*course.prepared.notes, *course.notes, *_undecided(course)]
     verdict = _verdict(findings)
-    if after.nrmse > _STRANGE and verdict != "sensor_fault":
+    strange = _blamed(course) if course.problem.follows else after.nrmse
+    if strange > _STRANGE and verdict != "sensor_fault":
         verdict, findings = "unknown_physics", []
         advice.insert(
             0,
-            f"nothing fits: the best model still errs by {100 * after.nrmse:.0f} % of the signal; "
+            f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; "
             "the system file does not seem to belong to this recording",
         )
+    elif after.nrmse > _STRANGE and not course.held.still:
+        advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     explained = _explained(before, after, floor_figures) if course.found else None
     return Report(
         system=course.system.name,
@@ -80,6 +83,14 @@ def narrate(course: Course, record: Recorded) -> Report:
         advice=tuple(advice),
         evidence=evidence_arrays(course, before, after, floor, [(f.location, f.effect) for f in findings]),
     )
+
+
+def _blamed(course: Course) -> float:
+    """Forces that nobody measured, as the noise of the measured ones, over the inertia forces, rms over rms."""
+    fit = course.fit
+    structure = fit.forward.plant.structure
+    inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
+    return float(np.sqrt(np.sum(structure.F**2 @ fit.noise.force**2) / np.sum(np.mean(inertia**2, axis=0))))
 
 
 def _figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
@@ -181,6 +192,7 @@ def _look_alikes(found: Found) -> tuple[str | None, str | None]:
         t
         for t in found.trials
         if t.evidence > best.evidence - _NAMING_MARGIN
+        and t.named
         and t.term.location == best.term.location
         and t.term.law.name != best.term.law.name
     ]

@@ -23,19 +23,24 @@ _PRELOADS = 4  # rounds of equivalent law and motion
 def preloaded(problem: Problem, point: Point) -> Point:
     """The point with the laws' equivalent stiffness and damping moved into the plant.
 
-    The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges.
+    The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges; a
+    motion that follows the sensors stays as it is.
     """
     for _ in range(_PRELOADS):
         if not any(is_waveform(t) and "|" not in t.location for t in point.terms):
             return point
         forward = problem.forward(point)
-        forces = forward.law_forces(point.state)
+        forces = problem.law_forces(forward, point)
         assert forces is not None
         start = particular_start(forward, forces)
-        terms, change = [], 0.0
+        terms, change, near = [], 0.0, forces.force.copy()
         for term in point.terms:
             if is_waveform(term) and "|" not in term.location:
                 k, c = _equivalent(forward, forces, term)
+                i = forces.index(term)
+                near[:, i] -= (k - term.preload[0]) * forces.deflection[:, i] + (c - term.preload[1]) * forces.rate[
+                    :, i
+                ]
                 element = forward.element_of(term)
                 size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
                 change = max(
@@ -46,14 +51,14 @@ def preloaded(problem: Problem, point: Point) -> Point:
                 terms.append(replace(term, preload=(k, c)))
             else:
                 terms.append(term)
-        point = replace(point, terms=tuple(terms))
-        if change < 1e-3:
+        point = replace(point, terms=tuple(terms), near=tuple(near.T))
+        if change < 1e-3 or problem.follows:
             break
         # the free state counts from the plant's particular solution, which has changed: keep the true state
         state = start + point.state
         for _ in range(2):
             moved = problem.forward(point)
-            point = replace(point, state=state - particular_start(moved, moved.law_forces(point.state)))
+            point = replace(point, state=state - particular_start(moved, problem.law_forces(moved, point)))
         if forces.converged and change < 0.2:
             break
     return point
@@ -61,7 +66,7 @@ def preloaded(problem: Problem, point: Point) -> Point:
 
 def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float, float]:
     """Stiffness and damping that are nearest to a law along its motion."""
-    i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    i = forces.index(term)
     thin = slice(None, None, OVERSAMPLING)
     regressors = np.column_stack([forces.deflection[thin, i], forces.rate[thin, i]])
     sizes = np.maximum(np.std(regressors, axis=0), 1e-300)

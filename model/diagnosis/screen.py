@@ -88,6 +88,27 @@ class Projector:
         self.factor = factor
 
     @cached_property
+    def lean(self) -> FloatArray:
+        """What the residual leans on J at the end of a fit whose residual's covariance depends on the parameters.
+
+        Such a fit ends at J^T r = d log det R / 2, not at zero.
+        """
+        slope = np.concatenate([self.fit.log_det_slope, np.zeros(len(self.fit.point.state))])[-len(self.kept) :]
+        lean = np.linalg.lstsq(self.r.T, slope[self.kept] / self.scale[self.kept], rcond=1e-9)[0]
+        return np.asarray(self.q @ lean[self.strong] / 2)
+
+    def spread(self, column: FloatArray, change: ComplexArray) -> float:
+        """What the residual's determinant adds to the product of a column and the residual.
+
+        change (F, S, inputs): of what the sensors show of the inputs.  Forces along elements need none of it: what
+        the determinant makes of them is what it makes of the spring and damper that they resemble.
+        """
+        if not self.problem.follows:
+            return 0.0
+        assert self.problem.whitener is not None
+        return float(column @ self.lean) - self.problem.whitener.log_det_slope(change) / 2
+
+    @cached_property
     def complex_q(self) -> ComplexArray:
         """The projection's basis as band spectra, (F, S, q)."""
         return self.unpack(self.q)
@@ -174,7 +195,7 @@ def screen(
 def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
     """The best shape of every element law at every element or pair, and how many shapes were tried."""
     system = projector.problem.system
-    d_all, v_all = element_motion(projector.fit)
+    d_all, v_all = projector.fit.element_motion
     channels: dict[str, Channel] = {}
     for law in laws:
         if not isinstance(law, ElementLaw):
@@ -204,23 +225,6 @@ def places(system, law: ElementLaw) -> list[str]:
             if same and level:
                 pairs.append(f"{a}|{b}")
     return pairs
-
-
-def element_motion(fit: Fit) -> tuple[FloatArray, FloatArray]:
-    """Deflection and rate of every element along the fit, oversampled, 2 x (4N, E)."""
-    forward, forces = fit.forward, fit.forces
-    ports = np.eye(forward.elements)
-    d, v = forward.fine_motion(ports, fit.point.state)
-    if forces is not None:
-        grid = forward.part.grid
-        plant = forward.plant
-        H = plant.structure.H[: forward.elements]
-        spectrum = forces.deflections[:, : forward.elements]
-        polynomial = forces.motion @ H.T
-        powers = np.vander(grid.fine_time / grid.length, len(polynomial), increasing=True)
-        d = d + grid.fine(spectrum) + powers @ polynomial
-        v = v + grid.fine(1j * grid.omega[:, None] * spectrum) + powers @ plant.derivative(polynomial)
-    return d, v
 
 
 def _best_shape(

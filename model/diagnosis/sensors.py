@@ -36,6 +36,7 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
     constant = np.zeros(len(truth), dtype=complex)
     constant[0] = np.sqrt(grid.samples)
     jw = 1j * grid.omega[band]
+    own = np.eye(len(problem.sensors))[:, None, :, None] * fit.forward.of_inputs[band]  # of one sensor each
     for i, index in enumerate(problem.sensors):
         name = problem.system.sensors[index]
         for effect, signal in (
@@ -46,7 +47,8 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
             if effect not in laws or (effect == "sensor_bias" and problem.part.rated[i]):
                 continue  # a position that is compared by its rate shows no bias
             column = projector.pack(projector.factor[:, :, i] * signal[:, None])
-            score, amplitude = projector.score(column)
+            copied = {"sensor_gain": 1.0, "sensor_lag": -jw[:, None, None]}.get(effect, 0.0)
+            score, amplitude = projector.score(column, (projector.spread(column, own[i] * copied), 0.0))
             start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
             scale = {"sensor_gain": 0.1, "sensor_lag": 0.1 * grid.step}.get(effect, max(abs(amplitude), 1e-9))
             term = Term(laws[effect], name, (float(start),), scales=(scale,))
@@ -108,7 +110,7 @@ def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
         response = projector.of_load @ direction
         effects = []
         if "sensor_gain" in laws:
-            effects.append(("sensor_gain", projector.pack(-response * fit.forward.part.force[band, i, None])))
+            effects.append(("sensor_gain", projector.pack(-response * part.force[band, i, None])))
         if "sensor_bias" in laws:
             load = np.zeros((part.force_polynomial.shape[0], len(direction)))
             load[0] = -direction  # the true force is the measured one less the offset

@@ -9,7 +9,7 @@ import numpy as np
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.latent import LatentForce, Surface, estimate_force
-from model.diagnosis.screen import Projector, element_motion
+from model.diagnosis.screen import Projector
 from model.diagnosis.terms import Term
 from model.signals import FloatArray
 
@@ -34,7 +34,7 @@ def _estimate(problem: Problem, fit: Fit) -> LatentForce:
     projector = Projector(problem, fit)
     grid, term = projector.grid, fit.point.terms[-1]
     element = problem.system.elements.index(term.location)
-    d, v = (motion[:, element] for motion in element_motion(fit))
+    d, v = (motion[:, element] for motion in fit.element_motion)
     present = force_along(
         term.law,  # type: ignore[arg-type]
         term.parameters,

@@ -31,7 +31,7 @@ def step_of(term: Term, parameter: int) -> float:
 
 def law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) -> tuple[int, ComplexArray]:
     """Port of a law and the spectrum of its force's derivative along the present trajectory, (F,)."""
-    port = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    port = forces.index(term)
     if isinstance(term.law, StaticLaw):
         values = term.law.values(forces.deflection[:, port], forces.rate[:, port])
         return port, forward.part.grid.coarse_spectrum(values[parameter])
@@ -49,11 +49,14 @@ def port_motions(
     forward: Forward,
     forces: LawForces,
     theta_forces: ComplexArray,
-    theta_loads: dict[int, ComplexArray],
+    loads: dict[int, ComplexArray],
     law_forces: ComplexArray,
     states: int,
 ) -> FloatArray:
-    """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns)."""
+    """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns).
+
+    What acts along elements is in `theta_forces` and `law_forces`; `loads` (F, n), by column, push bodies.
+    """
     plant, grid = forward.plant, forward.part.grid
     structure = plant.structure
     ports = np.array([wide_port(forward, w) for w in forces.ports])
@@ -61,12 +64,12 @@ def port_motions(
     spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
     of_force = ports @ plant.deflection_of_force  # (F, m, E)
     for i, parameter in enumerate(forward.system.parameters):
-        if i in theta_loads:
-            spectra[:, :, i] = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, theta_loads[i])
-        else:
+        if i not in loads:
             e = forward.system.elements.index(parameter.element)
             spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
     spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
+    for column, load in loads.items():
+        spectra[:, :, column] = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, load)
     free = plant.free_motion(structure.motion_rows(ports), grid.step, grid.samples).reshape(
         grid.samples, 2, len(ports), states
     )
@@ -76,18 +79,18 @@ def port_motions(
     result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
     if plant.floats:
         for i, parameter in enumerate(forward.system.parameters):
-            if i in theta_loads:
-                rest, line = plant.without_line(theta_loads[i])
-                steady = plant.polynomial_response(line_load(line)) @ (ports @ structure.H).T
-                swinging = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, rest)
-                result[0, :, :, i] = grid.inverse(swinging) + grid.monomials @ steady
-                rate = 1j * grid.omega[:, None] * swinging
-                result[1, :, :, i] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
-            else:
+            if i not in loads:
                 unit = np.eye(len(structure.H))[forward.system.elements.index(parameter.element)]
                 result[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
         for j in range(p):
             result[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
+        for column, load in loads.items():
+            rest, line = plant.without_line(load)
+            steady = plant.polynomial_response(line_load(line)) @ (ports @ structure.H).T
+            swinging = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, rest)
+            result[0, :, :, column] = grid.inverse(swinging) + grid.monomials @ steady
+            rate = 1j * grid.omega[:, None] * swinging
+            result[1, :, :, column] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
     return result
 
 
@@ -198,7 +201,7 @@ def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
 
 
 def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
-    i = next(k for k, t in enumerate(forces.terms) if t.key == term.key)
+    i = forces.index(term)
     grid = forward.part.grid
     return force_along(
         term.law,  # type: ignore[arg-type]
