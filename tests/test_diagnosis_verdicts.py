@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from diagnosis_cases import DAMPING, STIFFNESS, Recorded, quarter_car, simulate
 
-from model.diagnosis.channels import DiagnosisError
+from model.diagnosis.channels import DiagnosisError, TooLittleError
 from model.diagnosis.diagnose import Options, diagnose
 
 
@@ -84,8 +84,14 @@ def test_missing_input_is_refused_by_name():
 
 def test_short_recording_is_refused_with_what_is_needed():
     record = simulate(seed=28, seconds=10)
-    with pytest.raises(DiagnosisError, match="200"):
+    with pytest.raises(TooLittleError, match="200"):
         _diagnose(Recorded(record.values[:90]))
+
+
+def test_still_recording_is_refused_with_what_is_needed():
+    record = simulate(seed=30, seconds=10, level=1e-4)
+    with pytest.raises(TooLittleError, match="noise"):
+        _diagnose(record)
 
 
 def test_report_is_json_with_the_contracts_keys():

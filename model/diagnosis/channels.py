@@ -13,11 +13,16 @@ from model.system import System
 
 MINIMUM_SAMPLES = 200
 _GAP_SECONDS = 0.05  # longest gap that is closed by interpolation
+_MOVES = 2.0  # standard deviations of its noise by which at least one sensor has to move
 _STUCK_SHARE = 0.02  # of the recording: a run of equal values this long (and at least a second) is no chance
 
 
 class DiagnosisError(ValueError):
     """The recording cannot be diagnosed; the message says what is missing and what to do."""
+
+
+class TooLittleError(DiagnosisError):
+    """The recording is what it should be, but too short or too still to decide anything."""
 
 
 @dataclass(frozen=True)
@@ -33,18 +38,20 @@ class Prepared:
 def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
     """Sort columns (T, C) in the order of `system.channels` by role.
 
-    Errors: `DiagnosisError` when an input is missing or too little is left.
+    Errors: `DiagnosisError` when an input is missing, `TooLittleError` when too little is left or nothing moves.
     """
     names = [channel.name for channel in system.channels]
     if values.ndim != 2 or values.shape[1] != len(names):
         raise DiagnosisError(f"values: expected shape (samples, {len(names)}), came {values.shape}")
     values = np.array(values, dtype=float)
     notes: list[str] = []
-    stuck = _blank_stuck(values, names, sample_rate)
+    resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
+    notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
+    stuck = _blank_stuck(values, names, sample_rate, resting)
     first, last = _usable_stretch(system, values, sample_rate)
     if last - first < MINIMUM_SAMPLES:
-        raise DiagnosisError(
-            f"the recording has {last - first} usable samples in a row; "
+        raise TooLittleError(
+            f"too short to decide anything: the recording has {last - first} usable samples in a row; "
             f"at least {MINIMUM_SAMPLES} ({MINIMUM_SAMPLES / sample_rate:.1f} s) are needed"
         )
     if last - first < len(values):
@@ -52,16 +59,33 @@ def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
             f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
         )
     values = _close_gaps(values[first:last])
-    return _by_role(system, values, sample_rate, tuple(stuck), notes, first)
+    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
+    _require_motion(system, prepared.signals)
+    return prepared
 
 
-def _blank_stuck(values: FloatArray, names: list[str], sample_rate: float) -> list[tuple[str, float]]:
-    """Columns that repeat one value for long become NaN."""
+def _require_motion(system: System, signals: Signals) -> None:
+    listed = list(system.file.sensors.values())
+    noise = np.array([listed[index].noise for index in signals.sensor_index])
+    moves = np.std(signals.sensors, axis=0)
+    if np.all(moves < _MOVES * noise):
+        best = int(np.argmax(moves / noise))
+        raise TooLittleError(
+            f"too still to decide anything: no sensor moves by {_MOVES:g} times its noise "
+            f"({signals.sensor_names[best]}: {moves[best]:.2g}, noise {noise[best]:.2g}); "
+            "record faster or on rougher track"
+        )
+
+
+def _blank_stuck(
+    values: FloatArray, names: list[str], sample_rate: float, resting: set[str]
+) -> list[tuple[str, float]]:
+    """Columns that repeat one value for long become NaN, but for those that rest."""
     found = []
     for column, name in enumerate(names):
         series = values[:, column]
         good = np.flatnonzero(np.isfinite(series))
-        if len(good) < 2:
+        if len(good) < 2 or name in resting:
             continue
         change = np.flatnonzero(np.diff(series[good]) != 0)
         edges = np.concatenate([[-1], change, [len(good) - 1]])

@@ -60,7 +60,7 @@ def narrate(course: Course, record: Recorded) -> Report:
             f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; "
             "the system file does not seem to belong to this recording",
         )
-    elif after.nrmse > _STRANGE and not course.held.still:
+    elif course.problem.follows and after.nrmse > _STRANGE and not course.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     explained = _explained(before, after, floor_figures) if course.found else None
     return Report(

@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+from model.diagnosis.channels import TooLittleError
 from model.diagnosis.report import Report
 from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from replay.record import Record, load_record
@@ -19,7 +20,11 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, out: Path | None
     record = load(file, system, dbc or (MANCHESTER_DBC if system_file is None else None))
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
-    report = _diagnose(system, record, file, quiet=json_lines)
+    try:
+        report = _diagnose(system, record, file, quiet=json_lines)
+    except TooLittleError as error:
+        print(f"sprung: {file}: {error}", file=sys.stderr)
+        return 1
     if out is not None:
         from service.report import write_report
 
