@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks import paper
+from benchmarks.bounds import shared_bound
 from benchmarks.physics_overhead import _stepwise
 from model.alps import fit, mass_spring_damper, train_fit, two_body
 from model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
@@ -291,3 +292,13 @@ def test_positions_rest_as_opened_while_rates_are_learned(tmp_path: Path) -> Non
     torch.testing.assert_close(trained(seen).mean[..., :4], opened(seen).mean[..., :4])
     moved = (trained(seen).mean - opened(seen).mean)[..., 4:]
     assert float(moved.detach().abs().max()) > 1e-4
+
+
+def test_the_bound_falls_with_windows_and_rises_where_the_sensors_are_unknown(train_data) -> None:
+    system, truth = load_system(), train_data.log_ratio[0]
+    windows = [values[0].unflatten(0, (5, 100)) for values in (train_data.states, train_data.known)]
+    one = shared_bound(system, truth, *[w[:1] for w in windows], free=False)
+    twice = shared_bound(system, truth, *[w[[0, 0]] for w in windows], free=False)
+    np.testing.assert_allclose(twice, one / np.sqrt(2), rtol=1e-6)
+    known, unknown = (shared_bound(system, truth, *windows, free=free) for free in (False, True))
+    assert (known < one).all() and (known < unknown * (1 + 1e-6)).all()
