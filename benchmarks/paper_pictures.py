@@ -103,7 +103,7 @@ def kernels(views: dict[str, KernelView], path: Path) -> None:
     for name, found in views.items():
         style = "--" if name == "k_DFT" else "-"
         axes[0, 1].plot(np.arange(101) - 50, found.row, style, lw=1, label=name)
-        axes[0, 2].semilogy(np.arange(1, len(found.row_spectrum)), found.row_spectrum[1:], style, lw=1)  # mean taken off
+        axes[0, 2].semilogy(np.arange(1, len(found.row_spectrum)), found.row_spectrum[1:], style, lw=1)
         axes[0, 3].semilogy(found.eigenvalues, style, lw=1)
     axes[0, 1].legend(fontsize=6)
     for ax, title in zip(axes[0, 1:], ("(b) middle row", "(b') its spectrum", "eigenvalues / trace"), strict=True):
