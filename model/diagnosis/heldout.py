@@ -8,7 +8,8 @@ import numpy as np
 
 from model.diagnosis.choose import profile_gain
 from model.diagnosis.fit import Fit, Problem
-from model.diagnosis.forward import Forward, LawForces, propagate
+from model.diagnosis.forward import Forward, propagate
+from model.diagnosis.loop import LawForces
 from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
 from model.diagnosis.point import Point

@@ -14,7 +14,8 @@ from scipy.linalg import expm
 
 from model.diagnosis.catalogue import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from model.diagnosis.catalogue.base import Values
-from model.diagnosis.forward import Forward, LawForces, Loop, propagate
+from model.diagnosis.forward import Forward, propagate
+from model.diagnosis.loop import LawForces, Loop
 from model.diagnosis.plant import Plant
 from model.diagnosis.spectra import OVERSAMPLING
 from model.diagnosis.terms import Term

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.diagnosis.forward import Forward, LawForces, propagate
+from model.diagnosis.forward import Forward, propagate
+from model.diagnosis.loop import LawForces
 from model.diagnosis.spectra import ComplexArray
 from model.signals import FloatArray
 

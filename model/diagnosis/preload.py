@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from model.diagnosis.forward import Forward, LawForces
+from model.diagnosis.forward import Forward
+from model.diagnosis.loop import LawForces
 from model.diagnosis.motions import particular_start
 from model.diagnosis.point import Point
 from model.diagnosis.spectra import OVERSAMPLING

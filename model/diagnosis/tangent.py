@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from model.diagnosis.catalogue import ElementLaw
-from model.diagnosis.forward import Forward, LawForces
+from model.diagnosis.forward import Forward
 from model.diagnosis.hysteresis import force_along
+from model.diagnosis.loop import LawForces
 from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term
 from model.diagnosis.unknown import StaticLaw
