@@ -67,7 +67,7 @@ class Trial:
     @property
     def explains(self) -> float:
         """How much of what was missing: evidence, or power of forces that nobody measured."""
-        return self.worth if len(self.fit.noise.force) else self.gain
+        return self.worth if self.fit.noise.follows else self.gain
 
     @property
     def named(self) -> bool:

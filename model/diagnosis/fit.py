@@ -112,7 +112,7 @@ class Problem:
     @property
     def follows(self) -> bool:
         """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
-        return len(self.noise.force) > 0
+        return self.noise.follows
 
     def forward(self, point: Point) -> Forward:
         part = self.smoothed.part if self.smoothed else self.part

@@ -140,7 +140,7 @@ class Forward:
     def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
         """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
         plant, s = self.plant, self.plant.structure
-        load = -(plant.impedance[:, None, :] * s.H.T) @ s.G
+        load = plant.load_of_support
         moved = plant.receptance @ np.concatenate([load, np.broadcast_to(s.F, (len(load), *s.F.shape))], axis=2)
         inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
         return plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]

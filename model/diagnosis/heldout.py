@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from model.diagnosis.choose import profile_gain
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import Forward, propagate
-from model.diagnosis.loop import LawForces
+from model.diagnosis.loop import LawForces, near_of
 from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
 from model.diagnosis.point import Point
@@ -44,11 +45,15 @@ class HeldOut:
     def __init__(self, system: System, signals: Signals, noise: Noise, split: int) -> None:
         self.system, self.signals, self.noise, self.split = system, signals, noise, split
         self.whole = transform(signals, noise)
-        self.tracked = transform(signals, noise, rated=drifting(system, signals.sensor_index))
         self.grid = Grid(signals.samples - split, 1 / signals.sample_rate, split / signals.sample_rate)
         self.whitener: Whitener | None = None
-        rest = signals.part(split, signals.samples)
-        self.later = transform(rest, noise, rated=drifting(system, signals.sensor_index))
+        self.rated = drifting(system, signals.sensor_index)
+        self.later = transform(signals.part(split, signals.samples), noise, rated=self.rated)
+
+    @cached_property
+    def tracked(self) -> Part:
+        """The whole recording as it is followed: positions that drift by their rates."""
+        return transform(self.signals, self.noise, rated=self.rated)
 
     @property
     def still(self) -> bool:
@@ -75,7 +80,7 @@ class HeldOut:
         for number in range(2 if problem.follows else _ROUNDS):
             forward = problem.forward(replace(point, state=state, near=near))
             shown, forces = self._free_run(problem, forward, state, number > 0)
-            near = () if forces is None else tuple(forces.force.T)
+            near = near_of(forces)
             rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, part.grid.step, self.split)
             particular = part.grid.inverse(shown)
@@ -97,7 +102,7 @@ class HeldOut:
         Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
         good the model.
         """
-        if not len(before.noise.force):
+        if not before.noise.follows:
             return self.run(before.point).chi_square - self.run(after.point).chi_square
         (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
         return profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0) + first_log_det - second_log_det
@@ -137,7 +142,7 @@ class HeldOut:
         loop = forward.loop(state)
         if loop is None:
             return problem.shown(forward, None), None
-        forces = None
+        forces: LawForces | None
         if problem.follows:
             known = np.column_stack(forward.start_force)
             forces = loop.answer(march_forces(forward, state, self.split) if started else known)
@@ -152,7 +157,7 @@ class HeldOut:
     def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
         error = measured - simulated
-        if self.whitener is None or len(self.noise.force):
+        if self.whitener is None or self.noise.follows:
             problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
             self.whitener = Whitener.of(problem.forward(point), self.noise)
         compared = np.where(self.later.rated, rate_of(error, self.grid), error)

@@ -67,6 +67,11 @@ class Noise:
     sensors: FloatArray  # shape (S,)
     least: FloatArray  # of the sensors' levels: far below what was declared, another noise has taken their place, (S,)
 
+    @property
+    def follows(self) -> bool:
+        """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
+        return len(self.force) > 0
+
     def support_variance(self, omega: FloatArray) -> FloatArray:
         """Variance of the fused displacement per bin, shape (F, supports)."""
         return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)

@@ -255,12 +255,17 @@ class Plant:
         """Deflection of each element per law force along each element, shape (F, E, E)."""
         return -(self.deflection_of_load @ self.structure.H.T)
 
+    @property
+    def load_of_support(self) -> ComplexArray:
+        """Load on the degrees of freedom per support displacement, shape (F, n, supports)."""
+        s = self.structure
+        return -(self.impedance[:, None, :] * s.H.T) @ s.G
+
     @cached_property
     def sensor_of_support(self) -> ComplexArray:
         """Sensor signal per support displacement, shape (F, S, supports)."""
         s = self.structure
-        load = -(self.impedance[:, None, :] * s.H.T) @ s.G
-        result = self.sensor_of_load @ load
+        result = self.sensor_of_load @ self.load_of_support
         if np.any(s.L):
             result = result + self._of_deflection @ s.G
         return result
@@ -269,7 +274,7 @@ class Plant:
     def deflection_of_support(self) -> ComplexArray:
         """Deflection of each element per support displacement, shape (F, E, supports)."""
         s = self.structure
-        return self.deflection_of_load @ (-(self.impedance[:, None, :] * s.H.T) @ s.G) + s.G
+        return self.deflection_of_load @ self.load_of_support + s.G
 
     @cached_property
     def sensor_of_measured_force(self) -> ComplexArray:
@@ -279,6 +284,11 @@ class Plant:
     @cached_property
     def deflection_of_measured_force(self) -> ComplexArray:
         return self.deflection_of_load @ self.structure.F
+
+    @property
+    def deflection_of_inputs(self) -> ComplexArray:
+        """Deflection of each element per support displacement and measured force, shape (F, E, inputs)."""
+        return np.concatenate([self.deflection_of_support, self.deflection_of_measured_force], axis=2)
 
     def polynomial_response(self, load: FloatArray) -> FloatArray:
         """Polynomial motion q under polynomial loads on the degrees of freedom.

@@ -161,7 +161,7 @@ def _log_det_slopes(problem: Problem, forward: Forward) -> FloatArray:
     plant, band = forward.plant, problem.part.grid.band
     jw = 1j * plant.grid.omega[band, None]
     shown = forward.sensor_factor[band, :, None]
-    deflection = np.concatenate([plant.deflection_of_support, plant.deflection_of_measured_force], axis=2)[band]
+    deflection = plant.deflection_of_inputs[band]
     slopes = np.zeros(len(problem.system.parameters))
     for i, parameter in enumerate(problem.system.parameters):
         value = parameter.nominal * np.exp(forward.theta[i])

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from model.diagnosis.fit import Fit, Problem
-from model.diagnosis.hysteresis import force_along
 from model.diagnosis.latent import LatentForce, Surface, estimate_force
 from model.diagnosis.screen import Projector
 from model.diagnosis.terms import Term
@@ -35,14 +34,7 @@ def _estimate(problem: Problem, fit: Fit) -> LatentForce:
     grid, term = projector.grid, fit.point.terms[-1]
     element = problem.system.elements.index(term.location)
     d, v = (motion[:, element] for motion in fit.element_motion)
-    present = force_along(
-        term.law,  # type: ignore[arg-type]
-        term.parameters,
-        d,
-        v,
-        grid.start + grid.fine_time,
-        fit.forward.element_of(term),
-    )
+    present = fit.force_along(term)
 
     def respond(forces: FloatArray) -> FloatArray:
         spectra = grid.coarse_spectrum(forces)[grid.band]  # (F, m)

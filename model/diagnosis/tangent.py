@@ -226,7 +226,7 @@ class Taken:
         plant, self.grid = forward.plant, forward.part.grid
         band = self.grid.band
         ports = np.array([wide_port(forward, w) for w in forces.ports])
-        inputs = np.concatenate([plant.deflection_of_support, plant.deflection_of_measured_force], axis=2)[band]
+        inputs = plant.deflection_of_inputs[band]
         self.deflection = ports @ inputs @ problem.whitener.blame  # of whitened sensor signals, (F, m, S)
         self.rate = 1j * self.grid.omega[band, None, None] * self.deflection
         if plant.floats:
