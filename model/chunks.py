@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -11,6 +12,7 @@ import numpy as np
 from model.signals import BoolArray, IntArray
 
 CHUNK = 32  # windows
+WORKERS = min(2, os.cpu_count() or 1)  # of a diagnosis: each fit holds some 200 MB for a minute of twelve sensors
 Piece = TypeVar("Piece")
 Result = TypeVar("Result")
 

@@ -13,14 +13,13 @@ tells about it, so a shape that does not matter costs nothing, where BIC would c
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
 
-from model.chunks import share
+from model.chunks import WORKERS, share
 from model.diagnosis.catalogue import ElementLaw
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import BOTH
@@ -45,7 +44,6 @@ _STRONGER = 1.1
 _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
-_WORKERS = min(2, os.cpu_count() or 1)  # fits at a time: each holds some 200 MB for a minute of twelve sensors
 _QUIET = 0.5  # least noise power of a block over the estimated one
 
 
@@ -130,7 +128,7 @@ def compete(
         tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
         return max(tried, key=lambda t: t.evidence, default=None)
 
-    trials = [t for t in share(begin, hits, _WORKERS) if t is not None]
+    trials = [t for t in share(begin, hits, WORKERS) if t is not None]
     trials.sort(key=lambda t: -t.evidence)
     if not trials:
         return []
@@ -142,7 +140,7 @@ def compete(
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
-    finished = [*share(lambda trial: _finished(problem, base, trial), leading, _WORKERS), *behind]
+    finished = [*share(lambda trial: _finished(problem, base, trial), leading, WORKERS), *behind]
     finished.sort(key=lambda t: -t.evidence)
     return finished
 
@@ -244,6 +242,8 @@ def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -
 
 def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
+    if trial.fit.converged and not problem.follows:
+        return trial
     finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
     if not problem.follows or finished.fit.deviance > base.deviance:
         return finished

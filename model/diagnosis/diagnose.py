@@ -29,6 +29,7 @@ Progress = Callable[[float, str], None]
 # a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
 _MINOR_BESIDE, _MINOR_ELSEWHERE = 0.05, 0.002
 _MOST_LEFT = 0.5  # or from this share of what they left of forces that nobody measured
+_AGAINST = 3.0  # standard deviations by which the held-out part has to fall short to refute a finding
 _ASTRAY = 1.5  # rise of the reduced chi-square from the first part to the whole recording
 
 
@@ -281,7 +282,13 @@ def _worth(fit: Fit, index: int) -> float:
 
 
 def _holds(course: Course, trial: Trial) -> bool:
-    """Whether the finding improves what is said of the held-out part, if that can tell."""
+    """Whether the held-out part does not speak against the finding.
+
+    A true one gains there what it gained on the first part, by their lengths, as a non-central chi-square scatters:
+    twice the root of its mean.  A weak one may lose there by chance; that it is no chance is known from its p-value.
+    """
     if course.held.still:
         return True
-    return course.held.gain(course.fit, trial.fit) > 0
+    expected = max(trial.gain, 0.0) * (course.signals.samples / course.held.split - 1)
+    least = min(0.0, expected - _AGAINST * 2 * np.sqrt(expected))
+    return course.held.gain(course.fit, trial.fit) > least

@@ -149,12 +149,10 @@ class Problem:
 
     def _of_input_noise(self, forward: Forward) -> ComplexArray:
         """What the linear plant makes of the measured inputs less the smoothed ones, (F, S)."""
-        plant, part, smoothed = forward.plant, self.part, forward.part
-        supports = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support - smoothed.support)
+        part, smoothed = self.part, forward.part
         forces = part.force - smoothed.force
         forces[0] += (part.force_polynomial - smoothed.force_polynomial)[0] * np.sqrt(part.grid.samples)
-        forces = forces / forward.force_faults[0]
-        return supports + np.einsum("fsi,fi->fs", plant.sensor_of_measured_force, forces)
+        return forward.plant.sensors(part.support - smoothed.support, forces / forward.force_faults[0])
 
     def linearise(self, point: Point) -> Linearisation:
         """Residual and sensitivities at a point."""

@@ -96,9 +96,7 @@ class Forward:
     @cached_property
     def linear_sensors(self) -> ComplexArray:
         """True signals without laws' forces and free motion, (F, S)."""
-        plant, part = self.plant, self.part
-        supports = np.einsum("fsi,fi->fs", plant.sensor_of_support, part.support)
-        return supports + np.einsum("fsi,fi->fs", plant.sensor_of_measured_force, self.force)
+        return self.plant.sensors(self.part.support, self.force)
 
     @cached_property
     def force_faults(self) -> tuple[FloatArray, FloatArray]:
@@ -140,8 +138,7 @@ class Forward:
     def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
         """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
         plant, s = self.plant, self.plant.structure
-        load = plant.load_of_support
-        moved = plant.receptance @ np.concatenate([load, np.broadcast_to(s.F, (len(load), *s.F.shape))], axis=2)
+        moved = plant.receptance @ plant.load_of_inputs
         inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
         return plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
 
@@ -194,11 +191,16 @@ class Forward:
         return gain * np.exp(-s * delay) / (1 + s * lag)
 
     @cached_property
+    def linear_motion(self) -> ComplexArray:
+        """Periodic part of the degrees of freedom without laws' forces and free motion, (F, n)."""
+        load = self.plant.load(self.part.support, self.force)
+        return np.einsum("fnm,fm->fn", self.plant.receptance, load)
+
+    @cached_property
     def linear_deflection(self) -> ComplexArray:
         """Periodic part of the deflections without laws' forces and free motion, (F, E)."""
-        plant, part = self.plant, self.part
-        supports = np.einsum("fei,fi->fe", plant.deflection_of_support, part.support)
-        return supports + np.einsum("fei,fi->fe", plant.deflection_of_measured_force, self.force)
+        s = self.plant.structure
+        return self.linear_motion @ s.H.T + self.part.support @ s.G.T
 
     def free_rows(self) -> FloatArray:
         """Sensors over the free state at the first sample, (N, S, 2n)."""

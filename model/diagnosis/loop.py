@@ -113,7 +113,7 @@ class Loop:
         """
         plant = self.plant
         s = plant.structure
-        known = ports @ plant.deflection_of_force @ ports.T
+        known = plant.compliance(ports, ports)
         fine = 2 * np.pi * np.fft.rfftfreq(OVERSAMPLING * self.grid.samples, self.grid.step / OVERSAMPLING)
         values, vectors = np.linalg.eig(s.state_matrix())
         rows = s.motion_rows(ports)[: len(ports)] @ vectors

@@ -43,12 +43,7 @@ def motions_of(forward: Forward, forces: LawForces | None, state: FloatArray) ->
 
 def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray:
     """Periodic part of the degrees of freedom, (F, n)."""
-    plant, part = forward.plant, forward.part
-    s = plant.structure
-    load = -((part.support @ s.G.T) * plant.impedance) @ s.H
-    load = load + forward.force @ s.F.T
-    q = np.einsum("fnm,fm->fn", plant.receptance, load)
-    return q if forces is None else q + forces.q
+    return forward.linear_motion if forces is None else forward.linear_motion + forces.q
 
 
 def particular_start(forward: Forward, forces: LawForces | None) -> FloatArray:

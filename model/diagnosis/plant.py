@@ -245,15 +245,26 @@ class Plant:
             result = result + np.where(s.sensor_kind[:, None] == FORCE, s.L, 0.0)
         return result
 
-    @cached_property
-    def deflection_of_load(self) -> ComplexArray:
-        """Deflection of each element per load on a degree of freedom, shape (F, E, n)."""
-        return self.structure.H @ self.receptance
+    def deflection_of_load(self, ports: FloatArray) -> ComplexArray:
+        """Deflection along ports (m, E) per load on a degree of freedom, shape (F, m, n)."""
+        return (ports @ self.structure.H) @ self.receptance
 
-    @cached_property
-    def deflection_of_force(self) -> ComplexArray:
-        """Deflection of each element per law force along each element, shape (F, E, E)."""
-        return -(self.deflection_of_load @ self.structure.H.T)
+    def compliance(self, ports: FloatArray, sources: FloatArray) -> ComplexArray:
+        """Deflection along ports (m, E) per law force along sources (s, E), shape (F, m, s)."""
+        return -(self.deflection_of_load(ports) @ (sources @ self.structure.H).T)
+
+    def load(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
+        """Load on the degrees of freedom under supports (F, supports) and measured forces (F, forces), (F, n)."""
+        s = self.structure
+        return np.asarray(force @ s.F.T - ((support @ s.G.T) * self.impedance) @ s.H)
+
+    def sensors(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
+        """True signals under supports (F, supports) and measured forces (F, forces), (F, S)."""
+        s = self.structure
+        result = np.einsum("fsn,fn->fs", self.sensor_of_load, self.load(support, force))
+        if np.any(s.L):
+            result += np.einsum("fse,fe->fs", self._of_deflection, support @ s.G.T)
+        return result
 
     @property
     def load_of_support(self) -> ComplexArray:
@@ -271,24 +282,23 @@ class Plant:
         return result
 
     @cached_property
-    def deflection_of_support(self) -> ComplexArray:
-        """Deflection of each element per support displacement, shape (F, E, supports)."""
-        s = self.structure
-        return self.deflection_of_load @ self.load_of_support + s.G
-
-    @cached_property
     def sensor_of_measured_force(self) -> ComplexArray:
         """Sensor signal per measured force, shape (F, S, forces)."""
         return self.sensor_of_load @ self.structure.F
 
     @cached_property
-    def deflection_of_measured_force(self) -> ComplexArray:
-        return self.deflection_of_load @ self.structure.F
-
-    @property
     def deflection_of_inputs(self) -> ComplexArray:
         """Deflection of each element per support displacement and measured force, shape (F, E, inputs)."""
-        return np.concatenate([self.deflection_of_support, self.deflection_of_measured_force], axis=2)
+        s = self.structure
+        result = s.H @ (self.receptance @ self.load_of_inputs)
+        result[:, :, : s.G.shape[1]] += s.G
+        return result
+
+    @property
+    def load_of_inputs(self) -> ComplexArray:
+        """Load on the degrees of freedom per support displacement and measured force, shape (F, n, inputs)."""
+        load, F = self.load_of_support, self.structure.F
+        return np.concatenate([load, np.broadcast_to(F, (len(load), *F.shape))], axis=2)
 
     def polynomial_response(self, load: FloatArray) -> FloatArray:
         """Polynomial motion q under polynomial loads on the degrees of freedom.

@@ -55,11 +55,11 @@ def preloaded(problem: Problem, point: Point) -> Point:
         point = replace(point, terms=tuple(terms), near=tuple(near.T))
         if change < 1e-3 or problem.follows:
             break
-        # the free state counts from the plant's particular solution, which has changed: keep the true state
-        state = start + point.state
-        for _ in range(2):
-            moved = problem.forward(point)
-            point = replace(point, state=state - particular_start(moved, problem.law_forces(moved, point)))
+        # the free state counts from the plant's particular solution, which has changed: keep motion and true state
+        moved = problem.forward(point)
+        loop = moved.loop(point.state)
+        assert loop is not None
+        point = replace(point, state=start + point.state - particular_start(moved, loop.answer(near)))
         if forces.converged and change < 0.2:
             break
     return point

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy import stats
 
+from model.chunks import WORKERS, share
 from model.diagnosis.catalogue import ElementLaw, Law, Observed, SpringDamper, find_law, observe
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.hysteresis import force_along
@@ -197,14 +198,16 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
     system = projector.problem.system
     d_all, v_all = projector.fit.element_motion
     channels: dict[str, Channel] = {}
-    for law in laws:
-        if not isinstance(law, ElementLaw):
-            continue
-        for location in places(system, law):
-            if location not in channels:
-                port = Term(law, location, law.absent).port(system)
-                channels[location] = Channel(projector, projector.of_force[:, :, : len(port)] @ port)
-            yield _best_shape(projector, law, location, d_all, v_all, channels[location])
+    candidates = [(law, at) for law in laws if isinstance(law, ElementLaw) for at in places(system, law)]
+    for law, location in candidates:
+        if location not in channels:
+            port = Term(law, location, law.absent).port(system)
+            channels[location] = Channel(projector, projector.of_force[:, :, : len(port)] @ port)
+
+    def best(candidate: tuple[ElementLaw, str]) -> tuple[Hit, int]:
+        return _best_shape(projector, *candidate, d_all, v_all, channels[candidate[1]])
+
+    yield from share(best, candidates, WORKERS)
     for index, location in enumerate(system.elements):
         if location in channels:
             yield from _unnamed(projector, location, d_all[:, index], v_all[:, index], channels[location])

@@ -78,11 +78,11 @@ class Grid:
 
     def forward(self, series: FloatArray) -> ComplexArray:
         """Transform along the first axis: (N, ...) -> (F, ...)."""
-        return scipy.fft.rfft(series, axis=0) / np.sqrt(self.samples)
+        return scipy.fft.rfft(series, axis=0, norm="ortho")
 
     def inverse(self, spectrum: ComplexArray) -> FloatArray:
         """(F, ...) -> (N, ...)."""
-        return scipy.fft.irfft(spectrum, self.samples, axis=0) * np.sqrt(self.samples)
+        return scipy.fft.irfft(spectrum, self.samples, axis=0, norm="ortho")
 
     def fine(self, spectrum: ComplexArray) -> FloatArray:
         """Band-limited series on the oversampled axis: (F, ...) -> (OVERSAMPLING N, ...)."""

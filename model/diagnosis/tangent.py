@@ -63,14 +63,14 @@ def port_motions(
     ports = np.array([wide_port(forward, w) for w in forces.ports])
     P, p = theta_forces.shape[1], law_forces.shape[1]
     spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
-    of_force = ports @ plant.deflection_of_force  # (F, m, E)
+    of_force = plant.compliance(ports, np.eye(len(structure.H)))  # (F, m, E)
     for i, parameter in enumerate(forward.system.parameters):
         if i not in loads:
             e = forward.system.elements.index(parameter.element)
             spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
     spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
     for column, load in loads.items():
-        spectra[:, :, column] = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, load)
+        spectra[:, :, column] = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), load)
     free = plant.free_motion(structure.motion_rows(ports), grid.step, grid.samples).reshape(
         grid.samples, 2, len(ports), states
     )
@@ -88,7 +88,7 @@ def port_motions(
         for column, load in loads.items():
             rest, line = plant.without_line(load)
             steady = plant.polynomial_response(line_load(line)) @ (ports @ structure.H).T
-            swinging = np.einsum("fmn,fn->fm", ports @ plant.deflection_of_load, rest)
+            swinging = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), rest)
             result[0, :, :, column] = grid.inverse(swinging) + grid.monomials @ steady
             rate = 1j * grid.omega[:, None] * swinging
             result[1, :, :, column] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
@@ -112,7 +112,7 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
     shape = (len(grid.omega), len(sources), -1)
     rest, line = plant.without_line(force.reshape(len(grid.omega), -1))
     line = line.reshape(2, len(sources), -1)
-    answer = (ports @ plant.deflection_of_force @ sources.T) @ rest.reshape(shape)
+    answer = plant.compliance(ports, sources) @ rest.reshape(shape)
     lines = np.array([plant.line_motion(w) for w in sources])  # (s, 2, DEGREE + 1, n)
     polynomial = np.einsum("skpn,mn,ksc->pmc", lines, ports @ H, line)
     steady = np.stack([polynomial, plant.derivative(polynomial)])
@@ -130,10 +130,13 @@ def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Tak
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
     ports = np.array([wide_port(forward, w) for w in forces.ports])
-    compliance = ports @ plant.deflection_of_force @ ports.T  # (F, m, m)
+    compliance = plant.compliance(ports, ports)
     if taken is not None:
         compliance[grid.band] -= taken.deflection @ taken.seen
     jw = 1j * grid.omega[:, None, None]
+    if not plant.floats:  # single precision is ample for what is solved to a few thousandths, and quick
+        slopes, motions = slopes.astype(np.float32), motions.astype(np.float32)
+        compliance, jw = compliance.astype(np.complex64), jw.astype(np.complex64)
     along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
 
     def close(force: FloatArray) -> FloatArray:
@@ -146,7 +149,7 @@ def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Tak
         moved = compliance @ grid.forward(force)
         return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
 
-    return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]))
+    return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]).astype(np.float64))
 
 
 def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
@@ -158,8 +161,8 @@ def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> Floa
     scale = np.where(used, size, 1.0)
     basis = [right / scale]
     columns = len(scale)
-    hessenberg = np.zeros((columns, _KRYLOV + 1, _KRYLOV))
-    target = np.zeros((columns, _KRYLOV + 1, 1))
+    hessenberg = np.zeros((columns, _KRYLOV + 1, _KRYLOV), right.dtype)
+    target = np.zeros((columns, _KRYLOV + 1, 1), right.dtype)
     target[:, 0, 0] = size
     for k in range(_KRYLOV):
         w = apply(basis[k])
