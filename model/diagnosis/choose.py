@@ -109,7 +109,7 @@ def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> 
 def _strength(hit: Hit) -> float:
     """Score less what chance gives its degrees of freedom; input faults are weighed by the same measure."""
     extra = 4.0 if hit.family == "unnamed" else 0.0
-    extra += 22.0 if hit.family == "line" else 0.0
+    extra += 22.0 if hit.family in ("line", "comb") else 0.0
     return hit.score - 2.0 * (hit.freedom - 1) - extra
 
 

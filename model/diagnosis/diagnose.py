@@ -29,7 +29,6 @@ Progress = Callable[[float, str], None]
 # a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
 _MINOR_BESIDE, _MINOR_ELSEWHERE = 0.05, 0.002
 _MOST_LEFT = 0.5  # or from this share of what they left of forces that nobody measured
-_AGAINST = 3.0  # standard deviations by which the held-out part has to fall short to refute a finding
 _ASTRAY = 1.5  # rise of the reduced chi-square from the first part to the whole recording
 
 
@@ -51,7 +50,7 @@ class Options:
     project: bool = True  # take out of every candidate what the nominal parameters can imitate
     multiplicity: bool = True  # account for the number of candidates tried
     held_out: bool = True  # accept a finding only if it improves the part that no fit saw
-    alpha: float = 3e-3  # chance of a false finding per recording before the held-out check
+    alpha: float = 1e-3  # chance of a false finding per recording before the held-out check
     train_share: float = 0.7  # of the recording, from its start
     most_findings: int = 4
     file: str = ""  # name of the recording, for the report
@@ -217,7 +216,7 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     trials = preferred([t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)])
     trials.sort(key=lambda t: t.hit.family != "force")  # faults of the inputs first, of forces as of motions
     for trial in trials[:1]:
-        if options.held_out and not _holds(course, trial):
+        if options.held_out and not course.held.still and course.held.compare(course.fit, trial.fit).refuted:
             return False
         tests = course.last.tests[trial.hit.family] * len(course.last.tests) if options.multiplicity else 1
         p_value = max(trial.p_value(tests), min(1.0, trial.hit.p_single * tests))
@@ -239,7 +238,7 @@ def _smoother(course: Course, fit: Fit) -> Fit:
     surface = with_surface(course.problem, fit)
     if surface is None:
         return fit
-    return surface if course.held.gain(fit, surface) > 0 else fit
+    return surface if course.held.compare(fit, surface).gain > 0 else fit
 
 
 def _repeats(course: Course, hit) -> bool:
@@ -279,16 +278,3 @@ def _worth(fit: Fit, index: int) -> float:
     size = term.parameters[strength] - (absent if np.isfinite(absent) else 0.0)
     place = fit.place(index).start + strength
     return float(size**2 / max(fit.covariance[place, place], 1e-300))
-
-
-def _holds(course: Course, trial: Trial) -> bool:
-    """Whether the held-out part does not speak against the finding.
-
-    A true one gains there what it gained on the first part, by their lengths, as a non-central chi-square scatters:
-    twice the root of its mean.  A weak one may lose there by chance; that it is no chance is known from its p-value.
-    """
-    if course.held.still:
-        return True
-    expected = max(trial.gain, 0.0) * (course.signals.samples / course.held.split - 1)
-    least = min(0.0, expected - _AGAINST * 2 * np.sqrt(expected))
-    return course.held.gain(course.fit, trial.fit) > least

@@ -136,7 +136,7 @@ class Problem:
         """What the sensors show of a solution, (F, S)."""
         plant, part = forward.plant, forward.part
         periodic = forward.linear_sensors
-        polynomial = plant.polynomial_sensors(forward.polynomial[0], part.support_polynomial)
+        polynomial = plant.polynomial_sensors(forward.polynomial[0], forward.support_polynomial)
         if part is not self.part:
             periodic = periodic + self._of_input_noise(forward)
         if forces is not None:

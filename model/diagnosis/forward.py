@@ -12,11 +12,11 @@ from math import comb
 import numpy as np
 from scipy.linalg import expm
 
-from model.diagnosis.catalogue import BodyLaw, SensorLaw, SpringDamper
+from model.diagnosis.catalogue import CLOCK_LEAD, BodyLaw, SensorLaw, SpringDamper, SupportLaw
 from model.diagnosis.loop import LawForces, Loop, fixed_point
 from model.diagnosis.measured import Part
 from model.diagnosis.plant import Plant, Structure
-from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
 from model.diagnosis.terms import Term, branch_of, split
 from model.mechanics import VELOCITY
 from model.signals import FloatArray
@@ -86,7 +86,7 @@ class Forward:
     def polynomial(self) -> tuple[FloatArray, FloatArray]:
         """Polynomial motion (DEGREE + 1, n) and deflections (DEGREE + 1, E) under the polynomial inputs."""
         plant, s = self.plant, self.plant.structure
-        support = self.part.support_polynomial
+        support = self.support_polynomial
         moved = support @ s.G.T
         load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
         load = load + self.force_polynomial @ s.F.T
@@ -96,7 +96,34 @@ class Forward:
     @cached_property
     def linear_sensors(self) -> ComplexArray:
         """True signals without laws' forces and free motion, (F, S)."""
-        return self.plant.sensors(self.part.support, self.force)
+        return self.plant.sensors(self.support, self.force)
+
+    @cached_property
+    def _unmeasured(self) -> tuple[ComplexArray, FloatArray]:
+        """What the supports move besides what is measured: (F, supports) and (DEGREE + 1, supports)."""
+        grid = self.part.grid
+        spectrum = np.zeros(self.part.support.shape, dtype=complex)
+        polynomial = np.zeros(self.part.support_polynomial.shape)
+        time = grid.start + grid.time + CLOCK_LEAD
+        names = [n for n, source in self.system.file.inputs.items() if source.kind == "displacement"]
+        for term in self.terms:
+            if isinstance(term.law, SupportLaw):
+                at = [names.index(name) for name in term.location.split("|")]
+                d, v = (x[:, None] for x in term.law.movement(time, term.parameters, grid.nyquist))
+                line = detrend_ends(d, (v[0], v[-1]), grid)
+                spectrum[:, at] += grid.forward(d - grid.monomials @ line)
+                polynomial[:, at] += line
+        return spectrum, polynomial
+
+    @cached_property
+    def support(self) -> ComplexArray:
+        """Displacement of the supports, periodic part, (F, supports)."""
+        return self.part.support + self._unmeasured[0]
+
+    @property
+    def support_polynomial(self) -> FloatArray:
+        """The same, polynomial part, (DEGREE + 1, supports)."""
+        return self.part.support_polynomial + self._unmeasured[1]
 
     @cached_property
     def force_faults(self) -> tuple[FloatArray, FloatArray]:
@@ -193,14 +220,14 @@ class Forward:
     @cached_property
     def linear_motion(self) -> ComplexArray:
         """Periodic part of the degrees of freedom without laws' forces and free motion, (F, n)."""
-        load = self.plant.load(self.part.support, self.force)
+        load = self.plant.load(self.support, self.force)
         return np.einsum("fnm,fm->fn", self.plant.receptance, load)
 
     @cached_property
     def linear_deflection(self) -> ComplexArray:
         """Periodic part of the deflections without laws' forces and free motion, (F, E)."""
         s = self.plant.structure
-        return self.linear_motion @ s.H.T + self.part.support @ s.G.T
+        return self.linear_motion @ s.H.T + self.support @ s.G.T
 
     def free_rows(self) -> FloatArray:
         """Sensors over the free state at the first sample, (N, S, 2n)."""

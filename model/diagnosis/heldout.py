@@ -20,6 +20,7 @@ from model.signals import FloatArray
 from model.system import System
 
 _STILL = 0.05  # of the motion in the fitted part
+_CHANCE = 3.0  # standard deviations
 _ROUNDS = 4  # of laws' forces and the state at the start
 
 
@@ -29,14 +30,30 @@ class FreeRun:
 
     simulated: FloatArray  # (T, S), held-out samples
     measured: FloatArray  # (T, S)
-    chi_square: float  # whitened, of the held-out residual
-    count: int
+    residual: FloatArray  # whitened
     per_sensor: FloatArray  # rms(error) / rms(measured), (S,)
     point: Point  # the model, with its starting state over the whole recording
 
     @property
     def nrmse(self) -> float:
         return float(np.sqrt(np.mean(self.per_sensor**2)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the held-out part says of one fit against another."""
+
+    gain: float  # by how much the second says more, as twice the log-likelihood ratio or alike
+    apart: float  # distance of what they say, in units of noise
+    scatter: float  # variance along it: noise, and what the parameters' own uncertainty adds to it at most
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the second says less, and that is no chance.
+
+        Were it true, its gain would scatter about apart^2 by 2 apart: the error of the first is then apart and noise.
+        """
+        return self.gain < min(0.0, self.apart**2 - _CHANCE * 2 * self.apart * np.sqrt(self.scatter))
 
 
 class HeldOut:
@@ -96,16 +113,20 @@ class HeldOut:
         simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
         return self._judge(simulated[self.split :], replace(point, state=state, near=near))
 
-    def gain(self, before: Fit, after: Fit) -> float:
-        """By how much the second fit says more of the held-out part, as twice the log-likelihood ratio or alike.
+    def compare(self, before: Fit, after: Fit) -> Comparison:
+        """Two fits on the held-out part.
 
         Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
         good the model.
         """
         if not before.noise.follows:
-            return self.run(before.point).chi_square - self.run(after.point).chi_square
-        (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
-        return profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0) + first_log_det - second_log_det
+            first, second = self.run(before.point).residual, self.run(after.point).residual
+            gain = float(first @ first - second @ second)
+        else:
+            (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
+            gain = profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0)
+            gain += first_log_det - second_log_det
+        return Comparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
@@ -164,7 +185,7 @@ class HeldOut:
         residual = self.whitener(self.grid.forward(compared), self.later)
         size = np.sqrt(np.mean(measured**2, axis=0))
         per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
-        return FreeRun(simulated, measured, float(residual @ residual), len(residual), per_sensor, point)
+        return FreeRun(simulated, measured, residual, per_sensor, point)
 
     def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""

@@ -81,8 +81,13 @@ def mended(signals: Signals, term: Term) -> Signals:
         i = signals.force_names.index(term.location)
         force[:, i] = term.law.restore(force[:, i], term.parameters, signals.sample_rate)
         return replace(signals, force=force)
-    name, channel = term.location.rsplit(".", 1)
-    i = signals.support_names.index(name)
-    series = getattr(signals, channel).copy()
-    series[:, i] = term.law.restore(series[:, i], term.parameters, signals.sample_rate)
-    return replace(signals, **{channel: series})
+    if "." in term.location:
+        name, channel = term.location.rsplit(".", 1)
+        supports, channels = [name], [channel]
+    else:  # an axle: all that is measured of its wheels
+        supports, channels = term.location.split("|"), ["displacement", "velocity"]
+    at = [signals.support_names.index(name) for name in supports]
+    result = {channel: getattr(signals, channel).copy() for channel in channels}
+    for series in result.values():
+        series[:, at] = term.law.restore(series[:, at].T, term.parameters, signals.sample_rate).T
+    return replace(signals, **result)

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from scipy import stats
@@ -23,6 +24,7 @@ from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
 from model.diagnosis.terms import Term, branch_of, is_waveform
 from model.diagnosis.unknown import static_law, trials
 from model.signals import FloatArray
+from model.system import System
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class Hit:
     term: Term  # with the amplitude that the screening found
     score: float  # chi-square
     freedom: int
-    family: str  # which group of tests it belongs to: "law", "mode", "line", "mass", "sensor", "input"
+    family: str  # which group of tests it belongs to: "law", "comb", "mode", "line", "mass", "sensor", "input"
     p_single: float
     beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
     step: FloatArray | None = None  # what the fit's parameters and state would move by, (P + p + 2n,)
@@ -85,6 +87,7 @@ class Projector:
         shown = fit.forward.sensor_factor[grid.band, :, None]
         plant = fit.forward.plant
         self.of_force = factor @ (plant.sensor_of_force[grid.band] * shown)  # whitened, (F, S, E)
+        self.of_support = factor @ (plant.sensor_of_support[grid.band] * shown)  # (F, S, supports)
         self.of_load = factor @ (plant.sensor_of_load[grid.band] * shown)  # (F, S, n)
         self.factor = factor
 
@@ -179,12 +182,13 @@ def screen(
 ) -> Screening:
     """Screen all candidates on the residual of a fit."""
     from model.diagnosis.bodies import body_hits
+    from model.diagnosis.combs import comb_hits
     from model.diagnosis.sensors import measurement_hits
 
     projector = Projector(problem, fit, project)
     hits: list[Hit] = []
     tests: dict[str, int] = {}
-    for group in (element_hits, body_hits, measurement_hits):
+    for group in (element_hits, comb_hits, body_hits, measurement_hits):
         for hit, count in group(projector, laws):
             tests[hit.family] = tests.get(hit.family, 0) + count
             if hit.score > 0 and hit.term.key not in exclude:
@@ -213,20 +217,31 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
             yield from _unnamed(projector, location, d_all[:, index], v_all[:, index], channels[location])
 
 
-def places(system, law: ElementLaw) -> list[str]:
+def places(system: System, law: ElementLaw) -> list[str]:
     """Locations of an element law: elements, or pairs of elements between the same bodies at the same x."""
+    elements = system.file.elements
     if law.where == "element":
-        return list(system.elements)
-    if law.where != "pair":
-        return []
+        return list(elements)
+    pairs = level_pairs(system, list(elements))
+    return [f"{a}|{b}" for a, b in pairs if elements[a].lower == elements[b].lower]
+
+
+def wheelsets(system: System) -> list[str]:
+    """The two supports of every axle, "left|right"."""
+    elements, inputs = system.file.elements, set(system.file.inputs)
+    stands_on = {name: next(iter({e.upper, e.lower} & inputs), None) for name, e in elements.items()}
+    pairs = level_pairs(system, [name for name, support in stands_on.items() if support is not None])
+    return [f"{stands_on[a]}|{stands_on[b]}" for a, b in pairs if stands_on[a] != stands_on[b]]
+
+
+def level_pairs(system: System, names: list[str]) -> list[tuple[str, str]]:
+    """Pairs of elements below the same body at the same x."""
     pairs = []
-    items = list(system.file.elements.items())
-    for i, (a, first) in enumerate(items):
-        for b, second in items[i + 1 :]:
-            same = first.upper == second.upper and first.lower == second.lower
-            level = first.position and second.position and first.position[0] == second.position[0]
-            if same and level:
-                pairs.append(f"{a}|{b}")
+    for a, b in combinations(names, 2):
+        first, second = system.file.elements[a], system.file.elements[b]
+        level = first.position and second.position and first.position[0] == second.position[0]
+        if level and first.upper == second.upper:
+            pairs.append((a, b))
     return pairs
 
 

@@ -16,7 +16,7 @@ from scipy import stats
 
 from model.diagnosis.catalogue import Law, ParameterSpec, SensorLaw
 from model.diagnosis.forward import BOTH, DELAY
-from model.diagnosis.screen import Hit, Projector
+from model.diagnosis.screen import Hit, Projector, wheelsets
 from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.terms import Term
 from model.signals import FloatArray
@@ -69,12 +69,12 @@ def _with_delay(law: SensorLaw) -> SensorLaw:
 
 def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
     """Gain and lag of the channels of supports that are measured twice, and gain of forces."""
-    problem, fit, grid = projector.problem, projector.fit, projector.grid
+    problem, grid = projector.problem, projector.grid
     part, noise = problem.part, problem.noise
     band = grid.band
     omega = grid.omega[band]
     assert problem.whitener is not None
-    G = projector.factor @ (fit.forward.plant.sensor_of_support[band] * fit.forward.sensor_factor[band, :, None])
+    G = projector.of_support
     names = [n for n, s in problem.system.file.inputs.items() if s.kind == "displacement"]
     for at, support in enumerate(part.pairs):
         precision_d = 1 / noise.displacement[support] ** 2
@@ -96,7 +96,24 @@ def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
                 scale = 0.1 if effect == "sensor_gain" else 0.1 * grid.step
                 term = Term(laws[effect], f"{names[support]}.{channel}", (float(start),), scales=(scale,))
                 yield Hit(term, score, 1, "input", float(stats.chi2.sf(score, 1))), 1
+    if "axle_delay" in laws:
+        yield from _axle_hits(projector, laws["axle_delay"])
     yield from _force_hits(projector, laws)
+
+
+def _axle_hits(projector: Projector, law: SensorLaw) -> Iterator[tuple[Hit, int]]:
+    """Both wheels of an axle late together, all that is measured of them: no witness but the vehicle."""
+    part, grid = projector.problem.part, projector.grid
+    system = projector.problem.system
+    names = [n for n, s in system.file.inputs.items() if s.kind == "displacement"]
+    for location in wheelsets(system):
+        at = [names.index(wheel) for wheel in location.split("|")]
+        late = 1j * grid.omega[grid.band, None] * part.support[grid.band][:, at]
+        score, amplitude = projector.score(
+            projector.pack(np.einsum("fsa,fa->fs", projector.of_support[:, :, at], late))
+        )
+        term = Term(law, location, (float(amplitude),), scales=(0.1 * grid.step,))
+        yield Hit(term, score, 1, "input", float(stats.chi2.sf(score, 1))), 1
 
 
 def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:

@@ -40,6 +40,11 @@ class Grid:
         """Angular frequencies of the bins, rad/s, shape (F,)."""
         return np.asarray(2 * np.pi * np.fft.rfftfreq(self.samples, self.step), dtype=np.float64)
 
+    @property
+    def nyquist(self) -> float:
+        """Half of the sample rate, Hz."""
+        return 0.5 / self.step
+
     @cached_property
     def band(self) -> slice:
         """Bins that are compared."""

@@ -17,7 +17,7 @@ class Term:
     """One law at one place.  Parameters in the law's order."""
 
     law: Law
-    location: str  # element, "left|right" of a pair, body, sensor or input channel
+    location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle
     parameters: tuple[float, ...]
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
     preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant

@@ -11,6 +11,7 @@ from model.diagnosis.catalogue.base import (
     ParameterSpec,
     SensorLaw,
     SpringDamper,
+    SupportLaw,
     grid,
     observe,
 )
@@ -35,7 +36,7 @@ from model.diagnosis.catalogue.sensors import (
 )
 from model.diagnosis.catalogue.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
 
-Law = ElementLaw | BodyLaw | SensorLaw
+Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,
@@ -66,7 +67,7 @@ CATALOGUE: tuple[Law, ...] = (
 
 
 def element_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[ElementLaw, ...]:
-    """The laws that add a force to an element, an axle's elements or a pair."""
+    """The laws that add a force to an element or a pair."""
     return tuple(law for law in catalogue if isinstance(law, ElementLaw))
 
 
@@ -99,6 +100,7 @@ __all__ = [
     "ParameterSpec",
     "SensorLaw",
     "SpringDamper",
+    "SupportLaw",
     "body_laws",
     "element_laws",
     "find_law",

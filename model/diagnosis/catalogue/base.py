@@ -20,7 +20,7 @@ import numpy as np
 from model.mechanics import Mechanics
 from model.signals import FloatArray
 
-Where = Literal["element", "axle", "pair", "body", "sensor"]
+Where = Literal["element", "pair", "body", "sensor", "support", "axle"]  # "axle": both supports of one
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
 CLOCK_LEAD = 5.0  # s; the clock of the laws starts this long before the first sample of a recording
@@ -53,7 +53,6 @@ class Observed:
     stiffness: float  # N/m, of the element as identified without any law
     damping: float  # N s/m
     seconds: float  # length of the recording
-    lines: tuple[float, ...] = ()  # frequencies of narrow lines in the residual, Hz
 
     def deflection_quantile(self, shares: Sequence[float]) -> FloatArray:
         return np.interp(shares, np.linspace(0, 1, 101), self.deflection)
@@ -68,8 +67,6 @@ def observe(
     sample_rate: float,
     stiffness: float,
     damping: float,
-    *,
-    lines: Sequence[float] = (),
 ) -> Observed:
     """Statistics of one element's motion, both of shape (T,)."""
     shares = np.linspace(0, 1, 101)
@@ -81,7 +78,6 @@ def observe(
         stiffness=float(stiffness),
         damping=float(damping),
         seconds=len(deflection) / sample_rate,
-        lines=tuple(float(f) for f in lines),
     )
 
 
@@ -184,6 +180,42 @@ class BodyLaw:
 
     def admits(self, p: Sequence[float]) -> bool:
         return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+
+
+@dataclass(frozen=True)
+class SupportLaw:
+    """A movement of supports that repeats itself and that their measured motion does not show.
+
+    movement = depth sum_n harmonics[n - 1] cos(2 pi n (frequency t - phase)), t on the laws' clock
+    """
+
+    name: str
+    title: str
+    parameters: tuple[ParameterSpec, ...]  # depth m, frequency Hz, phase in periods
+    harmonics: tuple[float, ...]  # per unit of depth, from the fundamental on
+    absent: tuple[float, ...]
+    looks_like: str
+    confused_with: tuple[str, ...]
+    sentence: str
+    where: Where = "support"  # "axle": both supports of one axle together
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def admits(self, p: Sequence[float]) -> bool:
+        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+
+    def movement(self, time: FloatArray, p: Values, highest: float = np.inf) -> tuple[FloatArray, FloatArray]:
+        """What is added to the measured displacement (m) and velocity (m/s) at times on the laws' clock, each (T,).
+
+        highest: Hz, harmonics above it are left out, as anti-alias filters do.
+        """
+        depth, frequency, phase = p
+        n = np.arange(1, len(self.harmonics) + 1)
+        weight = depth * np.where(n * frequency < highest, self.harmonics, 0.0)
+        angle = 2 * np.pi * n * (np.asarray(time)[:, None] * frequency - phase)
+        return np.cos(angle) @ weight, np.sin(angle) @ (-2 * np.pi * n * frequency * weight)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,4 @@
-"""What belongs to rails and wheels: wheel flat, rail joints, anti-roll bar.
-
-Wheel flat and rail joints move the support of a primary element in a way that its measured displacement does not
-show: a periodic dip w(t).  The true deflection is then d - w, which adds -(k w + c w') to the element's force.
-"""
+"""What belongs to rails and wheels: wheel flat, rail joints, anti-roll bar."""
 
 from __future__ import annotations
 
@@ -11,47 +7,27 @@ import numpy as np
 from model.diagnosis.catalogue.base import (
     ElementLaw,
     Motion,
-    Observed,
     ParameterSpec,
     SpringDamper,
+    SupportLaw,
     Values,
     Where,
     grid,
 )
 from model.signals import FloatArray
 
-_HARMONICS = np.arange(1, 9)
+_COUNT = 8  # harmonics of a dip
 
 
-def _dip(time: FloatArray, frequency: FloatArray, phase: FloatArray, width: float) -> tuple[FloatArray, FloatArray]:
-    """A dip of unit depth per period and its rate: a Gaussian of relative `width`, as its first harmonics.
+def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: str, where: Where) -> SupportLaw:
+    """A Gaussian dip of relative `width` per period, as its first harmonics.
 
     The mean is left out (it is a static deflection), the harmonics are smooth in every parameter, and what they
     omit lies above what suspensions pass on.
     """
-    angle = 2 * np.pi * (np.asarray(time) * frequency - phase)
-    value: FloatArray = np.zeros(np.shape(angle))
-    slope: FloatArray = np.zeros(np.shape(angle))
-    for n in _HARMONICS:
-        weight = -2 * np.sqrt(2 * np.pi) * width * np.exp(-0.5 * (2 * np.pi * n * width) ** 2)
-        value = value + weight * np.cos(n * angle)
-        slope = slope - weight * n * np.sin(n * angle)
-    return value, 2 * np.pi * frequency * slope
-
-
-def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: str, where: Where) -> ElementLaw:
-    def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-        depth, frequency, phase = p
-        w, rate = _dip(motion.time, frequency, phase, width)
-        return -depth * (element.stiffness * w + element.damping * rate)
-
-    def shapes(seen: Observed) -> FloatArray:
-        if not seen.lines:  # nothing periodic is left in the residual: nothing to try
-            return np.zeros((0, 3))
-        fundamentals = sorted({f / n for f in seen.lines for n in (1, 2, 3) if f / n >= 0.3})
-        return grid([0.1 * seen.deflection_rms], fundamentals, np.arange(8) / 8)
-
-    return ElementLaw(
+    n = np.arange(1, _COUNT + 1)
+    harmonics = -2 * np.sqrt(2 * np.pi) * width * np.exp(-0.5 * (2 * np.pi * n * width) ** 2)
+    return SupportLaw(
         name=name,
         title=title,
         parameters=(
@@ -59,15 +35,12 @@ def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: 
             ParameterSpec("frequency", "Hz", 0.1, 200.0, "dips per second", lambda seen: 1.0, log=True),
             ParameterSpec("phase", "1", -2.0, 2.0, "periods from the start of the laws' clock to a dip", lambda s: 0.1),
         ),
-        force=force,
-        shapes=shapes,
+        harmonics=tuple(harmonics.tolist()),
         absent=(0.0, 1.0, 0.0),
         looks_like=looks_like,
         confused_with=("external_force", "wheel_flat" if name == "rail_joints" else "rail_joints"),
         sentence=sentence,
         where=where,
-        passive=False,
-        odd=False,
     )
 
 
@@ -76,8 +49,8 @@ WHEEL_FLAT = _dip_law(
     "wheel flat",
     0.02,
     looks_like="lines at the wheel's revolutions and their harmonics, at one wheel",
-    sentence="a flat of {depth} on the wheel below, {frequency} times a second",
-    where="element",
+    sentence="a flat of {depth}, {frequency} times a second",
+    where="support",
 )
 RAIL_JOINTS = _dip_law(
     "rail_joints",
