@@ -32,9 +32,17 @@ STIFFNESS, DAMPING, MASS, RATE, FINE = 3e4, 8.0, 1.5, 400, 20
 
 
 def simulate(
-    law: Callable[[float, float], float], *, seconds: float = 20.0, level: float = 20.0, start: float = 0.0
+    law: Callable[[float, float, float], float],
+    memory: Callable[[float, float, float], float] = lambda d, v, z: 0.0,
+    *,
+    seconds: float = 20.0,
+    level: float = 20.0,
+    start: float = 0.0,
 ) -> Recorded:
-    """Columns force and position; `law(d, v)` adds a force to the spring.  Random phases up to 60 Hz, Runge-Kutta."""
+    """Columns force and position; `law(d, v, z)` adds a force to the spring, `memory(d, v, z)` is the rate of its z.
+
+    Random phases up to 60 Hz, Runge-Kutta.
+    """
     rng = np.random.default_rng(7)
     samples, step = int(seconds * RATE), 1 / (RATE * FINE)
     lines = np.zeros(samples * FINE // 2 + 1, dtype=complex)
@@ -43,20 +51,21 @@ def simulate(
     force = np.fft.irfft(lines, samples * FINE)
     force *= level / np.std(force)  # none at level 0
 
-    def slope(x: float, v: float, u: float) -> tuple[float, float]:
-        return v, (u - DAMPING * v - STIFFNESS * x - law(x, v)) / MASS
+    def slope(x: float, v: float, z: float, u: float) -> tuple[float, float, float]:
+        return v, (u - DAMPING * v - STIFFNESS * x - law(x, v, z)) / MASS, memory(x, v, z)
 
-    rows, x, v = np.empty((samples, 2)), start, 0.0
+    rows, x, v, z = np.empty((samples, 2)), start, 0.0, 0.0
     for i in range(samples * FINE):
         if i % FINE == 0:
             rows[i // FINE] = force[i], x
         u = force[i], (force[i] + force[(i + 1) % len(force)]) / 2, force[(i + 1) % len(force)]
-        a = slope(x, v, u[0])
-        b = slope(x + step / 2 * a[0], v + step / 2 * a[1], u[1])
-        c = slope(x + step / 2 * b[0], v + step / 2 * b[1], u[1])
-        d = slope(x + step * c[0], v + step * c[1], u[2])
+        a = slope(x, v, z, u[0])
+        b = slope(x + step / 2 * a[0], v + step / 2 * a[1], z + step / 2 * a[2], u[1])
+        c = slope(x + step / 2 * b[0], v + step / 2 * b[1], z + step / 2 * b[2], u[1])
+        d = slope(x + step * c[0], v + step * c[1], z + step * c[2], u[2])
         x += step / 6 * (a[0] + 2 * b[0] + 2 * c[0] + d[0])
         v += step / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
+        z += step / 6 * (a[2] + 2 * b[2] + 2 * c[2] + d[2])
     noise = np.array([1e-3 * max(level, 1.0), 1e-6])
     return Recorded(values=rows + noise * rng.standard_normal(rows.shape), sample_rate=float(RATE))
 
@@ -78,13 +87,13 @@ def signals_of(record: Recorded) -> Signals:
 
 @pytest.fixture(scope="module")
 def linear() -> Recorded:
-    return simulate(lambda d, v: 0.0, seconds=12.0)
+    return simulate(lambda d, v, z: 0.0, seconds=12.0)
 
 
 def test_values_far_from_nominal_are_found_although_the_resonance_is_narrow(linear):
     """20 % of stiffness are ten widths of the resonance: a free run from nominal sees no direction to go."""
     signals, system = signals_of(linear), parse_system(SYSTEM)
-    problem, fit = baseline(system, signals, declared_noise(system, signals), Options())
+    problem, fit = baseline(system, signals, declared_noise(system, signals), 3360)
     found = np.array([p.nominal for p in system.parameters]) * np.exp(fit.point.theta)
     deviations = (np.log(found / [STIFFNESS, DAMPING])) / np.sqrt(np.diag(fit.covariance))
     np.testing.assert_allclose(found, [STIFFNESS, DAMPING], rtol=2e-3)
@@ -111,7 +120,9 @@ def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear):
 def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
     gap, stop = 1.2e-3, 2e5
     report = diagnose(
-        parse_system(SYSTEM), simulate(lambda d, v: stop * np.sign(d) * max(abs(d) - gap, 0.0), seconds=8.0), Options()
+        parse_system(SYSTEM),
+        simulate(lambda d, v, z: stop * np.sign(d) * max(abs(d) - gap, 0.0), seconds=8.0),
+        Options(),
     )
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("spring", "bump_stop")
@@ -125,7 +136,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
 
 def test_friction_shows_in_a_free_decay_without_any_input():
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
-    record = simulate(lambda d, v: 3.0 * np.tanh(v / 5e-3), seconds=6.0, level=0.0, start=0.01)
+    record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=6.0, level=0.0, start=0.01)
     record.values[:, 0] = 0.0
     report = diagnose(parse_system(SYSTEM), record, Options())
     assert report.findings[0].location == "spring"
@@ -134,3 +145,22 @@ def test_friction_shows_in_a_free_decay_without_any_input():
     assert {f.effect for f in report.findings} == {"coulomb_friction"}
     assert any("no force" in note for note in report.advice)
     assert any("hardly moves" in note for note in report.advice)
+
+
+def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family():
+    """The loop of the Bouc-Wen benchmark (Noel and Schoukens 2016): gamma -1.375, where the common form has 0.5."""
+    alpha, beta, gamma = 2e4, 800.0, -1.375
+    report = diagnose(
+        parse_system(SYSTEM),
+        simulate(
+            lambda d, v, z: alpha * z,
+            lambda d, v, z: v - beta * (abs(v) * z + gamma * v * abs(z)),
+            seconds=12.0,
+            level=40.0,
+        ),
+        Options(),
+    )
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("spring", "bouc_wen")
+    for parameter, truth in zip(finding.parameters, (alpha, beta, 1.0, gamma), strict=True):
+        assert abs(parameter.value - truth) < max(4 * parameter.std, 0.03 * abs(truth)), parameter

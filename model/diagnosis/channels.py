@@ -32,7 +32,6 @@ class Prepared:
     signals: Signals
     stuck: tuple[tuple[str, float], ...]  # channel, s from the start of the recording at which it froze
     notes: tuple[str, ...]
-    first_sample: int  # of the stretch used, in the recording
 
 
 def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
@@ -179,8 +178,9 @@ def _by_role(
         support_names=tuple(support_names),
         force_names=tuple(force_names),
         integrated=np.array(_integrated(system, values), dtype=bool),
+        start=first / sample_rate,
     )
-    return Prepared(signals, stuck, tuple(notes), first)
+    return Prepared(signals, stuck, tuple(notes))
 
 
 def _integrated(system: System, values: FloatArray) -> list[bool]:

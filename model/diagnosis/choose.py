@@ -56,6 +56,7 @@ class Trial:
     gain: float  # twice the log-likelihood ratio against the model without it
     worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
     evidence: float  # gain less what its parameters cost
+    freedom: int  # parameters of the law, and states that it brings
     finished: bool = True
 
     @property
@@ -73,7 +74,7 @@ class Trial:
 
     def p_value(self, tests: int) -> float:
         """Chance of such a gain among so many candidates, noise levels unknown."""
-        count = max(1, len(self.term.parameters))
+        count = max(1, self.freedom)
         return float(min(1.0, tests * stats.chi2.sf(max(self.gain, 0.0), count)))
 
     def delta_bic(self) -> float:
@@ -260,7 +261,8 @@ def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit) -> Trial:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, _QUIET))
     dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
-    return Trial(hit, fit, gain, worth, gain - dear)
+    freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
+    return Trial(hit, fit, gain, worth, gain - dear, freedom)
 
 
 def preferred(trials: list[Trial]) -> list[Trial]:

@@ -11,6 +11,7 @@ import numpy as np
 from model.diagnosis.catalogue import CATALOGUE, ElementLaw, Law
 from model.diagnosis.channels import Prepared, prepare
 from model.diagnosis.choose import Trial, compete, preferred, shortlist
+from model.diagnosis.cuts import cut
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.heldout import HeldOut
 from model.diagnosis.inputs import InputFault, best_input_fault, input_faults_of
@@ -28,6 +29,7 @@ Progress = Callable[[float, str], None]
 
 # a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
 _MINOR_BESIDE, _MINOR_ELSEWHERE = 0.05, 0.002
+_MINOR_FOLLOWED = 0.01  # elsewhere, where the gain is of logarithms: a law is simulated no better than that
 _MOST_LEFT = 0.5  # or from this share of what they left of forces that nobody measured
 _ASTRAY = 1.5  # rise of the reduced chi-square from the first part to the whole recording
 
@@ -87,6 +89,11 @@ class Course:
     final: Fit | None = None  # the same model on the whole recording
 
     @property
+    def split(self) -> int:
+        """How many samples were fitted."""
+        return self.problem.part.grid.samples
+
+    @property
     def reported(self) -> Fit:
         """The fit whose values the report gives."""
         return self.final or self.fit
@@ -114,10 +121,10 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     """Baseline, then finding after finding until the rest is noise."""
     tell(0.02, "channels and noise")
     prepared = prepare(system, record.values, record.sample_rate)
-    signals = prepared.signals.part(0, fast_length(prepared.signals.samples))
+    signals, split = cut(prepared.signals, options.train_share)
     declared = declared_noise(system, signals)
     tell(0.05, "nominal structure identified again")
-    problem, base = baseline(system, signals, declared, options)
+    problem, base = baseline(system, signals, declared, split)
     tell(0.2, "screening all laws at all places")
     screening = screen(problem, base, options.catalogue, options.project)
     course = Course(
@@ -134,8 +141,7 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
         screening,
     )
     _mend_inputs(course, declared, tell)
-    split = course.problem.part.grid.samples
-    course.held = HeldOut(system, course.signals, course.problem.noise, split)
+    course.held = HeldOut(system, course.signals, course.problem.noise, course.split)
     if course.held.still:
         course.notes.append("the last part of the recording hardly moves: findings could not be checked on it")
     for number in range(options.most_findings):
@@ -155,9 +161,8 @@ def _on_everything(course: Course) -> Fit:
     return fit if fit is not None and fit.reduced < _ASTRAY * course.fit.reduced else course.fit
 
 
-def baseline(system: System, signals: Signals, declared: Noise, options: Options) -> tuple[Problem, Fit]:
-    """The nominal structure on the first part, with noise levels estimated on the way."""
-    split = fast_length(round(options.train_share * signals.samples))
+def baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
+    """The nominal structure on the first `split` samples, with noise levels estimated on the way."""
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, rated=drifting(system, signals.sensor_index))
@@ -173,18 +178,6 @@ def baseline(system: System, signals: Signals, declared: Noise, options: Options
     return refreshed(problem, fit)
 
 
-def fast_length(samples: int) -> int:
-    """The longest length up to `samples` that transforms quickly: no prime factor above 7."""
-    for length in range(samples, samples // 2, -1):
-        rest = length
-        for prime in (2, 3, 5, 7):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return length
-    return samples
-
-
 def _mend_inputs(course: Course, declared: Noise, tell: Progress) -> None:
     """Faults of input channels come first: everything else is simulated from the inputs."""
     options = course.options
@@ -198,7 +191,7 @@ def _mend_inputs(course: Course, declared: Noise, tell: Progress) -> None:
             return
         course.input_faults.append(fault)
         course.signals = signals
-        course.problem, course.base = baseline(course.system, signals, declared, options)
+        course.problem, course.base = baseline(course.system, signals, declared, course.split)
         course.fit, course.noise = course.base, course.problem.noise
         course.last = screen(course.problem, course.base, options.catalogue, options.project)
         course.first = course.last
@@ -255,7 +248,8 @@ def _minor(course: Course, trial: Trial) -> bool:
     """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
     for index, found in enumerate(course.found):
         if found.trial.term.location != trial.term.location:
-            if trial.gain < _MINOR_ELSEWHERE * found.trial.gain:
+            least = _MINOR_FOLLOWED if course.problem.follows else _MINOR_ELSEWHERE
+            if trial.gain < least * found.trial.gain:
                 return True
         elif not trial.named:
             return True

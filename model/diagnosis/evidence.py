@@ -29,7 +29,7 @@ def evidence_arrays(
 ) -> dict[str, NDArray[Any]]:
     """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
     rate = course.signals.sample_rate
-    start = course.held.split + course.prepared.first_sample
+    start = course.held.split + round(course.signals.start * rate)
     arrays: dict[str, NDArray[Any]] = {
         "validation.time": (start + np.arange(len(before.measured))) / rate,
         "validation.measured": before.measured,

@@ -14,7 +14,7 @@ from model.diagnosis.loop import LawForces, near_of
 from model.diagnosis.march import march_forces
 from model.diagnosis.measured import Noise, Part, Signals, drifting, rate_of, transform
 from model.diagnosis.point import Point
-from model.diagnosis.spectra import ComplexArray, Grid
+from model.diagnosis.spectra import ComplexArray
 from model.diagnosis.whiten import Whitener
 from model.signals import FloatArray
 from model.system import System
@@ -62,10 +62,10 @@ class HeldOut:
     def __init__(self, system: System, signals: Signals, noise: Noise, split: int) -> None:
         self.system, self.signals, self.noise, self.split = system, signals, noise, split
         self.whole = transform(signals, noise)
-        self.grid = Grid(signals.samples - split, 1 / signals.sample_rate, split / signals.sample_rate)
         self.whitener: Whitener | None = None
         self.rated = drifting(system, signals.sensor_index)
         self.later = transform(signals.part(split, signals.samples), noise, rated=self.rated)
+        self.grid = self.later.grid
 
     @cached_property
     def tracked(self) -> Part:

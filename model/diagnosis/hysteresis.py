@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
 
 from model.diagnosis.catalogue import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
+from model.diagnosis.catalogue.memory import GAMMA
 from model.diagnosis.catalogue.trajectory import along
 from model.signals import FloatArray
 
-_ROOT3 = math.sqrt(3.0)
+_FAR, _BLOWS = 60.0, 1.5  # ends of the growing functions
 
 
 def force_along(
@@ -27,21 +29,20 @@ def force_along(
     if law.memory == 0:
         return np.asarray(law.force(Motion(deflection, rate, time + CLOCK_LEAD), parameters, element))
     if law.name == "bouc_wen":
-        alpha, beta, exponent = parameters
-        return alpha * bouc_wen_memory(deflection, beta, exponent)
+        alpha, beta, exponent, *gamma = parameters
+        return alpha * bouc_wen_memory(deflection, beta, exponent, *gamma)
     step = time[1] - time[0]
     return along(law, parameters, deflection, rate, sample_rate=1 / step, element=element, start=time[0] + CLOCK_LEAD)
 
 
-def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float) -> FloatArray:
+def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma: float = GAMMA) -> FloatArray:
     """z of the Bouc-Wen law along a deflection (T,), from z = 0; rate independent.
 
-    Between two reversals of the motion, with x the way travelled and u = z / z_max in the direction of travel,
-    z_max^n = 1 / (1.5 beta):  dx = z_max du / (1 - u^n) for u > 0 and z_max du / (1 + |u|^n / 3) for u < 0.
-    So one function of u, X(u), and its inverse carry z from any reversal to the next.
+    Between two reversals of the motion, with x the way travelled and u = z in the direction of travel,
+    dx = du / (1 - a u^n) for u > 0, a = beta (1 + gamma), and du / (1 + b |u|^n) for u < 0, b = beta (1 - gamma).
+    So one function of u, the way X(u), and its inverse carry z from any reversal to the next.
     """
-    limit = (1 / (1.5 * beta)) ** (1 / exponent)
-    way, back = _travel(exponent)
+    loop = _Loop(_Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent))
     steps = np.diff(deflection)
     direction = np.sign(steps)
     direction[direction == 0] = 1.0
@@ -49,48 +50,67 @@ def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float) -> Flo
     starts = np.concatenate([[0], turns])  # first step of every monotone stretch
     ends = np.concatenate([turns, [len(steps)]])
     signs = direction[starts]
-    travelled = np.abs(deflection[ends] - deflection[starts]) / limit
+    travelled = np.abs(deflection[ends] - deflection[starts])
     begin = np.empty(len(starts))
     u = 0.0
     for i in range(len(starts)):
-        begin[i] = way(signs[i] * u)
-        u = signs[i] * back(begin[i] + travelled[i])
+        begin[i] = loop.way(signs[i] * u)
+        u = signs[i] * loop.back(begin[i] + travelled[i])
     stretch = np.repeat(np.arange(len(starts)), ends - starts)
-    position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch]) / limit
+    position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch])
     z = np.zeros_like(deflection)
-    z[1:] = signs[stretch] * _inverse(position, exponent) * limit
+    z[1:] = signs[stretch] * np.where(position > 0, loop.ahead(position), -loop.behind(-position))
     return z
 
 
-def _travel(exponent: float):
-    """X(u) and its inverse as functions of one float."""
+class _Side:
+    """The way X(u) = integral du / (1 - a u^n) for u >= 0 and its inverse: of one float, and of arrays.
+
+    In units of |a|^(-1/n) it is one of two functions of n: towards saturation for a > 0, growing for a < 0.
+    """
+
+    def __init__(self, a: float, exponent: float) -> None:
+        self.unit = max(abs(a), 1e-12) ** (-1 / exponent)
+        self.way, self.back, self.array = _functions(exponent, a > 0)
+
+
+class _Loop:
+    """Both sides of u = 0: ahead, where z resists the motion, and behind, where it helps."""
+
+    def __init__(self, forth: _Side, back: _Side) -> None:
+        self.forth, self.rest = forth, back
+
+    def way(self, u: float) -> float:
+        side = self.forth if u > 0 else self.rest
+        return math.copysign(side.unit * side.way(abs(u) / side.unit), u)
+
+    def back(self, x: float) -> float:
+        side = self.forth if x > 0 else self.rest
+        return math.copysign(side.unit * side.back(abs(x) / side.unit), x)
+
+    def ahead(self, x: FloatArray) -> FloatArray:
+        return self.forth.unit * self.forth.array(np.maximum(x, 0) / self.forth.unit)
+
+    def behind(self, x: FloatArray) -> FloatArray:
+        return self.rest.unit * self.rest.array(np.maximum(x, 0) / self.rest.unit)
+
+
+@lru_cache(maxsize=64)
+def _functions(
+    exponent: float, saturates: bool
+) -> tuple[Callable[[float], float], Callable[[float], float], Callable[[FloatArray], FloatArray]]:
+    """X(u), its inverse, and that of arrays, for dX = du / (1 - u^n) or du / (1 + u^n), u >= 0."""
+    if exponent == 1.0 and saturates:
+        return lambda u: -math.log(max(1 - u, 1e-12)), lambda x: -math.expm1(-x), lambda x: -np.expm1(-x)
     if exponent == 1.0:
-
-        def way(u: float) -> float:
-            return -math.log(max(1 - u, 1e-12)) if u > 0 else -3 * math.log1p(-u / 3)
-
-        def back(x: float) -> float:
-            return -math.expm1(-x) if x > 0 else -3 * math.expm1(-x / 3)
-
-        return way, back
+        return math.log1p, lambda x: math.expm1(min(x, _FAR)), lambda x: np.expm1(np.minimum(x, _FAR))
+    if exponent == 2.0 and saturates:
+        return lambda u: math.atanh(min(u, 1 - 1e-15)), math.tanh, np.tanh
     if exponent == 2.0:
-
-        def square_way(u: float) -> float:
-            return math.atanh(min(u, 1 - 1e-15)) if u > 0 else _ROOT3 * math.atan(u / _ROOT3)
-
-        def square_back(x: float) -> float:
-            return math.tanh(x) if x > 0 else _ROOT3 * math.tan(max(x / _ROOT3, -1.5))
-
-        return square_way, square_back
-    u, x = (list(column) for column in _table(exponent))
-
-    def tabled_way(value: float) -> float:
-        return _between(value, u, x)
-
-    def tabled_back(value: float) -> float:
-        return _between(value, x, u)
-
-    return tabled_way, tabled_back
+        return math.atan, lambda x: math.tan(min(x, _BLOWS)), lambda x: np.tan(np.minimum(x, _BLOWS))
+    u, way = _table(exponent, saturates)
+    us, ways = u.tolist(), way.tolist()
+    return lambda v: _between(v, us, ways), lambda x: _between(x, ways, us), lambda x: np.interp(x, way, u)
 
 
 def _between(value: float, x: list[float], y: list[float]) -> float:
@@ -100,25 +120,12 @@ def _between(value: float, x: list[float], y: list[float]) -> float:
     return y[i - 1] + min(max(share, 0.0), 1.0) * (y[i] - y[i - 1])
 
 
-def _inverse(x: FloatArray, exponent: float) -> FloatArray:
-    if exponent == 1.0:
-        return np.where(x > 0, -np.expm1(-np.maximum(x, 0)), -3 * np.expm1(-np.minimum(x, 0) / 3))
-    if exponent == 2.0:
-        return np.where(x > 0, np.tanh(x), _ROOT3 * np.tan(np.clip(x / _ROOT3, -1.5, 0)))
-    u, table = _table(exponent)
-    return np.interp(x, table, u)
-
-
-@lru_cache(maxsize=8)
-def _table(exponent: float) -> tuple[FloatArray, FloatArray]:
+def _table(exponent: float, saturates: bool) -> tuple[FloatArray, FloatArray]:
     """X(u) on a fine grid, by the trapezoidal rule in a variable that resolves the approach to u = 1."""
-    approach = -np.expm1(-np.linspace(0, 25, 6000))
-    rising = _cumulative(approach, 1 / np.maximum(1 - approach**exponent, 1e-14))
-    falling_u = np.linspace(0, 1, 2000)
-    falling = _cumulative(falling_u, 1 / (1 + falling_u**exponent / 3))
-    u = np.concatenate([-falling_u[:0:-1], approach])
-    return u, np.concatenate([-falling[:0:-1], rising])
-
-
-def _cumulative(x: FloatArray, y: FloatArray) -> FloatArray:
-    return np.concatenate([[0.0], np.cumsum(np.diff(x) * (y[1:] + y[:-1]) / 2)])
+    if saturates:
+        u = -np.expm1(-np.linspace(0, 25, 6000))
+        slope = 1 / np.maximum(1 - u**exponent, 1e-14)
+    else:
+        u = np.concatenate([np.linspace(0, 3, 3000), np.geomspace(3, 1e3, 1000)[1:]])
+        slope = 1 / (1 + u**exponent)
+    return u, np.concatenate([[0.0], np.cumsum(np.diff(u) * (slope[1:] + slope[:-1]) / 2)])

@@ -51,7 +51,7 @@ def input_faults_of(course: Course, hit: Hit, declared: Noise) -> tuple[InputFau
         value = term.parameters[0]
         for _ in range(_ROUNDS):
             signals = mended(course.signals, term.at(np.array([value])))
-            problem, fit = baseline(course.system, signals, declared, course.options)
+            problem, fit = baseline(course.system, signals, declared, course.split)
             rest = screen(problem, fit, (term.law,), course.options.project)
             again = next((h for h in rest.hits if h.term.key == term.key), None)
             if again is None or again.score < 0.01:

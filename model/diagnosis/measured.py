@@ -41,6 +41,7 @@ class Signals:
     support_names: tuple[str, ...]
     force_names: tuple[str, ...]
     integrated: np.ndarray  # supports whose displacement is only the integral of the velocity, (supports,)
+    start: float = 0.0  # s, time of the first sample since the start of the recording
 
     @property
     def samples(self) -> int:
@@ -54,6 +55,7 @@ class Signals:
             velocity=self.velocity[start:stop],
             force=self.force[start:stop],
             sensors=self.sensors[start:stop],
+            start=self.start + start / self.sample_rate,
         )
 
 
@@ -154,12 +156,12 @@ def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
     return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
 
 
-def transform(signals: Signals, noise: Noise, start: float = 0.0, rated: np.ndarray | None = None) -> Part:
-    """Spectra of a part; `start` is its first sample's time since the start of the recording, s.
+def transform(signals: Signals, noise: Noise, rated: np.ndarray | None = None) -> Part:
+    """Spectra of a part.
 
     `rated`: sensors whose series are compared by their rates (`drifting`), (S,).
     """
-    grid = Grid(signals.samples, 1 / signals.sample_rate, start)
+    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start)
     rated = np.zeros(signals.sensors.shape[1], dtype=bool) if rated is None else rated
     sensors = signals.sensors
     if rated.any():

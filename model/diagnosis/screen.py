@@ -202,7 +202,9 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
     system = projector.problem.system
     d_all, v_all = projector.fit.element_motion
     channels: dict[str, Channel] = {}
-    candidates = [(law, at) for law in laws if isinstance(law, ElementLaw) for at in places(system, law)]
+    asked = [law for law in laws if isinstance(law, ElementLaw)]
+    asked += [law.wider for law in asked if law.wider is not None]
+    candidates = [(law, at) for law in asked for at in places(system, law)]
     for law, location in candidates:
         if location not in channels:
             port = Term(law, location, law.absent).port(system)

@@ -130,6 +130,7 @@ class ElementLaw:
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
     passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
     odd: bool = True  # force(-d, -v) = -force(d, v)
+    wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from model.diagnosis.catalogue.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from model.signals import FloatArray
 
+GAMMA = (
+    0.5  # of the Bouc-Wen law as it is commonly written: z' = v - beta abs(v) abs(z)^(n-1) z - gamma beta v abs(z)^n
+)
 # Corner frequencies, Hz, at which a branch with a spring and a damper in series is sought
 _CORNERS = np.array([0.5, 1.2, 3.0, 6.0, 10.0, 16.0, 25.0, 40.0, 70.0])
 
@@ -97,17 +102,18 @@ AIR_SPRING = ElementLaw(
 
 
 def _bouc_wen_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-    alpha, _, _ = p
+    alpha = p[0]
     (z,) = motion.memory
     return alpha * z
 
 
 def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-    _, beta, n = p
+    _, beta, n, *further = p
+    gamma = further[0] if further else GAMMA
     (z,) = motion.memory
     v, size = motion.rate, np.abs(z)
     level = beta * size**n
-    return (v - level * (np.abs(v) * np.sign(z) + 0.5 * v))[None]
+    return (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
 
 
 def _bouc_wen_shapes(seen: Observed) -> FloatArray:
@@ -118,7 +124,12 @@ def _bouc_wen_shapes(seen: Observed) -> FloatArray:
     return trials
 
 
-BOUC_WEN = ElementLaw(
+def _free_shapes(seen: Observed) -> FloatArray:
+    yields = max(seen.deflection_rms, 1e-12) * np.array([0.03, 0.1, 0.3, 1.0])
+    return grid([0.2 * seen.stiffness], 1 / (1.5 * yields), [1.0], [-1.4, -0.7, 0.0, 1.5])
+
+
+_BOUC_WEN = ElementLaw(
     name="bouc_wen",
     title="hysteresis (Bouc-Wen)",
     parameters=(
@@ -136,4 +147,16 @@ BOUC_WEN = ElementLaw(
     sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n})",
     memory=1,
     memory_rate=_bouc_wen_rate,
+)
+# The loop's shape free: gamma below -1 stiffens while it is loaded, above 1 it hardly yields while it is unloaded
+_FREE = ParameterSpec("gamma", "1", -4.0, 4.0, "in z' = v - beta (abs(v) z + gamma v abs(z))", lambda seen: GAMMA)
+BOUC_WEN = replace(
+    _BOUC_WEN,
+    wider=replace(
+        _BOUC_WEN,
+        parameters=(*_BOUC_WEN.parameters, _FREE),
+        shapes=_free_shapes,
+        absent=(*_BOUC_WEN.absent, GAMMA),
+        sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
+    ),
 )
