@@ -7,7 +7,7 @@ from scipy.signal import resample
 
 from model.diagnosis.catalogue import find_law
 from model.diagnosis.channels import prepare
-from model.diagnosis.diagnose import Options, baseline, refreshed
+from model.diagnosis.diagnose import baseline, refreshed
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.measured import declared_noise, drifting, rate_of
 from model.diagnosis.point import Point
@@ -61,7 +61,7 @@ def fitted() -> tuple[System, Problem, Fit]:
     """The axis with friction and offset in place, noise estimated."""
     system = parse_system(SLIDE)
     signals = prepare(system, positioning_axis().values, 200.0).signals
-    problem, base = baseline(system, signals, declared_noise(system, signals), Options())
+    problem, base = baseline(system, signals, declared_noise(system, signals), 2800)
     friction = Term(find_law("coulomb_friction"), "guide", (10.0, 0.005), scales=(10.0, 0.005))
     offset = Term(find_law("sensor_bias"), "motor", (0.0,), scales=(1.0,))
     fit = problem.fit(Point(base.point.theta, (friction, offset), base.point.state))

@@ -6,8 +6,6 @@ on a rail joint for one, is not continued truly and leaves a mark in the first a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
@@ -24,20 +22,20 @@ def cut(signals: Signals, share: float) -> tuple[Signals, int]:
     samples = signals.samples
     reach = int(min(_REACH_SECONDS * signals.sample_rate, _REACH_SHARE * samples))
     loud = _loudness(signals)
-    start = int(np.argmin(loud[: reach + 1]))
-    stop = _quietest(loud, start, range(samples - reach, samples + 1))
+    first, last = range(reach + 1), range(samples - reach, samples + 1)
+    start, stop = _quietest(loud, [(a, b) for a in first for b in last])
     meant = start + round(share * (stop - start))
-    split = _quietest(loud, start, range(meant - reach, meant + reach + 1))
+    _, split = _quietest(loud, [(start, b) for b in range(meant - reach, meant + reach + 1)])
     return signals.part(start, stop), split - start
 
 
-def _quietest(loud: FloatArray, start: int, ends: Iterable[int]) -> int:
-    """The quietest of the ends that make a quick length from `start`; where none does, the longest quick one below."""
-    ends = list(ends)
-    quick = [end for end in ends if _is_quick(end - start)]
+def _quietest(loud: FloatArray, stretches: list[tuple[int, int]]) -> tuple[int, int]:
+    """The stretch of samples with the quietest ends among those of quick length; if there is none, the first, cut."""
+    quick = [(a, b) for a, b in stretches if _is_quick(b - a)]
     if not quick:
-        return next(end for end in range(min(ends), start, -1) if _is_quick(end - start))
-    return min(quick, key=lambda end: float(loud[end - 1]))
+        start, stop = stretches[0]
+        return next((start, b) for b in range(stop, start, -1) if _is_quick(b - start))
+    return min(quick, key=lambda ends: float(loud[ends[0]] + loud[ends[1] - 1]))
 
 
 def _loudness(signals: Signals) -> FloatArray:
