@@ -26,7 +26,7 @@ from model.diagnosis.forward import BOTH
 from model.diagnosis.noise import refreshed
 from model.diagnosis.point import Point, advance
 from model.diagnosis.screen import Hit, Screening
-from model.diagnosis.terms import Term, is_waveform
+from model.diagnosis.terms import WIDER, Term, is_waveform
 from model.diagnosis.unknown import SMALL, UNKNOWN
 from model.signals import FloatArray
 
@@ -312,7 +312,7 @@ def _unusual(term: Term) -> float:
 
 
 def _prior_cost(hit: Hit) -> float:
-    if hit.term.variant == BOTH or hit.effect in _RARE:
+    if hit.term.variant in (BOTH, WIDER) or hit.effect in _RARE:
         return _UNNAMED_COST
     if hit.family != "unnamed":
         return 0.0

@@ -25,7 +25,7 @@ from model.diagnosis.hysteresis import force_along
 from model.diagnosis.loop import LawForces, near_of
 from model.diagnosis.measured import Noise, Part
 from model.diagnosis.motions import Motions
-from model.diagnosis.point import Point, advance
+from model.diagnosis.point import Point, advance, held_back
 from model.diagnosis.preload import preloaded
 from model.diagnosis.sensitivities import Linearisation, linearise
 from model.diagnosis.smoothing import Smoothed, scale_of, smooth
@@ -244,6 +244,11 @@ def _step(lin: Linearisation, point: Point, damping: float) -> tuple[FloatArray,
     scaled[np.diag_indices_from(scaled)] += damping + 1e-13
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
     step = scale * (inverse @ (gradient * scale))
+    held = held_back(point, step)
+    if held.any():  # the others go on as if it were given
+        scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
+        inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+        step = scale * (inverse @ (gradient * scale))
     free = len(normal) - len(point.state)
     sigma = (scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300)))[:free]
     return step, sigma

@@ -29,3 +29,14 @@ def advance(point: Point, step: FloatArray) -> Point:
         terms.append(term.advanced(step[at : at + count]))
         at += count
     return Point(theta, tuple(terms), point.state + step[at:], point.near)
+
+
+def held_back(point: Point, step: FloatArray) -> np.ndarray:
+    """Which entries of a step would take a law's parameter over a bound that it stands at, as the step."""
+    held = np.zeros(len(step), dtype=bool)
+    at = len(point.theta)
+    for term in point.terms:
+        here = slice(at, at + len(term.parameters))
+        held[here] = term.held_back(step[here])
+        at = here.stop
+    return held

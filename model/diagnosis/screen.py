@@ -9,7 +9,7 @@ candidate is absent (Rao's score test), whatever the parameters have absorbed.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -21,7 +21,7 @@ from model.diagnosis.catalogue import ElementLaw, Law, Observed, SpringDamper, f
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.hysteresis import force_along
 from model.diagnosis.spectra import OVERSAMPLING, ComplexArray
-from model.diagnosis.terms import Term, branch_of, is_waveform
+from model.diagnosis.terms import WIDER, Term, branch_of, is_waveform
 from model.diagnosis.unknown import static_law, trials
 from model.signals import FloatArray
 from model.system import System
@@ -202,16 +202,17 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
     system = projector.problem.system
     d_all, v_all = projector.fit.element_motion
     channels: dict[str, Channel] = {}
-    asked = [law for law in laws if isinstance(law, ElementLaw)]
-    asked += [law.wider for law in asked if law.wider is not None]
-    candidates = [(law, at) for law in asked for at in places(system, law)]
-    for law, location in candidates:
+    asked = [(law, "") for law in laws if isinstance(law, ElementLaw)]
+    asked += [(law.wider, WIDER) for law, _ in asked if law.wider is not None]
+    candidates = [Term(law, at, law.absent, variant) for law, variant in asked for at in places(system, law)]
+    for absent in candidates:
+        location = absent.location
         if location not in channels:
-            port = Term(law, location, law.absent).port(system)
+            port = absent.port(system)
             channels[location] = Channel(projector, projector.of_force[:, :, : len(port)] @ port)
 
-    def best(candidate: tuple[ElementLaw, str]) -> tuple[Hit, int]:
-        return _best_shape(projector, *candidate, d_all, v_all, channels[candidate[1]])
+    def best(absent: Term) -> tuple[Hit, int]:
+        return _best_shape(projector, absent, d_all, v_all, channels[absent.location])
 
     yield from share(best, candidates, WORKERS)
     for index, location in enumerate(system.elements):
@@ -248,23 +249,20 @@ def level_pairs(system: System, names: list[str]) -> list[tuple[str, str]]:
 
 
 def _best_shape(
-    projector: Projector,
-    law: ElementLaw,
-    location: str,
-    d_all: FloatArray,
-    v_all: FloatArray,
-    channel: Channel,
+    projector: Projector, nothing: Term, d_all: FloatArray, v_all: FloatArray, channel: Channel
 ) -> tuple[Hit, int]:
-    grid = projector.grid
-    port = Term(law, location, law.absent).port(projector.problem.system)
+    grid, law = projector.grid, nothing.law
+    assert isinstance(law, ElementLaw)
+    port = nothing.port(projector.problem.system)
     d, v = d_all @ port, v_all @ port
-    seen, element = _seen(projector, location, d, v)
+    seen, element = _seen(projector, nothing.location, d, v)
     scales = tuple(max(abs(q.typical(seen)), 1e-12) for q in law.parameters)
     trials = law.shapes(seen)
-    absent = Hit(Term(law, location, law.absent, scales=scales), 0.0, 1, "law", 1.0)
+    nothing = replace(nothing, scales=scales)
+    absent = Hit(nothing, 0.0, 1, "law", 1.0)
     if not len(trials):
         return absent, 0
-    terms = [Term(law, location, tuple(float(value) for value in trial), scales=scales) for trial in trials]
+    terms = [nothing.at(trial) for trial in trials]
     spectra = np.array([_force_spectrum(projector, term, d, v, element)[grid.band] for term in terms])
     scores, amplitudes = channel.scores(spectra)
     fine = np.array([_admissible(law, t, a) for t, a in zip(trials, amplitudes, strict=True)])
@@ -274,7 +272,7 @@ def _best_shape(
         return absent, len(trials)
     asked = law.scaled(list(trials[i]), float(amplitudes[i]))
     found = law.clip(list(asked))
-    term = Term(law, location, tuple(float(value) for value in found), scales=scales)
+    term = nothing.at(found)
     beyond = 1.0
     if law.strength is not None and found[law.strength] != law.absent[law.strength]:
         absent_value = law.absent[law.strength]

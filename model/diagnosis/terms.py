@@ -11,6 +11,8 @@ from model.diagnosis.plant import Branch
 from model.signals import FloatArray
 from model.system import System
 
+WIDER = "wider"  # variant of an element law: with more parameters than it has as a rule
+
 
 @dataclass(frozen=True)
 class Term:
@@ -40,6 +42,11 @@ class Term:
             new = value * np.exp(np.clip(change, -1.0, 1.0)) if spec.log else value + change
             values.append(float(min(max(new, spec.low), spec.high)))
         return replace(self, parameters=tuple(values))
+
+    def held_back(self, step: FloatArray) -> list[bool]:
+        """Which parameters stand at a bound that a step would take them over."""
+        triples = zip(self.law.parameters, self.parameters, step, strict=True)
+        return [(v <= spec.low and s < 0) or (v >= spec.high and s > 0) for spec, v, s in triples]
 
     @property
     def slopes(self) -> FloatArray:
