@@ -129,8 +129,7 @@ def compete(
         tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
         return max(tried, key=lambda t: t.evidence, default=None)
 
-    trials = [t for t in share(begin, hits, WORKERS) if t is not None]
-    trials.sort(key=lambda t: -t.evidence)
+    trials = _graded(problem, base, [t for t in share(begin, hits, WORKERS) if t is not None])
     if not trials:
         return []
     best = trials[0].evidence
@@ -141,9 +140,16 @@ def compete(
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
-    finished = [*share(lambda trial: _finished(problem, base, trial), leading, WORKERS), *behind]
-    finished.sort(key=lambda t: -t.evidence)
-    return finished
+    return _graded(problem, base, [*share(lambda trial: _finished(problem, base, trial), leading, WORKERS), *behind])
+
+
+def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
+    least = min((t.fit.reduced for t in trials), default=1.0)
+    if least < _QUIET and not problem.follows:
+        again = [_judged(problem, base, t.hit, t.fit, _QUIET * least) for t in trials]
+        trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
+    return sorted(trials, key=lambda t: -t.evidence)
 
 
 def start_of(base: Fit, hit: Hit) -> Point:
@@ -252,14 +258,14 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     return _judged(problem, base, trial.hit, fit)
 
 
-def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit) -> Trial:
+def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit, quiet: float = _QUIET) -> Trial:
     sensors = len(problem.sensors)
     if problem.follows:  # how noisy the forces are is what candidates differ in
         gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
         worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
     else:
         worth = base.chi_square - fit.chi_square
-        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, _QUIET))
+        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet))
     dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
     freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(hit, fit, gain, worth, gain - dear, freedom)

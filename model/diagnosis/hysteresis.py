@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -59,7 +60,7 @@ def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma:
     stretch = np.repeat(np.arange(len(starts)), ends - starts)
     position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch])
     z = np.zeros_like(deflection)
-    z[1:] = signs[stretch] * np.where(position > 0, loop.ahead(position), -loop.behind(-position))
+    z[1:] = signs[stretch] * loop.along(position)
     return z
 
 
@@ -71,28 +72,33 @@ class _Side:
 
     def __init__(self, a: float, exponent: float) -> None:
         self.unit = max(abs(a), 1e-12) ** (-1 / exponent)
-        self.way, self.back, self.array = _functions(exponent, a > 0)
-
-
-class _Loop:
-    """Both sides of u = 0: ahead, where z resists the motion, and behind, where it helps."""
-
-    def __init__(self, forth: _Side, back: _Side) -> None:
-        self.forth, self.rest = forth, back
+        self._way, self._back, self._along = _functions(exponent, a > 0)
 
     def way(self, u: float) -> float:
-        side = self.forth if u > 0 else self.rest
-        return math.copysign(side.unit * side.way(abs(u) / side.unit), u)
+        return self.unit * self._way(u / self.unit)
 
     def back(self, x: float) -> float:
-        side = self.forth if x > 0 else self.rest
-        return math.copysign(side.unit * side.back(abs(x) / side.unit), x)
+        return self.unit * self._back(x / self.unit)
 
-    def ahead(self, x: FloatArray) -> FloatArray:
-        return self.forth.unit * self.forth.array(np.maximum(x, 0) / self.forth.unit)
+    def along(self, x: FloatArray) -> FloatArray:
+        return self.unit * self._along(np.maximum(x, 0) / self.unit)
 
-    def behind(self, x: FloatArray) -> FloatArray:
-        return self.rest.unit * self.rest.array(np.maximum(x, 0) / self.rest.unit)
+
+@dataclass(frozen=True)
+class _Loop:
+    """Both sides of u = 0."""
+
+    ahead: _Side  # z resists the motion
+    behind: _Side  # z helps it
+
+    def way(self, u: float) -> float:
+        return self.ahead.way(u) if u > 0 else -self.behind.way(-u)
+
+    def back(self, x: float) -> float:
+        return self.ahead.back(x) if x > 0 else -self.behind.back(-x)
+
+    def along(self, x: FloatArray) -> FloatArray:
+        return np.where(x > 0, self.ahead.along(x), -self.behind.along(-x))
 
 
 @lru_cache(maxsize=64)
