@@ -157,7 +157,9 @@ def test_the_drawing_stacks_the_car_on_the_bogies_on_the_wheels() -> None:
     assert level["bogie1"] == level["bogie2"] == 1
 
 
-@pytest.mark.parametrize("place", ["secondary_1r", "car", "bogie1_2r", "wheel_21l.velocity", "nowhere"])
+@pytest.mark.parametrize(
+    "place", ["secondary_1r", "car", "bogie1_2r", "wheel_21l.velocity", "wheel_21l|wheel_21r", "nowhere"]
+)
 def test_the_drawing_calls_out_what_was_located_wherever_it_is(place: str) -> None:
     figure = draw_system(SYSTEM, {place: "some words"}, {})
     said = any("some words" in text.get_text() for text in figure.axes[0].texts)

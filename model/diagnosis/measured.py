@@ -11,6 +11,7 @@ and the faults of the input channels.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 
@@ -22,7 +23,8 @@ from model.signals import FloatArray
 from model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
-_LEAST = 0.2  # of a sensor's declared noise
+_LEAST = 0.2  # of a sensor's declared noise, or of what its fastest changes leave room for
+_ORDER = 8  # of the differences that tell those
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 
@@ -127,7 +129,14 @@ def declared_noise(system: System, signals: Signals) -> Noise:
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
     levels = np.array(sensors)
-    return Noise(np.array(displacement), np.array(velocity), np.array(force), levels, _LEAST * levels)
+    least = _LEAST * np.minimum(levels, _roughness(signals.sensors))
+    return Noise(np.array(displacement), np.array(velocity), np.array(force), levels, least)
+
+
+def _roughness(series: FloatArray) -> FloatArray:
+    """The strongest white noise that series (T, m) can hold, (m,): that of their differences of high order."""
+    differences = np.diff(series, _ORDER, axis=0)
+    return np.asarray(np.std(differences, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER)))
 
 
 def _size(series: FloatArray) -> float:

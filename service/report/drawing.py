@@ -200,7 +200,7 @@ def _draw_parts(
 ) -> dict[str, Point]:
     file, places = layout.system.file, dict[str, Point]()
     best = max((scores.get(name, 0.0) for name in file.elements), default=0.0)
-    owners = {place.split(".")[0] for place in findings}
+    owners = {owner for place in findings for owner in _owners(place)}
     for name in sorted(file.bodies, key=lambda n: layout.level[n]):
         found = name in owners
         _body(axes, layout, name, "#f6c9cd" if found else BODY, ink.HIGHLIGHT if found else LINE)
@@ -220,6 +220,11 @@ def _draw_parts(
         places[name] = _sensor(axes, layout, name, ink.HIGHLIGHT if found else "#3a86c8", 11 if found else 6)
     _ground(axes, layout)
     return places
+
+
+def _owners(place: str) -> list[str]:
+    """What is drawn of a located place: an input for one of its channels, both of a pair."""
+    return [part.split(".")[0] for part in place.split("|")]
 
 
 def _ground(axes: Axes, layout: Layout) -> None:
@@ -244,7 +249,7 @@ def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings:
     """Words above the vehicle in the order of their places, so that no arrows cross; several in staggered rows."""
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()
-    found = {name: places.get(name) or places.get(name.split(".")[0]) for name in findings}
+    found = {name: places.get(name) or places.get(_owners(name)[0]) for name in findings}
     known = sorted((place, name) for name, place in found.items() if place is not None)
     levels = 1 if len(known) <= 2 else 2 if len(known) <= 4 else 3
     axes.set_ylim(low, high + 1.5 * (levels - 1))
@@ -257,7 +262,7 @@ def _call_out(axes: Axes, layout: Layout, places: Mapping[str, Point], findings:
         beside = (place[0] + 1.1, place[1]) if layout.slant == 0 else (x, y)
         words = "\n".join(textwrap.wrap(findings[name], 44 if len(known) <= 2 else 26)[:3])
         axes.annotate(
-            f"{name}\n{words}",
+            f"{name.replace('|', ', ')}\n{words}",
             xy=place,
             xytext=beside,
             fontsize=10 if len(known) <= 2 else 8.5,
