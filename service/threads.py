@@ -1,8 +1,9 @@
-"""How many threads numerics libraries may start.  Imports nothing numerical: it must come before they do."""
+"""How numerics share the machine's threads.  Imports nothing numerical: it must come before they do."""
 
 from __future__ import annotations
 
 import os
+import sys
 
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -16,3 +17,12 @@ def one_thread_each() -> None:
     """
     for name in VARIABLES:
         os.environ.setdefault(name, "1")
+
+
+def hand_over_often() -> None:
+    """Let threads of small array operations take turns every 0.2 ms instead of every 5 ms.
+
+    Each of them gives the interpreter's lock up for a fraction of a millisecond at a time and would wait for it longer.
+    Measured on two cores, candidates of a diagnosis side by side: a tenth less time.
+    """
+    sys.setswitchinterval(2e-4)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.threads import one_thread_each
+from service.threads import hand_over_often, one_thread_each
 
 app = typer.Typer(
     name="sprung",
@@ -152,6 +152,7 @@ def diagnose(
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
     one_thread_each()  # candidates are fitted beside each other
+    hand_over_often()
     from service.cli.diagnose import run
 
     return run(file, system, dbc, out, json_lines)
