@@ -17,9 +17,8 @@ from scipy.ndimage import median_filter
 from model.diagnosis.catalogue import CLOCK_LEAD, Law, SupportLaw
 from model.diagnosis.screen import Channel, Hit, Projector, wheelsets
 from model.diagnosis.spectra import Grid
-from model.diagnosis.terms import Term
+from model.diagnosis.terms import Term, supports
 from model.signals import FloatArray
-from model.system import System
 
 _FINER = 8  # frequencies per bin: the last harmonic drifts by half a turn at most over the recording
 _PHASES = 64
@@ -33,20 +32,15 @@ _COLOUR = 2.5  # most by which exact columns may raise a score that is weighed b
 def comb_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
     """The best movement of every such law at every support or axle, and how many were tried."""
     system = projector.problem.system
-    supports = _supports(system)
     for law in laws:
         if isinstance(law, SupportLaw):
-            for location in wheelsets(system) if law.where == "axle" else supports:
+            for location in wheelsets(system) if law.where == "axle" else supports(system):
                 yield _best(projector, law, location)
-
-
-def _supports(system: System) -> list[str]:
-    return [name for name, source in system.file.inputs.items() if source.kind == "displacement"]
 
 
 def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, int]:
     absent = Hit(Term(law, location, law.absent), 0.0, 1, "comb", 1.0)
-    names = _supports(projector.problem.system)
+    names = supports(projector.problem.system)
     at = [names.index(name) for name in location.split("|")]
     channel = Channel(projector, projector.of_support[:, :, at].sum(axis=2))
     fundamentals, products, sizes = _products(projector.grid, law, channel)

@@ -17,7 +17,7 @@ from model.diagnosis.loop import LawForces, Loop, fixed_point
 from model.diagnosis.measured import Part
 from model.diagnosis.plant import Plant, Structure
 from model.diagnosis.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
-from model.diagnosis.terms import Term, branch_of, split
+from model.diagnosis.terms import Term, branch_of, split, supports
 from model.mechanics import VELOCITY
 from model.signals import FloatArray
 from model.system import System
@@ -105,7 +105,7 @@ class Forward:
         spectrum = np.zeros(self.part.support.shape, dtype=complex)
         polynomial = np.zeros(self.part.support_polynomial.shape)
         time = grid.start + grid.time + CLOCK_LEAD
-        names = [n for n, source in self.system.file.inputs.items() if source.kind == "displacement"]
+        names = supports(self.system)
         for term in self.terms:
             if isinstance(term.law, SupportLaw):
                 at = [names.index(name) for name in term.location.split("|")]

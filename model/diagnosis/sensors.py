@@ -18,7 +18,7 @@ from model.diagnosis.catalogue import Law, ParameterSpec, SensorLaw
 from model.diagnosis.forward import BOTH, DELAY
 from model.diagnosis.screen import Hit, Projector, wheelsets
 from model.diagnosis.spectra import ComplexArray
-from model.diagnosis.terms import Term
+from model.diagnosis.terms import Term, supports
 from model.signals import FloatArray
 
 
@@ -75,7 +75,7 @@ def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
     omega = grid.omega[band]
     assert problem.whitener is not None
     G = projector.of_support
-    names = [n for n, s in problem.system.file.inputs.items() if s.kind == "displacement"]
+    names = supports(problem.system)
     for at, support in enumerate(part.pairs):
         precision_d = 1 / noise.displacement[support] ** 2
         precision_v = (omega / noise.velocity[support]) ** 2
@@ -105,7 +105,7 @@ def _axle_hits(projector: Projector, law: SensorLaw) -> Iterator[tuple[Hit, int]
     """Both wheels of an axle late together, all that is measured of them: no witness but the vehicle."""
     part, grid = projector.problem.part, projector.grid
     system = projector.problem.system
-    names = [n for n, s in system.file.inputs.items() if s.kind == "displacement"]
+    names = supports(system)
     for location in wheelsets(system):
         at = [names.index(wheel) for wheel in location.split("|")]
         late = 1j * grid.omega[grid.band, None] * part.support[grid.band][:, at]

@@ -74,6 +74,11 @@ class Term:
         return weights
 
 
+def supports(system: System) -> list[str]:
+    """The inputs that move: moving supports, in the order of their columns."""
+    return [name for name, source in system.file.inputs.items() if source.kind == "displacement"]
+
+
 def branch_of(term: Term, element: int, damping: float) -> Branch | None:
     """The branch that a law with linear memory puts beside an element; None: the law is not linear."""
     if term.law.name == "series_stiffness":

@@ -6,6 +6,7 @@ from model.diagnosis.catalogue.base import (
     CLOCK_LEAD,
     BodyLaw,
     ElementLaw,
+    Law,
     Motion,
     Observed,
     ParameterSpec,
@@ -35,8 +36,6 @@ from model.diagnosis.catalogue.sensors import (
     SENSOR_STUCK,
 )
 from model.diagnosis.catalogue.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
-
-Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,

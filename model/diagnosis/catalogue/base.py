@@ -98,6 +98,19 @@ class ParameterSpec:
         return bool(self.low <= value <= self.high)
 
 
+class Parametrised:
+    """What every law has: names of its parameters, and whether it admits values of them."""
+
+    parameters: tuple[ParameterSpec, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def admits(self, p: Sequence[float]) -> bool:
+        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+
+
 def empty_memory(motion: Motion, p: Values, element: SpringDamper) -> Any:
     """A memory that knows nothing of the time before the recording."""
     return 0.0
@@ -109,7 +122,7 @@ def no_memory(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class ElementLaw:
+class ElementLaw(Parametrised):
     """A force that an element may have besides k d + c v (module docstring)."""
 
     name: str
@@ -132,13 +145,6 @@ class ElementLaw:
     odd: bool = True  # force(-d, -v) = -force(d, v)
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(parameter.name for parameter in self.parameters)
-
-    def admits(self, p: Sequence[float]) -> bool:
-        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
-
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""
         return np.array([min(max(float(v), q.low), q.high) for q, v in zip(self.parameters, p, strict=True)])
@@ -159,7 +165,7 @@ def grid(*columns: Sequence[float] | FloatArray) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class BodyLaw:
+class BodyLaw(Parametrised):
     """Physics of a body: it changes the mechanics, or loads a degree of freedom by a force nobody measured."""
 
     name: str
@@ -175,16 +181,9 @@ class BodyLaw:
     sentence: str
     load: Callable[[FloatArray, Values], FloatArray] | None = None  # N over the laws' clock: one more force in u
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(parameter.name for parameter in self.parameters)
-
-    def admits(self, p: Sequence[float]) -> bool:
-        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
-
 
 @dataclass(frozen=True)
-class SupportLaw:
+class SupportLaw(Parametrised):
     """A movement of supports that repeats itself and that their measured motion does not show.
 
     movement = depth sum_n harmonics[n - 1] cos(2 pi n (frequency t - phase)), t on the laws' clock
@@ -200,13 +199,6 @@ class SupportLaw:
     sentence: str
     where: Where = "support"  # "axle": both supports of one axle together
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(parameter.name for parameter in self.parameters)
-
-    def admits(self, p: Sequence[float]) -> bool:
-        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
-
     def movement(self, time: FloatArray, p: Values, highest: float = np.inf) -> tuple[FloatArray, FloatArray]:
         """What is added to the measured displacement (m) and velocity (m/s) at times on the laws' clock, each (T,).
 
@@ -220,7 +212,7 @@ class SupportLaw:
 
 
 @dataclass(frozen=True)
-class SensorLaw:
+class SensorLaw(Parametrised):
     """A fault of a measurement: what it shows instead of the truth, along the last axis (samples)."""
 
     name: str
@@ -234,9 +226,5 @@ class SensorLaw:
     sentence: str
     where: Where = "sensor"  # "axle": all inputs of one axle together
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(parameter.name for parameter in self.parameters)
 
-    def admits(self, p: Sequence[float]) -> bool:
-        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw

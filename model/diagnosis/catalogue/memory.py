@@ -9,9 +9,8 @@ import numpy as np
 from model.diagnosis.catalogue.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from model.signals import FloatArray
 
-GAMMA = (
-    0.5  # of the Bouc-Wen law as it is commonly written: z' = v - beta abs(v) abs(z)^(n-1) z - gamma beta v abs(z)^n
-)
+# Of the Bouc-Wen law as it is commonly written, z' = v - beta (abs(v) abs(z)^(n-1) z + gamma v abs(z)^n)
+GAMMA = 0.5
 # Corner frequencies, Hz, at which a branch with a spring and a damper in series is sought
 _CORNERS = np.array([0.5, 1.2, 3.0, 6.0, 10.0, 16.0, 25.0, 40.0, 70.0])
 

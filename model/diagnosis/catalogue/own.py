@@ -5,17 +5,14 @@ from __future__ import annotations
 import runpy
 from pathlib import Path
 
-from model.diagnosis.catalogue.base import BodyLaw, ElementLaw, SensorLaw, SupportLaw
+from model.diagnosis.catalogue.base import Law
 
 
 class LawFileError(ValueError):
     """The file of laws cannot be used; the message says why in one line."""
 
 
-Own = ElementLaw | BodyLaw | SupportLaw | SensorLaw
-
-
-def load_laws(path: str | Path, known: tuple[str, ...] = ()) -> tuple[Own, ...]:
+def load_laws(path: str | Path, known: tuple[str, ...] = ()) -> tuple[Law, ...]:
     """All laws that a Python file defines, in its order; `known` names are taken.
 
     The file is run: use only files that you trust.
@@ -25,9 +22,9 @@ def load_laws(path: str | Path, known: tuple[str, ...] = ()) -> tuple[Own, ...]:
     except Exception as error:
         problem = " ".join(str(error).split()) or type(error).__name__
         raise LawFileError(f"{path}: cannot be read as laws: {type(error).__name__}: {problem}") from None
-    found: list[Own] = []
+    found: list[Law] = []
     for value in names.values():
-        if isinstance(value, Own) and value.name not in known:
+        if isinstance(value, Law) and value.name not in known:
             if value.name in [law.name for law in found]:
                 raise LawFileError(f"{path}: two laws are called {value.name!r}; give each its own name")
             found.append(value)
