@@ -48,6 +48,19 @@ def test_wrong_gain_of_one_sensor_is_no_physics():
     assert report.findings[0].parameters[0].value == pytest.approx(0.95, abs=0.005)
 
 
+def test_late_sensor_is_timed_right_although_its_misfit_passed_for_noise():
+    record = simulate(seed=25)
+    signal, lag, delay = record.values[:, 4], 0.02, -0.0004  # lead, as a bilinear filter has it beside its lag
+    s = 2j * np.pi * np.fft.rfftfreq(2 * len(signal), 1 / record.sample_rate)
+    both = np.fft.rfft(np.concatenate([signal, signal[::-1]]))
+    record.values[:, 4] = np.fft.irfft(both * np.exp(-s * delay) / (1 + s * lag))[: len(signal)]
+    report = _diagnose(record)
+    assert [(f.location, f.effect) for f in report.findings] == [("bogie_a", "sensor_lag")]
+    time, further = report.findings[0].parameters
+    assert abs(time.value - lag) < 3 * time.std < 0.01 * lag
+    assert abs(further.value - delay) < 3 * further.std < 0.1 * abs(delay)
+
+
 def test_stuck_sensor_is_named_and_left_out():
     record = simulate(seed=24)
     record.values[1200:, 3] = record.values[1200, 3]

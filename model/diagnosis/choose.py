@@ -45,6 +45,7 @@ _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
 _QUIET = 0.5  # least noise power of a block over the estimated one
+_CHANCE = 4.0  # standard deviations by which what is noise exceeds it
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,15 @@ def compete(
         tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
         return max(tried, key=lambda t: t.evidence, default=None)
 
-    trials = _graded(problem, base, [t for t in share(begin, hits, WORKERS) if t is not None])
+    def begun(chosen: list[Hit]) -> list[Trial]:
+        return [trial for trial in share(begin, chosen, WORKERS) if trial is not None]
+
+    def finished(chosen: list[Trial]) -> list[Trial]:
+        return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
+
+    trials = begun([hit for hit in hits if hit.family != "unnamed"])
+    trials += begun([hit for hit in hits if hit.family == "unnamed" and _may_lead(problem, hit, trials)])
+    trials = _graded(problem, base, trials)
     if not trials:
         return []
     best = trials[0].evidence
@@ -140,7 +149,21 @@ def compete(
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
-    return _graded(problem, base, [*share(lambda trial: _finished(problem, base, trial), leading, WORKERS), *behind])
+    named = finished([trial for trial in leading if trial.named])
+    unnamed = [trial for trial in leading if not trial.named]
+    if not any(_may_lead(problem, trial.hit, named) for trial in unnamed):
+        return _graded(problem, base, [*named, *(replace(trial, finished=False) for trial in unnamed), *behind])
+    return _graded(problem, base, [*named, *finished(unnamed), *behind])
+
+
+def _may_lead(problem: Problem, unnamed: Hit, named: list[Trial]) -> bool:
+    """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
+    it promises is explained.  With one law alone it stays as what that one was chosen before."""
+    if problem.follows or len(named) < 2:
+        return True
+    best = max(named, key=lambda trial: trial.worth)
+    noise = 1 + _CHANCE * np.sqrt(2 / best.fit.count)
+    return unnamed.score > best.worth or not _QUIET <= best.fit.reduced <= noise
 
 
 def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:

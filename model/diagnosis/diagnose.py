@@ -208,22 +208,35 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     trials = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
     trials = preferred([t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)])
     trials.sort(key=lambda t: t.hit.family != "force")  # faults of the inputs first, of forces as of motions
-    for trial in trials[:1]:
-        if options.held_out and not course.held.still and course.held.compare(course.fit, trial.fit).refuted:
-            return False
-        tests = course.last.tests[trial.hit.family] * len(course.last.tests) if options.multiplicity else 1
-        p_value = max(trial.p_value(tests), min(1.0, trial.hit.p_single * tests))
-        if p_value > options.alpha:
-            return False
-        rivals = [t for t in trials if t is not trial]
-        course.found.append(Found(trial, rivals, p_value))
-        fit = trial.fit if trial.named else _smoother(course, trial.fit)
-        course.problem, course.fit = refreshed(course.problem, fit)
-        course.held.weigh(course.problem.noise)
-        tell(share + 0.12, "screening what is left")
-        course.last = screen(course.problem, course.fit, options.catalogue, options.project)
-        return True
-    return False
+    if not trials:
+        return False
+    chosen = trials[0]
+    if options.held_out and not course.held.still and course.held.compare(course.fit, chosen.fit).refuted:
+        return False
+    tests = course.last.tests[chosen.hit.family] * len(course.last.tests) if options.multiplicity else 1
+    p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
+    if p_value > options.alpha:
+        return False
+    fit = chosen.fit if chosen.named else _smoother(course, chosen.fit)
+    course.problem, course.fit = refreshed(course.problem, fit)
+    trial, course.fit = _variant(course, chosen, trials)
+    course.found.append(Found(trial, [t for t in trials if t is not trial], p_value))
+    course.held.weigh(course.problem.noise)
+    tell(share + 0.12, "screening what is left")
+    course.last = screen(course.problem, course.fit, options.catalogue, options.project)
+    return True
+
+
+def _variant(course: Course, chosen: Trial, trials: list[Trial]) -> tuple[Trial, Fit]:
+    """The variant of a law once the noise is known: beside a misfit that passed for noise, they looked alike."""
+    best = chosen, course.fit
+    for rival in trials:
+        if rival is not chosen and rival.term.key[:2] == chosen.term.key[:2] and rival.named:
+            fit = replace(course.problem, smoothed=None).try_fit(rival.fit.point, 6)
+            dearer = (rival.gain - rival.evidence) - (best[0].gain - best[0].evidence)
+            if fit is not None and best[1].deviance - fit.deviance > dearer:
+                best = rival, fit
+    return best
 
 
 def _smoother(course: Course, fit: Fit) -> Fit:

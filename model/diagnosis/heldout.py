@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from model.chunks import WORKERS, share
 from model.diagnosis.choose import profile_gain
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.forward import Forward, propagate
@@ -83,7 +84,15 @@ class HeldOut:
         self.noise, self.whitener = noise, None
 
     def run(self, point: Point) -> FreeRun:
-        """Simulate with the measured inputs from the state that the fitted part ends in.
+        """Simulate with the measured inputs from the state that the fitted part ends in."""
+        return self._judge(*self._simulated(point))
+
+    def runs(self, *points: Point) -> list[FreeRun]:
+        """The same for several models, simulated beside each other."""
+        return [self._judge(*simulated) for simulated in share(self._simulated, points, WORKERS)]
+
+    def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
+        """Held-out samples (T, S), and the point with its starting state.
 
         The periodic solution over the whole recording is another one than over the fitted part, so the free motion
         is fitted again, to the fitted part alone.
@@ -111,7 +120,7 @@ class HeldOut:
                 break
         A = forward.plant.structure.state_matrix()
         simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
-        return self._judge(simulated[self.split :], replace(point, state=state, near=near))
+        return simulated[self.split :], replace(point, state=state, near=near)
 
     def compare(self, before: Fit, after: Fit) -> Comparison:
         """Two fits on the held-out part.
@@ -120,7 +129,7 @@ class HeldOut:
         good the model.
         """
         if not before.noise.follows:
-            first, second = self.run(before.point).residual, self.run(after.point).residual
+            first, second = (run.residual for run in self.runs(before.point, after.point))
             gain = float(first @ first - second @ second)
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)

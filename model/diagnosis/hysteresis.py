@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -43,25 +42,31 @@ def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma:
     dx = du / (1 - a u^n) for u > 0, a = beta (1 + gamma), and du / (1 + b |u|^n) for u < 0, b = beta (1 - gamma).
     So one function of u, the way X(u), and its inverse carry z from any reversal to the next.
     """
-    loop = _Loop(_Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent))
+    ahead, behind = _Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent)
     steps = np.diff(deflection)
     direction = np.sign(steps)
     direction[direction == 0] = 1.0
     turns = np.flatnonzero(direction[1:] != direction[:-1]) + 1
     starts = np.concatenate([[0], turns])  # first step of every monotone stretch
     ends = np.concatenate([turns, [len(steps)]])
-    signs = direction[starts]
-    travelled = np.abs(deflection[ends] - deflection[starts])
-    begin = np.empty(len(starts))
-    u = 0.0
-    for i in range(len(starts)):
-        begin[i] = loop.way(signs[i] * u)
-        u = signs[i] * loop.back(begin[i] + travelled[i])
+    begin = np.array(_ways(ahead, behind, np.abs(deflection[ends] - deflection[starts])))
     stretch = np.repeat(np.arange(len(starts)), ends - starts)
     position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch])
     z = np.zeros_like(deflection)
-    z[1:] = signs[stretch] * loop.along(position)
+    z[1:] = direction * np.where(position > 0, ahead.along(position), -behind.along(-position))
     return z
+
+
+def _ways(ahead: _Side, behind: _Side, travelled: FloatArray) -> list[float]:
+    """The way X at which every monotone stretch begins: minus the z at which the one before ended."""
+    ways = []
+    u = 0.0
+    for length in travelled.tolist():
+        start = ahead.way(u) if u > 0 else -behind.way(-u)
+        ways.append(start)
+        end = start + length
+        u = -ahead.back(end) if end > 0 else behind.back(-end)
+    return ways
 
 
 class _Side:
@@ -82,23 +87,6 @@ class _Side:
 
     def along(self, x: FloatArray) -> FloatArray:
         return self.unit * self._along(np.maximum(x, 0) / self.unit)
-
-
-@dataclass(frozen=True)
-class _Loop:
-    """Both sides of u = 0."""
-
-    ahead: _Side  # z resists the motion
-    behind: _Side  # z helps it
-
-    def way(self, u: float) -> float:
-        return self.ahead.way(u) if u > 0 else -self.behind.way(-u)
-
-    def back(self, x: float) -> float:
-        return self.ahead.back(x) if x > 0 else -self.behind.back(-x)
-
-    def along(self, x: FloatArray) -> FloatArray:
-        return np.where(x > 0, self.ahead.along(x), -self.behind.along(-x))
 
 
 @lru_cache(maxsize=64)

@@ -39,8 +39,7 @@ _LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts 
 
 def narrate(course: Course, record: Recorded) -> Report:
     """The report of an investigation."""
-    before = course.held.run(course.base.point)
-    after = course.held.run(course.fit.point) if course.found else before
+    before, after = course.held.runs(course.base.point, course.fit.point)
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     floor = course.held.noise_rms(course.fit, course.problem.noise)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.polynomial.polynomial import polyval
 
 from model.mechanics import Mechanics
 from model.signals import FloatArray
@@ -205,10 +206,11 @@ class SupportLaw(Parametrised):
         highest: Hz, harmonics above it are left out, as anti-alias filters do.
         """
         depth, frequency, phase = p
-        n = np.arange(1, len(self.harmonics) + 1)
-        weight = depth * np.where(n * frequency < highest, self.harmonics, 0.0)
-        angle = 2 * np.pi * n * (np.asarray(time)[:, None] * frequency - phase)
-        return np.cos(angle) @ weight, np.sin(angle) @ (-2 * np.pi * n * frequency * weight)
+        n = np.arange(len(self.harmonics) + 1)
+        weights = depth * np.where(n * frequency < highest, (0.0, *self.harmonics), 0.0)
+        turn = np.exp(2j * np.pi * (np.asarray(time) * frequency - phase))
+        displacement, rate = polyval(turn, np.column_stack([weights, 2j * np.pi * n * frequency * weights]))
+        return displacement.real, rate.real
 
 
 @dataclass(frozen=True)
