@@ -33,6 +33,16 @@ def test_dry_friction_is_found_named_and_sized():
     assert "dry friction" in first.sentence
 
 
+def test_friction_whose_corner_is_sharper_than_sampling_shows_says_so():
+    sharp = 0.0003
+    report = _diagnose(simulate(lambda d, v: 300 * np.tanh(v / sharp), seed=26))
+    assert [(f.location, f.effect) for f in report.findings] == [("secondary", "coulomb_friction")]
+    force, smoothing = report.findings[0].parameters
+    assert abs(force.value - 300) < 3 * force.std < 15
+    assert abs(smoothing.value - sharp) < 3 * smoothing.std
+    assert smoothing.std > 0.3 * sharp
+
+
 def test_cubic_spring_is_not_taken_for_a_bump_stop():
     report = _diagnose(simulate(lambda d, v: 4e9 * d**3, seed=22))
     assert [(f.location, f.effect) for f in report.findings] == [("secondary", "cubic_stiffness")]

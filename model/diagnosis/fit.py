@@ -231,16 +231,22 @@ def _objective(lin: Linearisation, point: Point) -> float:
     return float(lin.residual @ lin.residual + lin.log_det + np.sum((point.theta / PRIOR) ** 2))
 
 
+def _normal(lin: Linearisation, point: Point) -> tuple[FloatArray, FloatArray]:
+    """Matrix of the normal equations with the prior of theta, columns scaled, and the scales."""
+    P = len(point.theta)
+    normal = lin.jacobian.T @ lin.jacobian
+    normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
+    scale = scale_of(normal, len(point.state))
+    return normal * scale * scale[:, None], scale
+
+
 def _step(lin: Linearisation, point: Point, damping: float) -> tuple[FloatArray, FloatArray]:
     """Gauss-Newton step and the standard deviations of theta and term parameters."""
     P = len(point.theta)
-    normal = lin.jacobian.T @ lin.jacobian
+    scaled, scale = _normal(lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
-    normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
     gradient[:P] -= point.theta / PRIOR**2
-    scale = scale_of(normal, len(point.state))
-    scaled = normal * scale * scale[:, None]
     scaled[np.diag_indices_from(scaled)] += damping + 1e-13
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
     step = scale * (inverse @ (gradient * scale))
@@ -249,7 +255,7 @@ def _step(lin: Linearisation, point: Point, damping: float) -> tuple[FloatArray,
         scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
         inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
         step = scale * (inverse @ (gradient * scale))
-    free = len(normal) - len(point.state)
+    free = len(scaled) - len(point.state)
     sigma = (scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300)))[:free]
     return step, sigma
 
@@ -257,10 +263,8 @@ def _step(lin: Linearisation, point: Point, damping: float) -> tuple[FloatArray,
 def _finish(problem: Problem, point: Point, lin: Linearisation, converged: bool, count: int) -> Fit:
     P = len(point.theta)
     free = lin.jacobian.shape[1] - len(point.state)
-    normal = lin.jacobian.T @ lin.jacobian
-    normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
-    scale = scale_of(normal, len(point.state))
-    inverse = np.linalg.pinv(normal * scale * scale[:, None], rcond=1e-14, hermitian=True)
+    scaled, scale = _normal(lin, point)
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
     covariance = (inverse * scale * scale[:, None])[:free, :free]
     slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)
     covariance = covariance * slopes * slopes[:, None]

@@ -149,7 +149,7 @@ def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
 
 def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
     term, place = fit.point.terms[index], fit.place(index)
-    block = fit.covariance[place, place]
+    block = _with_corner(fit, term, fit.covariance[place, place])
     sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
     hidden = term.law.name == UNKNOWN
     parameters = tuple(
@@ -158,6 +158,25 @@ def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], Flo
         if not hidden
     )
     return parameters, block
+
+
+def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
+    """Covariance of a law's parameters with what sampling leaves open of a corner over the rate.
+
+    A corner of width s is passed in steps of the rate, h each.  The slope there, sech^2(v / s), summed over samples
+    instead of integrated is off by 2 x / sinh x cos(phase) of itself, x = pi^2 s / h (Poisson's sum formula).
+    """
+    corner = term.law.corner if isinstance(term.law, ElementLaw) else None
+    if corner is None or covariance[corner, corner] <= 0:
+        return covariance
+    rate = fit.element_motion[1] @ term.port(fit.forward.system)
+    passing = np.abs(np.diff(rate))[rate[1:] * rate[:-1] < 0]
+    if not len(passing):
+        return covariance
+    width = term.parameters[corner]
+    x = min(np.pi**2 * width / max(float(np.median(passing)), 1e-300), 300.0)
+    along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
+    return covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
 
 
 def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:

@@ -144,6 +144,7 @@ class ElementLaw(Parametrised):
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
     passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
     odd: bool = True  # force(-d, -v) = -force(d, v)
+    corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
 
     def clip(self, p: Sequence[float]) -> FloatArray:

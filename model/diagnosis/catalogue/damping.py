@@ -42,6 +42,7 @@ COULOMB_FRICTION = ElementLaw(
     looks_like="force of constant size against the motion; strongest relative effect at small amplitudes",
     confused_with=("damper_blowoff", "quadratic_damping", "bouc_wen", "clearance"),
     sentence="dry friction of {force}",
+    corner=1,
 )
 
 
