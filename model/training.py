@@ -177,10 +177,11 @@ class Run:
         for group in self.optimiser.param_groups:
             group["lr"] = self.settings.learning_rate * (0.01 + 0.99 * 0.5 * (1 + np.cos(np.pi * share)))
 
-    def update(self, loss: Tensor) -> None:
+    def update(self, loss: Tensor, longest: float = 10.0) -> None:
+        """A step of Adam along the gradient, which is cut to the length of `longest`."""
         self.optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.net.parameters(), 10.0)
+        torch.nn.utils.clip_grad_norm_(self.net.parameters(), longest)
         self.optimiser.step()
         self.step += 1
         if self.step % self.settings.checkpoint_every == 0:

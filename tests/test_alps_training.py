@@ -249,6 +249,22 @@ def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> 
     assert np.isfinite(figures["SE"])
 
 
+def test_the_readout_is_the_best_map_and_its_gradient_that_of_what_no_map_explains() -> None:
+    draw = torch.Generator().manual_seed(0)
+    seen = torch.randn(2, 40, 4, generator=draw, dtype=torch.float64).requires_grad_()
+    shown = torch.randn(2, 40, 3, generator=draw, dtype=torch.float64)
+    readout = train_fit.Readout(4, 3)
+
+    def left(x: torch.Tensor) -> torch.Tensor:
+        return (readout(x, shown) - shown).square().sum()
+
+    best = np.linalg.lstsq(seen.detach().flatten(0, 1).numpy(), shown.flatten(0, 1).numpy(), rcond=None)
+    assert left(seen).item() == pytest.approx(best[1].sum(), rel=1e-6)
+    assert torch.autograd.gradcheck(left, (seen,), rtol=1e-3, atol=1e-4)
+    kept = readout.eval()(torch.eye(4, dtype=torch.float64)[None], shown)
+    torch.testing.assert_close(kept[0], torch.from_numpy(best[0]), rtol=1e-4, atol=1e-6)
+
+
 def test_torchdiffeq_and_the_exact_solution_agree() -> None:
     task = mass_spring_damper.TASK
     drawn = task.sample(2, np.random.default_rng(0), task.seen)

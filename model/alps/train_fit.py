@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from model.alps import metrics
 from model.alps.config import NetworkConfig
 from model.alps.context import ContextDynamics
-from model.alps.decoder import StateDecoder
 from model.alps.embedding import FeedForwardEmbedding
 from model.alps.encoder import AttentionEncoder
 from model.alps.fit import Clock
@@ -25,6 +24,8 @@ from model.features import magnitudes
 from model.simulate.linear import LinearSimulator
 from model.system import load_system
 from model.training import Run
+
+_RIDGE = 1e-6  # of the diagonal
 
 TrainMethod = Literal["alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors", "alps_known_sensors"]
 
@@ -40,7 +41,9 @@ class TrainConfig:
     decay: float = 30.0  # decoupled weight decay: the data have one parameter vector, so the network should be flat
     checkpoint_every: int = 100
     divergence_weight: float = 1e-5
-    observation_weight: float = 1.0
+    observation_weight: float = 20.0  # ALPS from sensors: with 1, simulations follow what is badly encoded
+    nominal: float = 0.2  # of the updates: parameters rest there until states mean something
+    longest_gradient: float = 10.0
 
 
 class StateEstimator(nn.Module):
@@ -88,10 +91,34 @@ class StateContext(nn.Module):
         return torch.cat([path[::segments, :1], path[:, 1:].reshape(batch, samples - 1, size)], dim=1).double()
 
 
+class Readout(nn.Module):
+    """Linear decoder that is never behind: least squares over every batch (variable projection, Golub & Pereyra 1973).
+
+    A decoder that is trained beside the parameters takes over what is their business and never gives it back; here
+    their gradient is of what no map of the states explains.
+    """
+
+    def __init__(self, columns: int, sensors: int) -> None:
+        super().__init__()
+        self.register_buffer("matrix", torch.zeros(columns, sensors, dtype=torch.float64))
+        self.matrix: Tensor
+
+    def forward(self, seen: Tensor, shown: Tensor) -> Tensor:
+        """States and inputs (B, T, columns), what the sensors showed (B, T, sensors) -> decoded (B, T, sensors)."""
+        if self.training:
+            with torch.no_grad():  # at the best map, its own change does not change the error
+                rows = seen.flatten(0, 1)
+                normal = rows.mT @ rows
+                normal += _RIDGE * torch.diag(normal.diagonal())
+                self.matrix = torch.linalg.solve(normal, rows.mT @ shown.flatten(0, 1))
+        return seen @ self.matrix
+
+
 class SensorAutoencoder(nn.Module):
     """ALPS from 12 accelerometers and the wheels: embedding, attention, estimator, simulator, decoder.
 
-    The decoder is a network, or, where it is `known` what the sensors measure, the sensors' own equation.
+    The decoder is a linear map of state and inputs, or, where it is `known` what the sensors measure, the sensors' own
+    equation.
     """
 
     def __init__(self, task: Task, data: TrainData, known: bool) -> None:
@@ -106,7 +133,7 @@ class SensorAutoencoder(nn.Module):
         self.embed = FeedForwardEmbedding(sensors + inputs, config)
         self.encoder = AttentionEncoder(task, config)
         self.estimator = LogRatioEstimator((WINDOW // 2 + 1) * len(task.states), len(task.parameters))
-        self.decoder = None if known else StateDecoder(len(task.states) + inputs, sensors, config)
+        self.decoder = None if known else Readout(len(task.states) + inputs, sensors)
 
     def forward(self, observations: Tensor, knots: Tensor, nominal: bool = False):  # type: ignore[no-untyped-def]
         """(B, T, 12), (B, T, 16) -> posterior, log-ratios, simulated states, decoded observations / scale.
@@ -123,8 +150,8 @@ class SensorAutoencoder(nn.Module):
         measured, simulated = self.simulator.simulate(log_ratio, knots, states[:, 0].double())
         if self.decoder is None:
             return encoded, log_ratio, simulated, measured / self.scale
-        seen = torch.cat([self.task.to_chart(simulated).float(), drive.float()], dim=-1)
-        return encoded, log_ratio, simulated, self.decoder(seen)
+        seen = torch.cat([self.task.to_chart(simulated), drive], dim=-1)
+        return encoded, log_ratio, simulated, self.decoder(seen, observations / self.scale)
 
 
 def halves(data: TrainData) -> tuple[Tensor, Tensor]:
@@ -159,7 +186,7 @@ def fit(method: TrainMethod, data: TrainData, config: TrainConfig, folder: Path,
         starts = torch.from_numpy(rng.integers(STEPS - WINDOW + 1, size=config.batch))
         torch.manual_seed(config.seed * 1_000_003 + run.step)
         run.rate(config.updates)
-        run.update(_loss(model, data, rows, starts, config, run.step))
+        run.update(_loss(model, data, rows, starts, config, run.step), config.longest_gradient)
         _shrink(model, run.optimiser.param_groups[0]["lr"] * config.decay)
         if run.step == config.updates:
             run.save()
@@ -176,7 +203,7 @@ def _loss(model: nn.Module, data: TrainData, rows: Tensor, starts: Tensor, confi
         return ((model(measured, known, horizon) - measured) / data.size).square().mean()
     observations, knots = windows(data.observations, starts, rows), windows(data.knots, starts, rows)
     assert isinstance(model, SensorAutoencoder)
-    encoded, _, simulated, decoded = model(observations, knots, nominal=step < config.updates // 2)
+    encoded, _, simulated, decoded = model(observations, knots, nominal=step < config.nominal * config.updates)
     divergence = encoded.divergence.mean()
     observation = (decoded - observations / model.scale).square().mean()
     state = ((encoded.draw - simulated) / data.size).square().sum(-1).mean()
