@@ -75,6 +75,7 @@ def detection_panel(axes: Axes, scores: list[Score], false_alarm_rate: float) ->
 def main() -> None:
     """Draws what a folder holds."""
     folder, out = Path(sys.argv[1]), Path(sys.argv[2])
+    out.mkdir(parents=True, exist_ok=True)
     scores = finished(folder)
     with rc_context(ink.RC):
         figure = ink.new_figure(10.0, 3.7)
