@@ -19,8 +19,6 @@ from model.simulate.linear import LinearSimulator
 from model.simulate.ode import LinearRate, solve
 from model.system import load_system
 
-ACCURACY = 1e-9
-
 
 def run(windows: int = 256, scipy_windows: int = 3) -> Iterator[dict]:
     """One dict per figure."""

@@ -32,7 +32,7 @@ PREFIX = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQI")  # start, end, inflated size, CRC
 FOOTER = struct.Struct("<QQI")  # summary start, summary offsets start, summary CRC
-DAMAGED, CUT = "a damaged chunk", "the rest of the file"
+DAMAGED = "a damaged chunk"
 
 
 @dataclass(slots=True)

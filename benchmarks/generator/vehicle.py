@@ -11,7 +11,6 @@ import yaml
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-DEGREES = ("bounce", "roll", "pitch")
 
 
 @dataclass(frozen=True)

@@ -37,10 +37,6 @@ class Clock:
 
     until: float = float("inf")  # of time.monotonic()
 
-    @classmethod
-    def allowing(cls, seconds: float | None) -> Clock:
-        return cls() if seconds is None else cls(time.monotonic() + seconds)
-
     def check(self, run: Run) -> None:
         if time.monotonic() > self.until:
             run.save()
