@@ -44,6 +44,7 @@ _STRONGER = 1.1
 _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
+_FURTHER = 3  # candidates that are tried for a runner-up where none was close
 _QUIET = 0.5  # least noise power of a block over the estimated one
 _CHANCE = 4.0  # standard deviations by which what is noise exceeds it
 
@@ -125,13 +126,9 @@ def compete(
     places = sorted({hit.location for hit in hits})
     progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
 
-    def begin(hit: Hit) -> Trial | None:
-        starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
-        tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
-        return max(tried, key=lambda t: t.evidence, default=None)
-
     def begun(chosen: list[Hit]) -> list[Trial]:
-        return [trial for trial in share(begin, chosen, WORKERS) if trial is not None]
+        tried = share(lambda hit: _begun(problem, base, hit), chosen, WORKERS)
+        return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
         return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
@@ -154,6 +151,27 @@ def compete(
     if not any(_may_lead(problem, trial.hit, named) for trial in unnamed):
         return _graded(problem, base, [*named, *(replace(trial, finished=False) for trial in unnamed), *behind])
     return _graded(problem, base, [*named, *finished(unnamed), *behind])
+
+
+def runner_up(problem: Problem, base: Fit, hits: list[Hit], chosen: Trial, tried: list[Trial]) -> Trial | None:
+    """The best candidate with another law, at the same place before others; a hit is fitted where none was."""
+    rivals = [t for t in tried if t.term.law.name != chosen.term.law.name and t.gain > 0]
+    if rivals:
+        return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
+    fitted = {t.hit.term.key for t in tried}
+    others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
+    for hit in sorted(others, key=_strength, reverse=True)[:_FURTHER]:
+        trial = _begun(problem, base, hit)
+        if trial is not None and trial.gain > 0:
+            return replace(trial, finished=False)
+    return None
+
+
+def _begun(problem: Problem, base: Fit, hit: Hit) -> Trial | None:
+    """A hit fitted far enough to see what it is worth, from the best of several starts."""
+    starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+    tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
+    return max(tried, key=lambda t: t.evidence, default=None)
 
 
 def _may_lead(problem: Problem, unnamed: Hit, named: list[Trial]) -> bool:

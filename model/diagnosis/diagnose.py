@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from model.diagnosis.catalogue import CATALOGUE, ElementLaw, Law
 from model.diagnosis.channels import Prepared, prepare
-from model.diagnosis.choose import Trial, compete, preferred, shortlist
+from model.diagnosis.choose import Trial, compete, preferred, runner_up, shortlist
 from model.diagnosis.cuts import cut
 from model.diagnosis.fit import Fit, Problem
 from model.diagnosis.heldout import HeldOut
@@ -19,7 +19,7 @@ from model.diagnosis.measured import Noise, Signals, declared_noise, drifting, t
 from model.diagnosis.noise import force_noise, input_noise, refreshed
 from model.diagnosis.point import Point
 from model.diagnosis.report import Report
-from model.diagnosis.screen import Screening, screen
+from model.diagnosis.screen import Hit, Screening, screen
 from model.diagnosis.surface import with_surface
 from model.diagnosis.unknown import UNKNOWN
 from model.signals import FloatArray
@@ -64,7 +64,8 @@ class Found:
     """One accepted finding with what it was chosen among."""
 
     trial: Trial
-    trials: list[Trial]
+    trials: list[Trial]  # that could have been chosen instead
+    runner_up: Trial | None  # the best with another law
     p_value: float
 
 
@@ -200,13 +201,16 @@ def _mend_inputs(course: Course, declared: Noise, tell: Progress) -> None:
 def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     """Find, fit and accept one more finding; False when the rest is noise."""
     options = course.options
-    hits = [h for h in shortlist(course.last, options.alpha, options.multiplicity) if h.family != "input"]
-    hits = [h for h in hits if not _repeats(course, h)]
+
+    def new(hits: Iterable[Hit]) -> list[Hit]:
+        return [h for h in hits if h.family != "input" and not _repeats(course, h)]
+
+    hits = new(shortlist(course.last, options.alpha, options.multiplicity))
     if not hits:
         return False
     share = 0.25 + 0.17 * number
-    trials = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
-    trials = preferred([t for t in trials if t.finished and t.evidence > 0 and not _minor(course, t)])
+    tried = compete(course.problem, course.fit, hits, lambda text: tell(share, text))
+    trials = preferred([t for t in tried if t.finished and t.evidence > 0 and not _minor(course, t)])
     trials.sort(key=lambda t: t.hit.family != "force")  # faults of the inputs first, of forces as of motions
     if not trials:
         return False
@@ -217,10 +221,11 @@ def _next_finding(course: Course, number: int, tell: Progress) -> bool:
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.alpha:
         return False
+    second = runner_up(course.problem, course.fit, new(course.last.hits), chosen, tried)
     fit = chosen.fit if chosen.named else _smoother(course, chosen.fit)
     course.problem, course.fit = refreshed(course.problem, fit)
     trial, course.fit = _variant(course, chosen, trials)
-    course.found.append(Found(trial, [t for t in trials if t is not trial], p_value))
+    course.found.append(Found(trial, [t for t in trials if t is not trial], second, p_value))
     course.held.weigh(course.problem.noise)
     tell(share + 0.12, "screening what is left")
     course.last = screen(course.problem, course.fit, options.catalogue, options.project)
@@ -247,7 +252,7 @@ def _smoother(course: Course, fit: Fit) -> Fit:
     return surface if course.held.compare(fit, surface).gain > 0 else fit
 
 
-def _repeats(course: Course, hit) -> bool:
+def _repeats(course: Course, hit: Hit) -> bool:
     """The same law at the same place, or physics at a place that is unknown already."""
     for term in course.fit.point.terms:
         if hit.term.key[:2] == term.key[:2]:

@@ -185,7 +185,7 @@ def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[index]
         parameters, block = _law_parameters(course.reported, index)
-        rival = next((t for t in found.trials if t.term.law.name != term.law.name), None)
+        rival = found.runner_up
         family, advice = _look_alikes(found)
         finding = Finding(
             location=term.location,
@@ -331,7 +331,7 @@ def _changes(course: Course) -> tuple[str, ...]:
 def _candidates(course: Course) -> tuple[Candidate, ...]:
     rows: dict[tuple[str, str], Candidate] = {}
     for found in course.found:
-        for trial in [found.trial, *found.trials]:
+        for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:
             key = (trial.term.location, trial.term.law.name)
             if key not in rows:
                 p = course.first.p_value(trial.hit)
