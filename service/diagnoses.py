@@ -112,7 +112,8 @@ class Diagnoses:
         return self.jobs
 
     def _diagnose(self, path: Path, row: RecordingRow, out: Path, progress: Progress) -> dict[str, Any]:
-        command = [sys.executable, "-m", "service.cli", "diagnose", str(path), "--out", str(out), "--json"]
+        command = [sys.executable, "-m", "service.cli", "diagnose", str(path), f"--name={row.name}"]
+        command += ["--out", str(out), "--json"]
         if self._settings.system is not None:
             command += ["--system", str(self._settings.system)]
         if self._engine.dbc is not None:
@@ -126,7 +127,6 @@ class Diagnoses:
             line = errors.strip().splitlines()[-1:] or ["the diagnosis ended without an answer"]
             raise UserError(line[0].removeprefix("sprung: ").replace(str(path), row.name))
         report: dict[str, Any] = json.loads(output)
-        report["recording"]["file"] = row.name
         return report
 
 

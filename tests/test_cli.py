@@ -13,7 +13,9 @@ import urllib.request
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from diagnosis_cases import SYSTEM, simulate
 
 from model.system import MANCHESTER, System
 from service.cli import describe, main
@@ -191,6 +193,23 @@ def test_what_cannot_be_done_is_one_line_and_exit_status_two(
     assert len(captured.err.splitlines()) == 1
     assert captured.err.startswith("sprung: ")
     assert "Traceback" not in captured.err
+
+
+def test_diagnose_prints_the_report_and_leaves_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    system, recording = tmp_path / "quarter-car.yaml", tmp_path / "ride.csv"
+    system.write_text(SYSTEM)
+    rows = simulate(lambda d, v: 300 * np.tanh(v / 0.002), seed=21).values
+    time = np.arange(len(rows))[:, None] / 100
+    np.savetxt(
+        recording, np.hstack([time, rows]), delimiter=",", header="time,d,v,a,b,e,f", comments="", fmt="%.9g"
+    )  # fmt: skip
+    options = ["--system", str(system), "--out", str(tmp_path / "out"), "--name", "Monday", "--json"]
+    assert main(["diagnose", str(recording), *options]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert report["recording"]["file"] == "Monday"
+    assert [(f["location"], f["effect"]) for f in report["findings"]] == [("secondary", "coulomb_friction")]
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Monday" in page and 'src="http' not in page and 'href="http' not in page
 
 
 def test_a_setting_that_cannot_be_is_named(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,6 +148,7 @@ def diagnose(
     system: System = None,
     dbc: Dbc = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the pictures.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Of the recording, in the report.")] = None,
     json_lines: Json = False,
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
@@ -155,7 +156,7 @@ def diagnose(
     hand_over_often()
     from service.cli.diagnose import run
 
-    return run(file, system, dbc, out, json_lines)
+    return run(file, system, dbc, out, name, json_lines)
 
 
 @app.command()

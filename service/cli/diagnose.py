@@ -14,14 +14,16 @@ from service.cli.console import errors, silent_stage, stages
 from service.diagnoses import load_excerpt
 
 
-def run(file: Path, system_file: Path | None, dbc: Path | None, out: Path | None, json_lines: bool) -> int:
+def run(
+    file: Path, system_file: Path | None, dbc: Path | None, out: Path | None, name: str | None, json_lines: bool
+) -> int:
     """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
     system = load_system(system_file or MANCHESTER)
     record = load(file, system, dbc or (MANCHESTER_DBC if system_file is None else None))
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
     try:
-        report = _diagnose(system, record, file, quiet=json_lines)
+        report = _diagnose(system, record, name or file.name, quiet=json_lines)
     except TooLittleError as error:
         print(f"sprung: {file}: {error}", file=sys.stderr)
         return 1
@@ -45,11 +47,11 @@ def load(file: Path, system: System, dbc: Path | None) -> Record:
     return load_record(file, system.channels, system.sample_rate, dbc=dbc)
 
 
-def _diagnose(system: System, record: Record, file: Path, quiet: bool) -> Report:
+def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
     from model.diagnosis.diagnose import Options, diagnose
 
     with stages(errors()) as show:
-        return diagnose(system, record, Options(file=file.name), silent_stage if quiet else show)
+        return diagnose(system, record, Options(file=name), silent_stage if quiet else show)
 
 
 def text(report: Report) -> str:
