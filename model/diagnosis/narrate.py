@@ -243,6 +243,8 @@ def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, aft
         words = term.law.sentence.format(**values)
     except (KeyError, IndexError):
         words = term.law.title
+    if finding.family is not None:
+        words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
     bias = _worst_bias(course)
     if bias is not None:
