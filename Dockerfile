@@ -8,6 +8,7 @@ RUN python3 -m venv /opt/sprung
 RUN /opt/sprung/bin/pip install --no-cache-dir --extra-index-url "$TORCH_INDEX" "$(grep '^torch==' requirements.lock)"
 RUN /opt/sprung/bin/pip install --no-cache-dir -r requirements.lock
 COPY pyproject.toml README.md ./
+COPY sprung ./sprung
 COPY model ./model
 COPY replay ./replay
 COPY service ./service

@@ -6,7 +6,7 @@ TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
-SOURCES := model replay service benchmarks tests
+SOURCES := sprung/__init__.py model replay service benchmarks tests
 DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 

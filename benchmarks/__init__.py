@@ -11,18 +11,18 @@ from importlib import import_module
 from typing import Any
 
 BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
-    "identify": ("benchmarks.identify", "accuracy and speed of window estimates, against the Cramer-Rao bound"),
-    "estimator": ("benchmarks.estimator", "iterations saved by the trained start, against the paper's feature"),
-    "simulate": ("benchmarks.simulate", "windows simulated per second, against torchdiffeq and scipy"),
-    "decode": ("benchmarks.decode", "frames and messages per second, against cantools and mcap"),
-    "replay": ("benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
-    "serve": ("benchmarks.serve", "latency of POST /identify, against a bare echo"),
-    "drift": ("benchmarks.drift", "delay of alarms and false alarms of the tracker"),
-    "concealed": ("benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
-    "silverbox": ("benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
-    "emps": ("benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
-    "paper": ("benchmarks.paper", "the paper's systems, baselines and ablations"),
-    "physics-overhead": ("benchmarks.physics_overhead", "what physics in the loop costs a training update"),
+    "identify": ("sprung.benchmarks.identify", "accuracy and speed of window estimates, against the Cramer-Rao bound"),
+    "estimator": ("sprung.benchmarks.estimator", "iterations saved by the trained start, against the paper's feature"),
+    "simulate": ("sprung.benchmarks.simulate", "windows simulated per second, against torchdiffeq and scipy"),
+    "decode": ("sprung.benchmarks.decode", "frames and messages per second, against cantools and mcap"),
+    "replay": ("sprung.benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
+    "serve": ("sprung.benchmarks.serve", "latency of POST /identify, against a bare echo"),
+    "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
+    "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
+    "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
+    "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
+    "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
+    "physics-overhead": ("sprung.benchmarks.physics_overhead", "what physics in the loop costs a training update"),
 }
 
 Figures = Iterator[dict[str, Any]]

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from model.fusion import fuse
-from model.signals import FloatArray
-from model.simulate.linear import LinearSimulator, knot_columns
-from model.system import System
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.fusion import fuse
+from sprung.model.simulate.linear import LinearSimulator, knot_columns
+from sprung.model.system import System
 
 
 def time_domain_bound(system: System, clean: FloatArray, log_ratio: FloatArray, *, fused: bool) -> FloatArray:

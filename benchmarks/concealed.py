@@ -18,14 +18,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import model
-from benchmarks.concealed_score import Score, explained, rate, score, summary
-from benchmarks.generator import draw_cases, read_vehicle, write_set
-from benchmarks.generator.laws import LAWS
-from model.diagnosis.catalogue import CATALOGUE
-from model.diagnosis.diagnose import Options, diagnose
-from model.system import MANCHESTER, System, load_system
-from replay.record import load_record
+from sprung import model
+from sprung.benchmarks.concealed_score import Score, explained, rate, score, summary
+from sprung.benchmarks.generator import draw_cases, read_vehicle, write_set
+from sprung.benchmarks.generator.laws import LAWS
+from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.laws import CATALOGUE
+from sprung.model.system import MANCHESTER, System, load_system
+from sprung.replay.record import load_record
 
 NAMED = tuple(law.name for law in CATALOGUE)
 WEAK_KINDS = [*LAWS, "flexible_mode", "external_force", "mass_change", "sensor_gain", "sensor_lag", "sensor_bias"]
@@ -79,7 +79,7 @@ def run(
     yield from _by_kind(everything)
     yield from _ablations(system, sets, ablate, false_alarm_rate)
     if pysindy:
-        from benchmarks.sindy import compare
+        from sprung.benchmarks.sindy import compare
 
         chosen = {
             name: [(folder / f, t) for f, t in list(_labels(folder).items())[:pysindy]] for name, folder in sets.items()
@@ -139,8 +139,9 @@ def _progress(what: str) -> Callable[[str], None]:
 def engine_digest() -> str:
     """Tells one state of the diagnosis from another, so that results of an older one are not taken for new."""
     hashed = hashlib.sha256()
-    for source in sorted((Path(model.__file__).parent / "diagnosis").rglob("*.py")):
-        hashed.update(source.read_bytes())
+    for folder in ("laws", "simulate", "diagnosis"):
+        for source in sorted((Path(model.__file__).parent / folder).rglob("*.py")):
+            hashed.update(source.read_bytes())
     return hashed.hexdigest()[:12]
 
 

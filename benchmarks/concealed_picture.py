@@ -1,6 +1,6 @@
 """Pictures of the concealed-effects benchmark for docs/mismatch.md, from the folder that it has filled.
 
-`python -m benchmarks.concealed_picture concealed-results docs/img/mismatch`
+`python -m sprung.benchmarks.concealed_picture concealed-results docs/img/mismatch`
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 
-from benchmarks.concealed import NAMED
-from benchmarks.concealed_score import Score, confusion, detection_limit, oracle_threshold, score
-from service.report import ink
+from sprung.benchmarks.concealed import NAMED
+from sprung.benchmarks.concealed_score import Score, confusion, detection_limit, oracle_threshold, score
+from sprung.service.report import ink
 
 VERDICTS = ("consistent", "missing_physics", "sensor_fault", "unknown_physics")
 

@@ -25,12 +25,12 @@ from cantools.database.conversion import BaseConversion
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from model.signals import Channel
-from replay import open_recording
-from replay.account import Account
-from replay.candecode import CanDecoder
-from replay.frames import EXTENDED, FrameBlock
-from replay.recording import CAN_READERS
+from sprung.model.signals import Channel
+from sprung.replay import open_recording
+from sprung.replay.account import Account
+from sprung.replay.candecode import CanDecoder
+from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.recording import CAN_READERS
 
 MESSAGES, SIGNALS = 7, 4
 ROUNDS = 3

@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from model.excitation import simulate_runs
-from model.identify import Identifier
-from model.signals import Estimate, FloatArray
-from model.system import System, load_system
-from model.tracker import Tracker, TrackerSettings
-from model.tracking import changes, misfit, scatter
-from model.tracking.settings import SECONDS_PER_MONTH
-from service.errors import UserError
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import Identifier
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.system import System, load_system
+from sprung.model.tracking import changes, misfit, scatter
+from sprung.model.tracking.settings import SECONDS_PER_MONTH
+from sprung.model.tracking.tracker import Tracker, TrackerSettings
+from sprung.service.errors import UserError
 
 STEP = 0.05
 WITHIN = 30.0  # s

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.silverbox import data_file, diagnosis_of
-from model.system import load_system
-from replay.record import load_record
+from sprung.benchmarks.silverbox import data_file, diagnosis_of
+from sprung.model.system import load_system
+from sprung.replay.record import load_record
 
 SYSTEM = Path(__file__).parent / "systems" / "emps.yaml"
 PUBLISHED = {"mass": 95.11, "viscous": 203.50, "coulomb": 20.39, "offset": -3.16}

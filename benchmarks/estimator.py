@@ -12,12 +12,12 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from model.estimator import EstimatorNet, bundled_estimator
-from model.excitation import draw_log_ratios, simulate_runs
-from model.features import ForceBalance
-from model.refine import Refiner
-from model.signals import FloatArray
-from model.system import System, load_system
+from sprung.model.identification.estimator import EstimatorNet, bundled_estimator
+from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.identification.features import ForceBalance
+from sprung.model.identification.refine import Refiner
+from sprung.model.signals import FloatArray
+from sprung.model.system import System, load_system
 
 
 def run(windows: int = 500, seed: int = 201) -> Iterator[dict]:

@@ -14,15 +14,15 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from benchmarks.bounds import time_domain_bound
-from benchmarks.peers import ScipyPeer, ukf_peer
-from benchmarks.sensing import full_state_system
-from model.excitation import Runs, draw_log_ratios, simulate_runs
-from model.features import magnitudes
-from model.identify import Identifier, load_identifier
-from model.refine import Refiner
-from model.signals import Estimate, FloatArray
-from model.system import System, load_system
+from sprung.benchmarks.bounds import time_domain_bound
+from sprung.benchmarks.peers import ScipyPeer, ukf_peer
+from sprung.benchmarks.sensing import full_state_system
+from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
+from sprung.model.identification.features import magnitudes
+from sprung.model.identification.identify import Identifier, load_identifier
+from sprung.model.identification.refine import Refiner
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.system import System, load_system
 
 
 def run(

@@ -1,4 +1,6 @@
-"""Score the diagnosis on a folder of recordings with labels.json: `python -m benchmarks.labelled_cases DIR [FILE...]`.
+"""Score the diagnosis on a folder of recordings with labels.json.
+
+`python -m sprung.benchmarks.labelled_cases DIR [FILE...]`
 
 One line per recording: V verdict, L located, N named, then what was said.  Places and names count as right when the
 set of findings equals the label's; the effects of an unknown verdict are called `unknown`.
@@ -15,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from model.diagnosis.diagnose import Options, diagnose
-from model.diagnosis.report import Report
-from model.system import MANCHESTER_DBC, System, load_system
-from replay.record import load_record
+from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.diagnosis.report.report import Report
+from sprung.model.system import MANCHESTER_DBC, System, load_system
+from sprung.replay.record import load_record
 
 
 def run(folder: Path, files: list[str]) -> Iterator[dict[str, Any]]:

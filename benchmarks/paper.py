@@ -15,11 +15,11 @@ from typing import Any, cast, get_args
 
 import torch
 
-from benchmarks import paper_analysis, paper_train, paper_visual
-from benchmarks.paper_settings import Settings
-from model.alps.config import Budget
-from model.alps.fit import OutOfTime
-from service.errors import UserError
+from sprung.benchmarks import paper_analysis, paper_train, paper_visual
+from sprung.benchmarks.paper_settings import Settings
+from sprung.model.alps.config import Budget
+from sprung.model.alps.fit import OutOfTime
+from sprung.service.errors import UserError
 
 TASKS: dict[str, tuple[Callable[[Settings], Iterator[dict[str, Any]]], tuple[str, ...]]] = {
     "systems": (paper_visual.system_rows, ()),

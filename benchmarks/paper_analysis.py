@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
-from benchmarks import paper_pictures
-from benchmarks.paper_settings import Settings
-from benchmarks.paper_visual import TASKS
-from model.alps import kernels, metrics, phase
-from model.alps.config import NetworkConfig, TrainingConfig, training_config
-from model.alps.estimator import Estimator, Features, log_magnitudes, raw
-from model.alps.fit import draw_rollouts, pick_windows
-from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
+from sprung.benchmarks import paper_pictures
+from sprung.benchmarks.paper_settings import Settings
+from sprung.benchmarks.paper_visual import TASKS
+from sprung.model.alps import kernels, metrics, phase
+from sprung.model.alps.config import NetworkConfig, TrainingConfig, training_config
+from sprung.model.alps.estimator import Estimator, Features, log_magnitudes, raw
+from sprung.model.alps.fit import draw_rollouts, pick_windows
+from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 
 INPUTS = (1, 2, 4, 8)
 FEATURE_UPDATES = 1000

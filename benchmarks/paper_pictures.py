@@ -12,10 +12,10 @@ import torch
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
-from model.alps.evaluate import Predicted
-from model.alps.fit import VisualModel
-from model.alps.kernels import SAMPLE_RATE, KernelView, six_sines
-from model.alps.task import Task
+from sprung.model.alps.evaluate import Predicted
+from sprung.model.alps.fit import VisualModel
+from sprung.model.alps.kernels import SAMPLE_RATE, KernelView, six_sines
+from sprung.model.alps.task import Task
 
 plt.rcParams.update({"font.size": 9, "axes.titlesize": 9, "legend.fontsize": 8})
 plt.rcParams.update({"savefig.dpi": 150, "figure.constrained_layout.use": True})

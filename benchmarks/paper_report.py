@@ -1,4 +1,4 @@
-"""`python -m benchmarks.paper_report [FOLDER] [DOCUMENT]`: measured rows and pictures into docs/paper.md.
+"""`python -m sprung.benchmarks.paper_report [FOLDER] [DOCUMENT]`: measured rows and pictures into docs/paper.md.
 
 Reads the rows that `sprung bench paper` kept (runs/paper/quick by default) and replaces what stands between
 `<!-- rows TASK -->` or `<!-- targets -->` and `<!-- end -->` in the document, so that figures there are never typed by

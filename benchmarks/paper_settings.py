@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from model.alps.config import Budget
-from model.alps.fit import Clock
+from sprung.model.alps.config import Budget
+from sprung.model.alps.fit import Clock
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks import paper_pictures
-from benchmarks.bounds import shared_bound
-from benchmarks.paper_settings import Settings
-from model.alps import train_fit
-from model.alps.task import WINDOW, windows
-from model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
-from model.alps.train_system import STEPS, TrainData, full_state_system, generate, to_points
-from model.estimator import Estimator, new_estimator, noise_power
-from model.identify import load_identifier
-from model.refine import Refiner
-from model.system import System, load_system
+from sprung.benchmarks import paper_pictures
+from sprung.benchmarks.bounds import shared_bound
+from sprung.benchmarks.paper_settings import Settings
+from sprung.model.alps import train_fit
+from sprung.model.alps.task import WINDOW, windows
+from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
+from sprung.model.alps.train_system import STEPS, TrainData, full_state_system, generate, to_points
+from sprung.model.identification.estimator import Estimator, new_estimator, noise_power
+from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.refine import Refiner
+from sprung.model.system import System, load_system
 
 CONSTANT_METHODS = ("alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors", "alps_known_sensors")
 CHANGING_METHODS = (

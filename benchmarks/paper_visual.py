@@ -10,14 +10,14 @@ from typing import Any, cast
 import numpy as np
 import torch
 
-from benchmarks import paper_pictures
-from benchmarks.paper_settings import Settings
-from model.alps import evaluate, mass_spring_damper, pendulum, two_body
-from model.alps.config import METHODS, NetworkConfig, training_config
-from model.alps.config import Method as MethodName
-from model.alps.evaluate import Predicted
-from model.alps.fit import Split, VisualModel, embedded, train_frames, train_method
-from model.alps.task import Task
+from sprung.benchmarks import paper_pictures
+from sprung.benchmarks.paper_settings import Settings
+from sprung.model.alps import evaluate, mass_spring_damper, pendulum, two_body
+from sprung.model.alps.config import METHODS, NetworkConfig, training_config
+from sprung.model.alps.config import Method as MethodName
+from sprung.model.alps.evaluate import Predicted
+from sprung.model.alps.fit import Split, VisualModel, embedded, train_frames, train_method
+from sprung.model.alps.task import Task
 
 __all__ = ["METHODS", "rows"]
 

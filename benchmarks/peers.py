@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.optimize import least_squares
 
-from model.signals import FloatArray
-from model.system import System
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
 
 
 @dataclass(frozen=True, slots=True)

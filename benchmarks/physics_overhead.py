@@ -17,15 +17,15 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.alps import mass_spring_damper
-from model.alps.config import NetworkConfig, training_config
-from model.alps.fit import VisualModel
-from model.alps.frames import FrameAutoencoder
-from model.alps.losses import loss_of, picture_loss
-from model.alps.network import Network
-from model.alps.task import WINDOW, Task
-from model.simulate.ode import solve
-from service.errors import UserError
+from sprung.model.alps import mass_spring_damper
+from sprung.model.alps.config import NetworkConfig, training_config
+from sprung.model.alps.fit import VisualModel
+from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.losses import loss_of, picture_loss
+from sprung.model.alps.network import Network
+from sprung.model.alps.task import WINDOW, Task
+from sprung.model.simulate.ode import solve
+from sprung.service.errors import UserError
 
 BATCH = 10  # windows, the paper's
 REPEATS = {"quick": 3, "full": 30}

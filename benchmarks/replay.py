@@ -16,16 +16,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from service.threads import one_thread_each
+from sprung.service.threads import one_thread_each
 
-RECORDING = Path(__file__).parent.parent / "tests" / "data" / "drift-600s.blf"
+RECORDING = Path(__file__).resolve().parents[1] / "tests" / "data" / "drift-600s.blf"
 TARGET = 100.0  # times real time
 
 CHILD = """
 import json, resource, sys, time
 begun = time.perf_counter()
 from pathlib import Path
-from benchmarks.replay import one_run
+from sprung.benchmarks.replay import one_run
 print(json.dumps(one_run(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), begun)))
 """
 
@@ -77,12 +77,12 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
     import resource
     import time
 
-    import service.feed
-    from service.compute import Compute
-    from service.engine import load_engine
-    from service.pipeline import Batch, Pipeline
-    from service.settings import Settings
-    from service.store import open_store
+    from sprung.service import feed
+    from sprung.service.compute import Compute
+    from sprung.service.engine import load_engine
+    from sprung.service.pipeline import Batch, Pipeline
+    from sprung.service.settings import Settings
+    from sprung.service.store import open_store
 
     engine = load_engine(Settings())
     stages: dict[str, float] = {}
@@ -92,10 +92,10 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
             stages[stage] = stages.get(stage, 0.0) + seconds
 
     if times > 1:
-        service.feed.open_recording = _longer(service.feed.open_recording, times)  # type: ignore[assignment]
+        feed.open_recording = _longer(feed.open_recording, times)  # type: ignore[assignment]
     started = time.perf_counter()
     store, compute = open_store(store_file), Compute(8)
-    fed = service.feed.feed_file(Pipeline(engine, store, compute), recording, on_batch=add)
+    fed = feed.feed_file(Pipeline(engine, store, compute), recording, on_batch=add)
     compute.close()
     store.close()
     ended = time.perf_counter()

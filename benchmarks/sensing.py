@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from model.excitation import Runs
-from model.mechanics import DISPLACEMENT, VELOCITY
-from model.refine import Refiner
-from model.schema import MotionSensor
-from model.signals import FloatArray
-from model.system import System, load_system
+from sprung.model.identification.excitation import Runs
+from sprung.model.identification.refine import Refiner
+from sprung.model.mechanics import DISPLACEMENT, VELOCITY
+from sprung.model.schema import MotionSensor
+from sprung.model.signals import FloatArray
+from sprung.model.system import System, load_system
 
 
 def full_state_system(typical: Runs, share: float) -> System:

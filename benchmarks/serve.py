@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from model.excitation import simulate_runs
-from model.system import System, load_system
-from service.threads import one_thread_each
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.system import System, load_system
+from sprung.service.threads import one_thread_each
 
 TARGET_MS = 15.0
 WARM_UP = 20
@@ -170,10 +170,10 @@ def _serve_echo(port: int) -> None:
 def _serve_sprung(port: int, folder: str) -> None:
     import uvicorn
 
-    from service.api.app import create_app
-    from service.core import build_core
-    from service.engine import load_engine
-    from service.settings import Settings
+    from sprung.service.api.app import create_app
+    from sprung.service.core import build_core
+    from sprung.service.engine import load_engine
+    from sprung.service.settings import Settings
 
     settings = Settings(data_dir=Path(folder))
     uvicorn.run(create_app(build_core(settings, load_engine(settings))), port=port, log_level="error", access_log=False)

@@ -14,10 +14,10 @@ import torch
 from scipy.integrate import solve_ivp
 from torch import Tensor
 
-from model.excitation import draw_log_ratios, simulate_runs
-from model.simulate.linear import LinearSimulator
-from model.simulate.ode import LinearRate, solve
-from model.system import load_system
+from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.simulate.ode import LinearRate, solve
+from sprung.model.system import load_system
 
 
 def run(windows: int = 256, scipy_windows: int = 3) -> Iterator[dict]:

@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from benchmarks.concealed_score import rate
-from benchmarks.generator import Vehicle
-from model.system import System
-from replay.record import load_record
+from sprung.benchmarks.concealed_score import rate
+from sprung.benchmarks.generator import Vehicle
+from sprung.model.system import System
+from sprung.replay.record import load_record
 
 Array = NDArray[np.float64]
 

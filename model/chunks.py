@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from model.signals import BoolArray, IntArray
+from sprung.model.signals import BoolArray, IntArray
 
 CHUNK = 32  # windows
 WORKERS = min(2, os.cpu_count() or 1)  # of a diagnosis: each fit holds some 200 MB for a minute of twelve sensors

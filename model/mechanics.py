@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from model.schema import Body, ElementSensor, ForceInput, SupportInput, SystemFile
-from model.signals import FloatArray, IntArray
+from sprung.model.schema import Body, ElementSensor, ForceInput, SupportInput, SystemFile
+from sprung.model.signals import FloatArray, IntArray
 
 ACCELERATION, VELOCITY, DISPLACEMENT, DEFLECTION, FORCE = range(5)
 SENSOR_KINDS = ("acceleration", "velocity", "displacement", "deflection", "force")

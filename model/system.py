@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.mechanics import Mechanics, assemble
-from model.schema import (
+from sprung.model.mechanics import Mechanics, assemble
+from sprung.model.schema import (
     Address,
     ForceInput,
     SupportInput,
@@ -20,7 +20,7 @@ from model.schema import (
     parse_system_file,
     read_system_file,
 )
-from model.signals import Channel, FloatArray
+from sprung.model.signals import Channel, FloatArray
 
 BUNDLED = Path(__file__).parent / "systems"
 MANCHESTER = BUNDLED / "manchester.yaml"

@@ -4,7 +4,7 @@ The doors: `open_recording` (files), `replay.live.LiveBus` (buses), `replay.wind
 and `replay.record.load_record` (one long even record).
 """
 
-from replay.account import UnreadableRecording
-from replay.recording import Recording, open_recording
+from sprung.replay.account import UnreadableRecording
+from sprung.replay.recording import Recording, open_recording
 
 __all__ = ["Recording", "UnreadableRecording", "open_recording"]

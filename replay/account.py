@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from model.signals import Tally
+from sprung.model.signals import Tally
 
 
 class UnreadableRecording(ValueError):

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from can.io.asc import ASCReader
 
-from replay.account import Account, UnreadableRecording
-from replay.frames import EXTENDED, FrameBlock
-from replay.textframes import LineFrames, decimal_ns, line_batches
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.textframes import LineFrames, decimal_ns, line_batches
 
 DATE = re.compile(rb"(?:date|Begin Trigger ?block)\s+\w+\s+(?P<date>.+)", re.IGNORECASE)
 BASE = re.compile(rb"base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<stamps>absolute|relative))?", re.IGNORECASE)

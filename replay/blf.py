@@ -17,9 +17,9 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from model.signals import IntArray
-from replay.account import Account, UnreadableRecording
-from replay.frames import ByteArray, FrameBlock
+from sprung.model.signals import IntArray
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.frames import ByteArray, FrameBlock
 
 IndexArray = NDArray[np.intp]
 

@@ -20,9 +20,9 @@ import numpy as np
 from cantools.database import Database, Message, Signal
 from numpy.typing import NDArray
 
-from model.signals import BoolArray, Channel, FloatArray, SampleBlock
-from replay.account import Account, UnreadableRecording
-from replay.frames import EXTENDED, ByteArray, FrameBlock, WordArray, id_text, last_byte, raw_bits
+from sprung.model.signals import BoolArray, Channel, FloatArray, SampleBlock
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.frames import EXTENDED, ByteArray, FrameBlock, WordArray, id_text, last_byte, raw_bits
 
 INVALID_CHOICE = re.compile(
     r"invalid|not[ _]?(available|avail|valid|supported|defined|used)|unavailable|unknown|undefined|"

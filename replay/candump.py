@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from replay.account import Account, UnreadableRecording
-from replay.frames import EXTENDED, FrameBlock
-from replay.textframes import LineFrames, decimal_ns, line_batches
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.textframes import LineFrames, decimal_ns, line_batches
 
 ERROR_FLAG = 0x2000_0000
 

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from model.signals import Channel, FloatArray, SampleBlock
-from replay.account import Account, UnreadableRecording
+from sprung.model.signals import Channel, FloatArray, SampleBlock
+from sprung.replay.account import Account, UnreadableRecording
 
 TIME = "time"
 BATCH_ROWS = 4096

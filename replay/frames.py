@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.signals import IntArray
+from sprung.model.signals import IntArray
 
 ByteArray = NDArray[np.uint8]
 WordArray = NDArray[np.uint64]

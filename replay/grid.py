@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from model.signals import BoolArray, FloatArray, IntArray
+from sprung.model.signals import BoolArray, FloatArray, IntArray
 
 TOLERANCE = 0.25  # of a grid period: samples nearer to their grid point than this are copied
 SLOWEST = 0.5  # own rate / grid rate below which a channel cannot be interpolated

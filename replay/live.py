@@ -12,11 +12,11 @@ import can
 import numpy as np
 from cantools.database import Database
 
-from model.signals import Channel, SampleBlock, Tally
-from replay.account import Account, UnreadableRecording
-from replay.candecode import CanDecoder
-from replay.frames import EXTENDED, FrameBlock
-from replay.recording import CAN_READERS
+from sprung.model.signals import Channel, SampleBlock, Tally
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.candecode import CanDecoder
+from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.recording import CAN_READERS
 
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0  # s, doubled from try to try
 MOST_FRAMES = 4096  # frames of one block, so that a flooded bus stays bounded in memory

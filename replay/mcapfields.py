@@ -20,9 +20,9 @@ from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
 from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 
-from model.signals import FloatArray, IntArray
-from replay.account import Account
-from replay.mcapfile import Messages
+from sprung.model.signals import FloatArray, IntArray
+from sprung.replay.account import Account
+from sprung.replay.mcapfile import Messages
 
 TimeSource = Literal["auto", "header", "publish", "log"]
 STAMP_PATHS = (("header", "stamp"), ("timestamp",), ("stamp",))

@@ -22,7 +22,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Metadata, Schema, Statistics
 
-from replay.account import Account, UnreadableRecording
+from sprung.replay.account import Account, UnreadableRecording
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_SIZE_LIMIT = 1 << 30  # bytes; a longer record is damage, not data

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from model.signals import Channel, SampleBlock
-from replay.account import Account, UnreadableRecording
-from replay.mcapfields import Field, TimeSource, Topic, parse_field
-from replay.mcapfile import DISORDER, Batch, McapFile
+from sprung.model.signals import Channel, SampleBlock
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.mcapfields import Field, TimeSource, Topic, parse_field
+from sprung.replay.mcapfile import DISORDER, Batch, McapFile
 
 SORTED_SAMPLES = 65_536  # handed out together from a recording that had to be sorted
 SOURCES = ("auto", "header", "publish", "log")

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from replay.account import Account, UnreadableRecording
-from replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
 
 
 def frames(path: Path, account: Account) -> Iterator[FrameBlock]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
-from model.signals import SampleBlock
+from sprung.model.signals import SampleBlock
 
 LONGEST_WAIT = 5.0  # s of recorded time; a longer pause in the recording is not waited for
 SLICE = 0.05  # s of recorded time that is handed out at once

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from cantools.database import Database
 
-from model.signals import Channel, FloatArray, SampleBlock
-from replay.account import Account, UnreadableRecording
-from replay.grid import REACH, place, resample
-from replay.recording import Recording, open_recording
-from replay.stream import Jump, Order
+from sprung.model.signals import Channel, FloatArray, SampleBlock
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.grid import REACH, place, resample
+from sprung.replay.recording import Recording, open_recording
+from sprung.replay.stream import Jump, Order
 
 ROWS_AT_ONCE = 512  # rows that are resampled together, so that memory stays small
 

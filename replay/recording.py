@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 from cantools.database import Database
 
-from model.signals import Channel, SampleBlock, Tally
-from replay import asc, blf, candump, csvtable, mcaptopics, mf4
-from replay.account import Account, UnreadableRecording
-from replay.candecode import CanDecoder
-from replay.frames import FrameBlock
+from sprung.model.signals import Channel, SampleBlock, Tally
+from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.candecode import CanDecoder
+from sprung.replay.frames import FrameBlock
 
 FrameReader = Callable[[Path, Account], Iterator[FrameBlock]]
 

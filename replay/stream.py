@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.signals import SampleBlock
+from sprung.model.signals import SampleBlock
 
 
 @dataclass(frozen=True, slots=True)

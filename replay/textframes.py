@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from replay.account import Account
-from replay.frames import FrameBlock
+from sprung.replay.account import Account
+from sprung.replay.frames import FrameBlock
 
 BATCH_BYTES = 1 << 19
 

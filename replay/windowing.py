@@ -8,9 +8,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
-from replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample
-from replay.stream import Jump, Order
+from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
+from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample
+from sprung.replay.stream import Jump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
 MOST_WINDOWS = 64  # that are made together

@@ -6,9 +6,9 @@ import threading
 from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 
-from service.engine import Engine
-from service.pipeline import Batch
-from service.views import VehicleView, vehicle_view
+from sprung.service.engine import Engine
+from sprung.service.pipeline import Batch
+from sprung.service.views import VehicleView, vehicle_view
 
 
 @dataclass(slots=True)

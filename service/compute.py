@@ -10,7 +10,7 @@ from concurrent.futures import Future
 from enum import IntEnum
 from typing import Any, TypeVar
 
-from service.errors import Busy
+from sprung.service.errors import Busy
 
 T = TypeVar("T")
 

@@ -8,22 +8,22 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
-from model.signals import Tally
-from service.board import Board
-from service.compute import Compute
-from service.diagnoses import Diagnoses
-from service.engine import Engine
-from service.feed import OnTally
-from service.housekeeping import Housekeeping
-from service.jobs import Handler, Jobs
-from service.metrics import Metrics
-from service.pipeline import Batch, Pipeline
-from service.recordings import RecordingJobs
-from service.ring import Rings
-from service.settings import Settings
-from service.store import Store, fleet, open_store
-from service.store.windows import latest_window
-from service.views import VehicleView, vehicle_view
+from sprung.model.signals import Tally
+from sprung.service.board import Board
+from sprung.service.compute import Compute
+from sprung.service.diagnoses import Diagnoses
+from sprung.service.engine import Engine
+from sprung.service.feed import OnTally
+from sprung.service.housekeeping import Housekeeping
+from sprung.service.jobs import Handler, Jobs
+from sprung.service.metrics import Metrics
+from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.recordings import RecordingJobs
+from sprung.service.ring import Rings
+from sprung.service.settings import Settings
+from sprung.service.store import Store, fleet, open_store
+from sprung.service.store.windows import latest_window
+from sprung.service.views import VehicleView, vehicle_view
 
 log = logging.getLogger("sprung")
 

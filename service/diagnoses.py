@@ -17,18 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from replay.account import Account
-from replay.record import Record
-from service.engine import Engine
-from service.errors import Busy, UserError
-from service.jobs import Jobs, Progress, Stopped
-from service.pipeline import Batch
-from service.recordings import stored_file
-from service.ring import Excerpt, Rings
-from service.settings import Settings
-from service.store import Store, fleet, work
-from service.store.work import JobRow, RecordingRow, ReportRow
-from service.times import NANOSECONDS, now_ns
+from sprung.replay.account import Account
+from sprung.replay.record import Record
+from sprung.service.engine import Engine
+from sprung.service.errors import Busy, UserError
+from sprung.service.jobs import Jobs, Progress, Stopped
+from sprung.service.pipeline import Batch
+from sprung.service.recordings import stored_file
+from sprung.service.ring import Excerpt, Rings
+from sprung.service.settings import Settings
+from sprung.service.store import Store, fleet, work
+from sprung.service.store.work import JobRow, RecordingRow, ReportRow
+from sprung.service.times import NANOSECONDS, now_ns
 
 POLL_SECONDS = 0.2
 LONGEST_SECONDS = 600  # s a diagnosis may take
@@ -112,7 +112,7 @@ class Diagnoses:
         return self.jobs
 
     def _diagnose(self, path: Path, row: RecordingRow, out: Path, progress: Progress) -> dict[str, Any]:
-        command = [sys.executable, "-m", "service.cli", "diagnose", str(path), f"--name={row.name}"]
+        command = [sys.executable, "-m", "sprung", "diagnose", str(path), f"--name={row.name}"]
         command += ["--out", str(out), "--json"]
         if self._settings.system is not None:
             command += ["--system", str(self._settings.system)]

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from model.signals import Estimate, FloatArray
-from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
-from model.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
-from service.errors import UserError
-from service.settings import Settings
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
+from sprung.service.errors import UserError
+from sprung.service.settings import Settings
 
 log = logging.getLogger("sprung.engine")
 
@@ -30,7 +30,7 @@ class StageTimes(Protocol):
 
 
 class Identifies(Protocol):
-    """The part of `model.identify.Identifier` that the service uses."""
+    """The part of `model.identification.identify.Identifier` that the service uses."""
 
     @property
     def digest(self) -> str:
@@ -89,7 +89,7 @@ def load_engine(settings: Settings) -> Engine:
     """
     import torch  # takes a second; a bad system file is told before
 
-    from model.identify import load_identifier
+    from sprung.model.identification.identify import load_identifier
 
     torch.set_num_threads(1)  # batches are shared among workers instead: single operations are too small to split
 

@@ -12,15 +12,15 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any, Protocol, TypeVar
 
-from model.signals import SampleBlock, Tally, Window
-from model.tracker import TrackerState
-from replay import open_recording
-from replay.pacing import paced
-from replay.windowing import Windower
-from service.compute import Priority
-from service.errors import Busy
-from service.pipeline import Batch, Identified, Pipeline
-from service.times import NANOSECONDS
+from sprung.model.signals import SampleBlock, Tally, Window
+from sprung.model.tracking.tracker import TrackerState
+from sprung.replay import open_recording
+from sprung.replay.pacing import paced
+from sprung.replay.windowing import Windower
+from sprung.service.compute import Priority
+from sprung.service.errors import Busy
+from sprung.service.pipeline import Batch, Identified, Pipeline
+from sprung.service.times import NANOSECONDS
 
 T = TypeVar("T")
 NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")

@@ -7,9 +7,9 @@ import threading
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.settings import Settings
-from service.store import Store, retention
-from service.times import NANOSECONDS, now_ns
+from sprung.service.settings import Settings
+from sprung.service.store import Store, retention
+from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.housekeeping")
 PERIOD_SECONDS = 3600.0

@@ -12,9 +12,9 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from service.errors import Busy, UserError
-from service.store import Store, work
-from service.times import now_ns
+from sprung.service.errors import Busy, UserError
+from sprung.service.store import Store, work
+from sprung.service.times import now_ns
 
 log = logging.getLogger("sprung.jobs")
 WORST_MESSAGE = "an unexpected error; the service's log has the details"

@@ -16,16 +16,16 @@ from typing import NoReturn
 
 import uvicorn
 
-from replay.live import LiveBus
-from service.api.app import create_app
-from service.core import Core, build_core
-from service.engine import load_engine
-from service.errors import UserError
-from service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
-from service.pipeline import Batch
-from service.recordings import file_row, finish_row
-from service.settings import Settings
-from service.store.work import add_recording
+from sprung.replay.live import LiveBus
+from sprung.service.api.app import create_app
+from sprung.service.core import Core, build_core
+from sprung.service.engine import load_engine
+from sprung.service.errors import UserError
+from sprung.service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
+from sprung.service.pipeline import Batch
+from sprung.service.recordings import file_row, finish_row
+from sprung.service.settings import Settings
+from sprung.service.store.work import add_recording
 
 log = logging.getLogger("sprung")
 

@@ -8,9 +8,9 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from model.signals import Tally
-from service.board import Board, Entry
-from service.times import NANOSECONDS
+from sprung.model.signals import Tally
+from sprung.service.board import Board, Entry
+from sprung.service.times import NANOSECONDS
 
 STAGE_BUCKETS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 VALUES = {

@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from sqlalchemy import Connection
 
-from model.signals import Estimate, Window
-from model.tracker import TrackerState
-from service.compute import Compute, Priority
-from service.engine import Engine
-from service.store import Store, fleet, history
-from service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
-from service.times import now_ns
+from sprung.model.signals import Estimate, Window
+from sprung.model.tracking.tracker import TrackerState
+from sprung.service.compute import Compute, Priority
+from sprung.service.engine import Engine
+from sprung.service.store import Store, fleet, history
+from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from sprung.service.times import now_ns
 
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from replay import UnreadableRecording
-from service.errors import UserError
-from service.feed import Fed, OnTally, feed_file
-from service.jobs import Progress
-from service.pipeline import Batch, Pipeline
-from service.settings import Settings
-from service.store import Store, fleet, work
-from service.store.work import JobRow
-from service.times import now_ns
+from sprung.replay import UnreadableRecording
+from sprung.service.errors import UserError
+from sprung.service.feed import Fed, OnTally, feed_file
+from sprung.service.jobs import Progress
+from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.settings import Settings
+from sprung.service.store import Store, fleet, work
+from sprung.service.store.work import JobRow
+from sprung.service.times import now_ns
 
 
 def _uncounted(_source: str) -> OnTally:

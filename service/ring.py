@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.signals import FloatArray, Window
-from service.times import NANOSECONDS
+from sprung.model.signals import FloatArray, Window
+from sprung.service.times import NANOSECONDS
 
 
 @dataclass(frozen=True, slots=True)

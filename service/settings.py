@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from service.errors import UserError
+from sprung.service.errors import UserError
 
 
 def default_data_dir() -> Path:

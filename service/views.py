@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from model.signals import FloatArray
-from model.tracker import Alarm, TrackerState
-from service.engine import Engine
-from service.store.fleet import AlarmRow
-from service.store.windows import WindowRecord
-from service.times import optional_iso, to_iso
+from sprung.model.signals import FloatArray
+from sprung.model.tracking.tracker import Alarm, TrackerState
+from sprung.service.engine import Engine
+from sprung.service.store.fleet import AlarmRow
+from sprung.service.store.windows import WindowRecord
+from sprung.service.times import optional_iso, to_iso
 
 SEVERITIES = ("warning", "alarm")
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from model.system import MANCHESTER_DBC, System, load_system
-from service.compute import Compute
-from service.engine import Engine, make_tracker
-from service.pipeline import Pipeline
-from service.store import Store, open_store
+from sprung.model.system import MANCHESTER_DBC, System, load_system
+from sprung.service.compute import Compute
+from sprung.service.engine import Engine, make_tracker
+from sprung.service.pipeline import Pipeline
+from sprung.service.store import Store, open_store
 from tests.service_fakes import FakeIdentifier
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from model.system import System, parse_system
+from sprung.model.system import System, parse_system
 
 SYSTEM = """
 name: quarter-car

@@ -12,8 +12,8 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from model.signals import Channel
-from replay import open_recording
+from sprung.model.signals import Channel
+from sprung.replay import open_recording
 
 START = 1_790_000_000_000_000_000
 STEP = 10_000_000

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from model.signals import Estimate, FloatArray, Window
-from model.system import System
+from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.model.system import System
 
 START = 1_790_000_000_000_000_000  # ns
 HOP = 500_000_000  # ns

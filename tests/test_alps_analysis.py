@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import paper_report
-from model.alps import kernels, metrics, pendulum, phase, two_body
+from sprung.benchmarks import paper_report
+from sprung.model.alps import kernels, metrics, pendulum, phase, two_body
 
 
 def test_the_tangent_kernel_is_that_of_a_wide_network() -> None:

@@ -10,21 +10,21 @@ import torch
 from scipy.special import i0, i1
 from scipy.stats import vonmises
 
-from model.alps import mass_spring_damper, pendulum, two_body
-from model.alps.config import METHODS, NetworkConfig, TrainingConfig
-from model.alps.context import ContextDynamics
-from model.alps.embedding import ConvolutionalEmbedding, positions
-from model.alps.encoder import AttentionEncoder, DifferenceEncoder
-from model.alps.estimator import Estimator, log_magnitudes
-from model.alps.losses import loss_of
-from model.alps.network import Network
-from model.alps.posterior import (
+from sprung.model.alps import mass_spring_damper, pendulum, two_body
+from sprung.model.alps.config import METHODS, NetworkConfig, TrainingConfig
+from sprung.model.alps.context import ContextDynamics
+from sprung.model.alps.embedding import ConvolutionalEmbedding, positions
+from sprung.model.alps.encoder import AttentionEncoder, DifferenceEncoder
+from sprung.model.alps.estimator import Estimator, log_magnitudes
+from sprung.model.alps.losses import loss_of
+from sprung.model.alps.network import Network
+from sprung.model.alps.posterior import (
     gaussian_divergence,
     gaussian_sample,
     von_mises_divergence,
     von_mises_sample,
 )
-from model.alps.task import WINDOW
+from sprung.model.alps.task import WINDOW
 
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
 SIZES = NetworkConfig()

@@ -9,11 +9,11 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from model.alps import mass_spring_damper, pendulum, two_body
-from model.alps.config import NetworkConfig
-from model.alps.encoder import AttentionEncoder
-from model.alps.rollout import held, runge_kutta
-from model.alps.task import ROLLOUT, WINDOW, Task, windows
+from sprung.model.alps import mass_spring_damper, pendulum, two_body
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.encoder import AttentionEncoder
+from sprung.model.alps.rollout import held, runge_kutta
+from sprung.model.alps.task import ROLLOUT, WINDOW, Task, windows
 
 SIZES = NetworkConfig()
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
@@ -150,7 +150,7 @@ def test_pictures_are_small_anti_aliased_and_follow_the_state(task: Task) -> Non
 
 
 def test_a_disc_covers_its_area() -> None:
-    from model.alps.rendering import disc
+    from sprung.model.alps.rendering import disc
 
     column, row = torch.tensor([31.2, 20.9]), torch.tensor([30.0, 40.4])
     area = disc(column, row, 5.0).sum((1, 2))

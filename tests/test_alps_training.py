@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import paper
-from benchmarks.bounds import shared_bound
-from benchmarks.physics_overhead import _stepwise
-from model.alps import fit, mass_spring_damper, train_fit, two_body
-from model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
-from model.alps.evaluate import every_window, predict, state_figures
-from model.alps.fit import Clock, OutOfTime, Split
-from model.alps.frames import FrameAutoencoder
-from model.alps.losses import tempered
-from model.alps.task import WINDOW
-from model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
-from model.refine import Refiner
-from model.simulate.linear import LinearSimulator
-from model.system import load_system
-from service.errors import UserError
+from sprung.benchmarks import paper
+from sprung.benchmarks.bounds import shared_bound
+from sprung.benchmarks.physics_overhead import _stepwise
+from sprung.model.alps import fit, mass_spring_damper, train_fit, two_body
+from sprung.model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
+from sprung.model.alps.evaluate import every_window, predict, state_figures
+from sprung.model.alps.fit import Clock, OutOfTime, Split
+from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.losses import tempered
+from sprung.model.alps.task import WINDOW
+from sprung.model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
+from sprung.model.identification.refine import Refiner
+from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.system import load_system
+from sprung.service.errors import UserError
 
 SIZES = NetworkConfig()
 TINY = TrainingConfig(

@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 OURS = ("model", "replay", "service", "benchmarks")
 MAY_IMPORT = {
     "model": {"model"},
-    "replay": {"replay", "model.signals"},
+    "replay": {"replay", "sprung.model.signals"},
     "service": {"service", "model", "replay", "benchmarks"},
     "benchmarks": {"benchmarks", "model", "replay", "service"},
 }
@@ -28,10 +28,11 @@ def imported(path: Path) -> set[str]:
     found: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
+            found |= {alias.name.removeprefix("sprung.") for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            found.add(node.module or "")
+            module = (node.module or "").removeprefix("sprung.")
+            found |= {alias.name for alias in node.names} if module == "sprung" else {module}
     return found
 
 

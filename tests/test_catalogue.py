@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from model.diagnosis.catalogue import (
+from sprung.model.laws import (
     CATALOGUE,
     ElementLaw,
     SpringDamper,
@@ -13,9 +13,9 @@ from model.diagnosis.catalogue import (
     find_law,
     observe,
 )
-from model.diagnosis.catalogue.base import CLOCK_LEAD, Motion
-from model.diagnosis.catalogue.stiffness import CLEARANCE
-from model.diagnosis.catalogue.trajectory import along, parameter_columns, phi
+from sprung.model.laws.base import CLOCK_LEAD, Motion
+from sprung.model.laws.stiffness import CLEARANCE
+from sprung.model.laws.trajectory import along, parameter_columns, phi
 
 SPRING = SpringDamper(4.3e5, 2.0e4)
 RATE = 1000.0

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.diagnosis.catalogue import find_law, sensor_laws
-from model.simulate.nonlinear import NonlinearSimulator
-from model.system import load_system
+from sprung.model.laws import find_law, sensor_laws
+from sprung.model.simulate.nonlinear import NonlinearSimulator
+from sprung.model.system import load_system
 
 SYSTEM = load_system()
 MECHANICS = SYSTEM.mechanics

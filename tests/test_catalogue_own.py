@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.diagnosis.catalogue import CATALOGUE, SpringDamper, load_laws, observe
-from model.diagnosis.catalogue.own import LawFileError
-from model.diagnosis.catalogue.trajectory import along, parameter_columns
-from model.simulate.nonlinear import NonlinearSimulator, Placement
-from model.system import load_system
+from sprung.model.laws import CATALOGUE, SpringDamper, load_laws, observe
+from sprung.model.laws.own import LawFileError
+from sprung.model.laws.trajectory import along, parameter_columns
+from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement
+from sprung.model.system import load_system
 
 DOCUMENT = Path(__file__).parent.parent / "docs" / "catalogue.md"
 

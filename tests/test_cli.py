@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from diagnosis_cases import SYSTEM, simulate
 
-from model.system import MANCHESTER, System
-from service.cli import describe, main
-from service.cli.bench import parse
-from service.engine import Engine, make_tracker
-from service.errors import UserError
-from service.settings import Settings
+from sprung.model.system import MANCHESTER, System
+from sprung.service.cli import describe, main
+from sprung.service.cli.bench import parse
+from sprung.service.engine import Engine, make_tracker
+from sprung.service.errors import UserError
+from sprung.service.settings import Settings
 from tests.service_fakes import START, FakeIdentifier
 
 SECONDS = 40
@@ -33,12 +33,12 @@ def fake_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     """The commands load a fake identifier; the real one has tests and benchmarks of its own."""
 
     def load(settings: Settings) -> Engine:
-        from model.system import load_system
+        from sprung.model.system import load_system
 
         system = load_system(settings.system or MANCHESTER)
         return Engine(system, FakeIdentifier(system), make_tracker(system), settings.dbc)
 
-    monkeypatch.setattr("service.cli.replay.load_engine", load)
+    monkeypatch.setattr("sprung.service.cli.replay.load_engine", load)
     for name in list(os.environ):
         if name.startswith("SPRUNG_"):
             monkeypatch.delenv(name)
@@ -250,7 +250,7 @@ def test_options_of_a_benchmark_are_those_of_its_function() -> None:
 def sprung(*arguments: str, **options: Any) -> subprocess.Popen[str]:
     """The real command in a process of its own, which heeds Ctrl-C even where these tests run in the background."""
     return subprocess.Popen(
-        [sys.executable, "-m", "service.cli", *arguments],
+        [sys.executable, "-m", "sprung", *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -323,7 +323,7 @@ def test_train_takes_several_recordings_and_tells_how_far_it_is(
         progress("simulate", 1, 2, float("nan"))
         asked.update(windows=recordings.shape, records=settings.records, out=out)
 
-    monkeypatch.setattr("model.training.train", train)
+    monkeypatch.setattr("sprung.model.identification.training.train", train)
     arguments = ["train", "--system", str(csv_system), "--out", str(tmp_path), "--records", "5"]
     assert main([*arguments, "--recordings", str(healthy), str(healthy)]) == 0
     assert asked == {"windows": (2 * 79, 100, 28), "records": 5, "out": tmp_path}

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from benchmarks.generator import draw_cases, make_recordings, read_vehicle, track, write_set
-from benchmarks.generator.draw import FAULTS
-from benchmarks.generator.exact import exact_response
-from benchmarks.generator.files import WRITERS
-from benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, Motion, Plant, Slot
-from benchmarks.generator.laws import LAWS
-from benchmarks.generator.make import _integrated
-from model.system import MANCHESTER, MANCHESTER_DBC, load_system
-from replay.record import load_record
+from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle, track, write_set
+from sprung.benchmarks.generator.draw import FAULTS
+from sprung.benchmarks.generator.exact import exact_response
+from sprung.benchmarks.generator.files import WRITERS
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, Motion, Plant, Slot
+from sprung.benchmarks.generator.laws import LAWS
+from sprung.benchmarks.generator.make import _integrated
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
+from sprung.replay.record import load_record
 
 VEHICLE = read_vehicle(MANCHESTER)
 

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import concealed
-from benchmarks.generator import read_vehicle
-from benchmarks.silverbox import FINER, free_run, oscillator
-from benchmarks.sindy import regression, sparse_fit
-from model.diagnosis.report import FitFigures, RecordingFacts, Report
-from model.system import MANCHESTER
+from sprung.benchmarks import concealed
+from sprung.benchmarks.generator import read_vehicle
+from sprung.benchmarks.silverbox import FINER, free_run, oscillator
+from sprung.benchmarks.sindy import regression, sparse_fit
+from sprung.model.diagnosis.report.report import FitFigures, RecordingFacts, Report
+from sprung.model.system import MANCHESTER
 
 
 def quiet(system: Any, record: Any, options: Any = None, progress: Any = None) -> Report:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.concealed_score import (
+from sprung.benchmarks.concealed_score import (
     confusion,
     detection_limit,
     explained,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from diagnosis_cases import quarter_car, simulate
 
-from model.diagnosis.channels import prepare
-from model.diagnosis.cuts import cut
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.split import cut
 
 
 def prime_factors(number: int) -> set[int]:

@@ -5,15 +5,15 @@ import pytest
 from diagnosis_cases import Recorded
 from scipy.signal import resample
 
-from model.diagnosis.catalogue import find_law
-from model.diagnosis.channels import prepare
-from model.diagnosis.diagnose import baseline, refreshed
-from model.diagnosis.fit import Fit, Problem
-from model.diagnosis.measured import declared_noise, drifting, rate_of
-from model.diagnosis.point import Point
-from model.diagnosis.spectra import Grid
-from model.diagnosis.terms import Term
-from model.system import System, load_system, parse_system
+from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.investigation.diagnose import baseline, refreshed
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.signals import declared_noise, drifting, rate_of
+from sprung.model.diagnosis.record.spectra import Grid
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import find_law
+from sprung.model.system import System, load_system, parse_system
 
 SLIDE = """
 name: slide

@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from model.diagnosis.diagnose import Options, baseline, diagnose
-from model.diagnosis.fit import Problem
-from model.diagnosis.measured import Signals, declared_noise, transform
-from model.diagnosis.point import Point
-from model.system import parse_system
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.investigation.diagnose import Options, baseline, diagnose
+from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.system import parse_system
 from tests.diagnosis_cases import Recorded
 
 SYSTEM = """

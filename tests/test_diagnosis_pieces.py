@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from diagnosis_cases import DAMPING, STIFFNESS, quarter_car, simulate
 
-from model.diagnosis.catalogue import SpringDamper, find_law
-from model.diagnosis.catalogue.trajectory import along
-from model.diagnosis.channels import prepare
-from model.diagnosis.fit import Problem
-from model.diagnosis.hysteresis import force_along
-from model.diagnosis.march import march_forces
-from model.diagnosis.measured import declared_noise, transform
-from model.diagnosis.noise import input_noise
-from model.diagnosis.plant import Branch, Plant, Structure
-from model.diagnosis.point import Point
-from model.diagnosis.screen import screen
-from model.diagnosis.spectra import Grid
-from model.diagnosis.terms import Term
-from model.system import load_system
+from sprung.model.diagnosis.fit.noise import input_noise
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.signals import declared_noise, transform
+from sprung.model.diagnosis.record.spectra import Grid
+from sprung.model.diagnosis.response.plant import Branch, Plant, Structure
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.laws import SpringDamper, find_law
+from sprung.model.laws.along import force_along
+from sprung.model.laws.trajectory import along
+from sprung.model.system import load_system
 
 
 def _problem(record, system=None):

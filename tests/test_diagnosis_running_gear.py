@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from benchmarks.generator import draw_cases, make_recordings, read_vehicle
-from model.diagnosis.catalogue import CLOCK_LEAD, find_law
-from model.diagnosis.catalogue.sensors import delayed
-from model.diagnosis.diagnose import diagnose
-from model.system import MANCHESTER, load_system
+from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
+from sprung.model.diagnosis.investigation.diagnose import diagnose
+from sprung.model.laws import CLOCK_LEAD, find_law
+from sprung.model.laws.sensor_faults import delayed
+from sprung.model.system import MANCHESTER, load_system
 
 SYSTEM = load_system(MANCHESTER)
 RATE = SYSTEM.sample_rate

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from diagnosis_cases import DAMPING, STIFFNESS, Recorded, quarter_car, simulate
 
-from model.diagnosis.channels import DiagnosisError, TooLittleError
-from model.diagnosis.diagnose import Options, diagnose
+from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 
 
 def _diagnose(record: Recorded, **options):

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from test_system import QUARTER_CAR
 
-from model import training
-from model.estimator import WEIGHTS, ModelError, bundled_estimator, load_estimator
-from model.excitation import draw_log_ratios, simulate_runs
-from model.identify import load_identifier
-from model.refine import Refiner
-from model.system import load_system, parse_system
-from model.training import TrainingSettings, train
+from sprung.model.identification import training
+from sprung.model.identification.estimator import WEIGHTS, ModelError, bundled_estimator, load_estimator
+from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.refine import Refiner
+from sprung.model.identification.training import TrainingSettings, train
+from sprung.model.system import load_system, parse_system
 
 TINY = TrainingSettings(records=100, windows_per_record=2, steps=30, batch=64, checkpoint_every=10, recording_steps=6)
 SMALL_CAR = QUARTER_CAR.replace("window: 200", "window: 100")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from model.fusion import fuse, fused_noise
+from sprung.model.simulate.fusion import fuse, fused_noise
 
 NOISE = (1e-5, 5e-4)
 

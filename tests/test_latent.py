@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from model.diagnosis.catalogue import ElementLaw, find_law
-from model.diagnosis.latent import Axis, Surface, estimate_force
-from model.signals import FloatArray
-from model.simulate.nonlinear import Model, NonlinearSimulator, Placement
-from model.simulate.stepping import cubic_chain, exact_steps
-from model.system import parse_system
+from sprung.model.laws import ElementLaw, find_law
+from sprung.model.laws.spline import Axis, Surface, estimate_force
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.nonlinear import Model, NonlinearSimulator, Placement
+from sprung.model.simulate.stepping import cubic_chain, exact_steps
+from sprung.model.system import parse_system
 
 RATE, SAMPLES, NOISE = 100.0, 2000, np.array([0.01, 0.05])
 SYSTEM = """

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
 
-from model.signals import Channel
-from replay import UnreadableRecording
-from replay.live import LiveBus, send
-from replay.windowing import Windower
+from sprung.model.signals import Channel
+from sprung.replay import UnreadableRecording
+from sprung.replay.live import LiveBus, send
+from sprung.replay.windowing import Windower
 
 CHANNEL = Channel("speed", "m/s", 0.1, can="Train.Speed")
 DATABASE = Database([Message(0x123, "Train", 8, [Signal("Speed", 0, 16, minimum=0, maximum=65000)])])
@@ -96,7 +96,7 @@ def test_a_silent_bus_stops_at_once(dbc, bus_name):
 
 def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
     """The first opening fails, the second bus breaks after three frames, the third stays."""
-    monkeypatch.setattr("replay.live.FIRST_RETRY", 0.01)
+    monkeypatch.setattr("sprung.replay.live.FIRST_RETRY", 0.01)
     opened = count(1)
 
     class Breaking:

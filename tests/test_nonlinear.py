@@ -10,11 +10,11 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.special import ellipk
 
-from model.diagnosis.catalogue import Motion, SpringDamper, element_laws, find_law
-from model.diagnosis.catalogue.bodies import with_element
-from model.mechanics import Mechanics
-from model.simulate.nonlinear import NonlinearSimulator, Placement, band_limited
-from model.system import load_system, parse_system
+from sprung.model.laws import Motion, SpringDamper, element_laws, find_law
+from sprung.model.laws.bodies import with_element
+from sprung.model.mechanics import Mechanics
+from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement, band_limited
+from sprung.model.system import load_system, parse_system
 
 RATE = 100.0
 TOY = """
@@ -175,7 +175,7 @@ def test_segments_in_parallel_give_what_one_after_the_other_gives(monkeypatch):
     simulator = NonlinearSimulator(mechanics, RATE)
     together = simulator.run(knots, placements)
     assert together.solution.sweeps > 1
-    monkeypatch.setattr("model.simulate.segments._WIDTH", 1)
+    monkeypatch.setattr("sprung.model.simulate.segments._WIDTH", 1)
     alone = simulator.run(knots, placements)
     assert alone.solution.sweeps == 1
     assert error(together.states, alone.states) < 1e-5

@@ -19,12 +19,12 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from setuptools import find_packages
 
-from model.signals import Tally
-from model.system import System
-from service.board import Board
-from service.engine import Engine
-from service.metrics import Metrics
-from service.pipeline import Pipeline
+from sprung.model.signals import Tally
+from sprung.model.system import System
+from sprung.service.board import Board
+from sprung.service.engine import Engine
+from sprung.service.metrics import Metrics
+from sprung.service.pipeline import Pipeline
 from tests.service_fakes import make_window
 
 ROOT = Path(__file__).parent.parent
@@ -41,7 +41,7 @@ def locked(name: str) -> dict[str, str]:
 def test_every_folder_with_modules_is_installed() -> None:
     found = set(find_packages(str(ROOT), include=PROJECT["tool"]["setuptools"]["packages"]["find"]["include"]))
     folders = {
-        path.parent.relative_to(ROOT).as_posix().replace("/", ".")
+        "sprung." + path.parent.relative_to(ROOT).as_posix().replace("/", ".")
         for top in ("model", "replay", "service", "benchmarks")
         for path in (ROOT / top).rglob("*.py")
     }
@@ -51,7 +51,7 @@ def test_every_folder_with_modules_is_installed() -> None:
 def test_files_that_are_no_modules_are_package_data() -> None:
     data = PROJECT["tool"]["setuptools"]["package-data"]
     for top in ("model", "replay", "service", "benchmarks"):
-        shipped = {path for pattern in data.get(top, []) for path in (ROOT / top).glob(pattern)}
+        shipped = {path for pattern in data.get(f"sprung.{top}", []) for path in (ROOT / top).glob(pattern)}
         tracked = subprocess.run(
             ["git", "ls-files", top], cwd=ROOT, capture_output=True, text=True, check=False
         ).stdout.split()

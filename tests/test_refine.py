@@ -5,12 +5,12 @@ import pytest
 import torch
 from test_system import OSCILLATOR, QUARTER_CAR
 
-from model.excitation import draw_log_ratios, simulate_runs
-from model.features import ForceBalance, magnitudes
-from model.identify import Identifier, UnusableWindow, identifiability
-from model.linearise import WindowModel
-from model.refine import Refiner
-from model.system import load_system, parse_system
+from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.identification.features import ForceBalance, magnitudes
+from sprung.model.identification.identify import Identifier, UnusableWindow, identifiability
+from sprung.model.identification.linearise import WindowModel
+from sprung.model.identification.refine import Refiner
+from sprung.model.system import load_system, parse_system
 
 
 @pytest.fixture(scope="module")

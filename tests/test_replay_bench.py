@@ -1,6 +1,6 @@
 """The decode benchmark runs on input of its own making and says what it compares."""
 
-from benchmarks.decode import run
+from sprung.benchmarks.decode import run
 
 
 def test_the_decode_benchmark_gives_two_figures():

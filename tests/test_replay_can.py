@@ -6,10 +6,10 @@ import pytest
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
 
-from model.signals import Channel
-from replay.account import Account, UnreadableRecording
-from replay.candecode import CanDecoder, load_database
-from replay.frames import EXTENDED, FrameBlock, id_text, raw_bits
+from sprung.model.signals import Channel
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.candecode import CanDecoder, load_database
+from sprung.replay.frames import EXTENDED, FrameBlock, id_text, raw_bits
 
 START = 1_790_000_000_000_000_000
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from replay import UnreadableRecording
+from sprung.replay import UnreadableRecording
 from tests.replay_files import ROWS, START, STEP, TIMES, VALUES, database, read, write_can, write_csv, write_json
 
 TOLERANCE = 2_000  # ns; python-can writes float seconds

@@ -5,8 +5,8 @@ import pytest
 from cantools.database.can import Database, Message, Signal
 from mcap.writer import CompressionType, Writer
 
-from model.signals import Channel
-from replay import UnreadableRecording, open_recording
+from sprung.model.signals import Channel
+from sprung.replay import UnreadableRecording, open_recording
 from tests.replay_files import (
     CHANNELS,
     LEFT,

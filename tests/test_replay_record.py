@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from model.signals import Channel, SampleBlock
-from replay.pacing import paced
-from replay.record import load_record
+from sprung.model.signals import Channel, SampleBlock
+from sprung.replay.pacing import paced
+from sprung.replay.record import load_record
 from tests.replay_files import CHANNELS, START, STEP, VALUES, write_json
 
 CSV_CHANNELS = [Channel("force", "N", 1.0, csv="force"), Channel("position", "m", 1e-6, csv="position")]

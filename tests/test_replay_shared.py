@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from model.signals import Channel
-from replay import open_recording
-from replay.record import load_record
-from replay.windowing import Windower
+from sprung.model.signals import Channel
+from sprung.replay import open_recording
+from sprung.replay.record import load_record
+from sprung.replay.windowing import Windower
 
 SHARED = Path(__file__).parents[2] / "shared"
 RECORDINGS = SHARED / "recordings"

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.diagnosis.report import (
+from sprung.model.diagnosis.report.report import (
     Candidate,
     Finding,
     FitFigures,
@@ -19,10 +19,10 @@ from model.diagnosis.report import (
     RecordingFacts,
     Report,
 )
-from model.system import System, load_system
-from service.report import words, write_report
-from service.report.drawing import draw_system, lay_out
-from service.report.values import largest_bias
+from sprung.model.system import System, load_system
+from sprung.service.report import words, write_report
+from sprung.service.report.drawing import draw_system, lay_out
+from sprung.service.report.values import largest_bias
 
 SYSTEM = load_system()
 

@@ -11,11 +11,11 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from model.system import System
-from service.api.app import create_app
-from service.core import Core, build_core
-from service.engine import Engine
-from service.settings import Settings
+from sprung.model.system import System
+from sprung.service.api.app import create_app
+from sprung.service.core import Core, build_core
+from sprung.service.engine import Engine
+from sprung.service.settings import Settings
 from tests.service_fakes import FakeIdentifier, make_window
 
 PROBLEM = "application/problem+json"

@@ -17,22 +17,22 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from model.signals import SampleBlock, Tally
-from model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
-from replay.live import LiveBus
-from service.api.app import create_app
-from service.compute import Compute
-from service.core import Core, build_core
-from service.diagnoses import load_excerpt, save_excerpt
-from service.engine import Engine, make_tracker
-from service.errors import UserError
-from service.feed import feed_file, feed_live, prefetched, vehicle_of
-from service.main import Feeds, _bus
-from service.pipeline import Pipeline
-from service.ring import Excerpt, Ring, Rings
-from service.settings import Settings
-from service.store import open_store, work
-from service.store.work import JobRow
+from sprung.model.signals import SampleBlock, Tally
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
+from sprung.replay.live import LiveBus
+from sprung.service.api.app import create_app
+from sprung.service.compute import Compute
+from sprung.service.core import Core, build_core
+from sprung.service.diagnoses import load_excerpt, save_excerpt
+from sprung.service.engine import Engine, make_tracker
+from sprung.service.errors import UserError
+from sprung.service.feed import feed_file, feed_live, prefetched, vehicle_of
+from sprung.service.main import Feeds, _bus
+from sprung.service.pipeline import Pipeline
+from sprung.service.ring import Excerpt, Ring, Rings
+from sprung.service.settings import Settings
+from sprung.service.store import open_store, work
+from sprung.service.store.work import JobRow
 from tests.service_fakes import HOP, START, FakeIdentifier, make_window
 
 SECONDS = 5
@@ -374,7 +374,7 @@ def tool(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         f"print({json.dumps(json.dumps(REPORT))}); sys.exit(1)\n"
     )
     path.chmod(0o755)
-    monkeypatch.setattr("service.diagnoses.sys.executable", str(path))
+    monkeypatch.setattr("sprung.service.diagnoses.sys.executable", str(path))
     return path
 
 
@@ -389,7 +389,7 @@ def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recordin
     page = client.get(f"/reports/{done['result']['report']}", headers={"accept": "text/html"})
     assert page.text == "<p>the page</p>"
     asked = json.loads((tool.parent / "asked").read_text())
-    assert asked[:3] == ["-m", "service.cli", "diagnose"] and {"--json", "--name=ride.csv"} <= set(asked)
+    assert asked[:3] == ["-m", "sprung", "diagnose"] and {"--json", "--name=ride.csv"} <= set(asked)
 
 
 def test_a_stored_recording_is_diagnosed_by_id(client: TestClient, recording: Path, tool: Path) -> None:
@@ -447,7 +447,7 @@ def jobs(core: Core) -> list[JobRow]:
     """Diagnoses, whatever their state."""
     from sqlalchemy import select
 
-    from service.store.schema import jobs as table
+    from sprung.service.store.schema import jobs as table
 
     with core.store.read() as connection:
         rows = connection.execute(select(table).where(table.c.kind == "diagnosis"))

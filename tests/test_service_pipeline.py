@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
-from model.system import System
-from service.compute import Compute, Priority
-from service.engine import Engine
-from service.errors import Busy
-from service.pipeline import Pipeline
-from service.store import Store, fleet, open_store
-from service.store.schema import posteriors, windows
+from sprung.model.system import System
+from sprung.service.compute import Compute, Priority
+from sprung.service.engine import Engine
+from sprung.service.errors import Busy
+from sprung.service.pipeline import Pipeline
+from sprung.service.store import Store, fleet, open_store
+from sprung.service.store.schema import posteriors, windows
 from tests.service_fakes import HOP, START, FakeIdentifier, make_window
 
 

@@ -6,10 +6,10 @@ import scipy.linalg
 import torch
 from test_system import OSCILLATOR, QUARTER_CAR
 
-from model.excitation import simulate_runs
-from model.simulate.linear import LinearSimulator, phi_functions
-from model.simulate.ode import LinearRate, solve
-from model.system import load_system, parse_system
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.simulate.linear import LinearSimulator, phi_functions
+from sprung.model.simulate.ode import LinearRate, solve
+from sprung.model.system import load_system, parse_system
 
 
 def oscillator(stiffness=800.0, damping=4.0, rate=200):

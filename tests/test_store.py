@@ -12,11 +12,11 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import func, select, text
 
-from service.errors import UserError
-from service.store import Store, fleet, history, open_store, retention, work
-from service.store.schema import metadata, posteriors, windows
-from service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
-from service.times import NANOSECONDS, from_iso, to_iso
+from sprung.service.errors import UserError
+from sprung.service.store import Store, fleet, history, open_store, retention, work
+from sprung.service.store.schema import metadata, posteriors, windows
+from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 P, S = 3, 2
 START = 1_790_000_000 * NANOSECONDS

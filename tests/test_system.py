@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from model.system import MANCHESTER, SystemFileError, load_system, parse_system
+from sprung.model.system import MANCHESTER, SystemFileError, load_system, parse_system
 
 TEXT = MANCHESTER.read_text()
 

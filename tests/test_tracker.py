@@ -18,8 +18,14 @@ from tracker_windows import (
     windows,
 )
 
-from model.signals import FloatArray
-from model.tracker import Tracker, TrackerSettings, TrackerSettingsError, TrackerState, TrackerStateError
+from sprung.model.signals import FloatArray
+from sprung.model.tracking.tracker import (
+    Tracker,
+    TrackerSettings,
+    TrackerSettingsError,
+    TrackerState,
+    TrackerStateError,
+)
 
 
 def test_posterior_intervals_of_a_healthy_vehicle_cover_the_truth() -> None:

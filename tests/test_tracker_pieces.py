@@ -7,11 +7,11 @@ import pytest
 from scipy.linalg import block_diag, expm
 from tracker_windows import Parameter, correlated, estimate
 
-from benchmarks.drift import Errors, Fleet, step_delays
-from model.tracker import Tracker, TrackerSettings
-from model.tracking import filter as kalman
-from model.tracking import misfit, scatter, surprise
-from model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
+from sprung.benchmarks.drift import Errors, Fleet, step_delays
+from sprung.model.tracking import filter as kalman
+from sprung.model.tracking import misfit, scatter, surprise
+from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
+from sprung.model.tracking.tracker import Tracker, TrackerSettings
 
 
 def test_prediction_is_the_exact_integral_of_the_process() -> None:

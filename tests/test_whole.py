@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.system import load_system
-from service.cli import main
+from sprung.model.system import load_system
+from sprung.service.cli import main
 
 DRIFT = Path(__file__).parent / "data" / "drift-600s.blf"
 SHARED = Path(__file__).parents[1].parent / "shared" / "recordings"
@@ -87,7 +87,7 @@ def test_a_truncated_file_is_used_up_to_its_end(capsys):
 @pytest.mark.slow
 def test_the_same_ride_as_mcap_and_as_can_gives_the_same_estimates(capsys, tmp_path):
     """The healthy recording, its values rounded as the CAN database does, written as CSV: MCAP against quantised."""
-    from replay.record import load_record
+    from sprung.replay.record import load_record
 
     system = load_system()
     record = load_record(shared("healthy-120s.mcap"), system.channels, system.sample_rate)

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from model.signals import Channel, SampleBlock
-from replay.windowing import Windower
+from sprung.model.signals import Channel, SampleBlock
+from sprung.replay.windowing import Windower
 
 RATE = 100.0
 START = 1_790_000_000_123_456_789

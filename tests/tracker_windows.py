@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.signals import Estimate, FloatArray
-from model.tracker import Tracker, TrackerSettings
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.tracking.tracker import Tracker, TrackerSettings
 
 EPOCH = 1_790_000_000_000_000_000
 WINDOW_STD = np.repeat([0.004, 0.006, 0.02, 0.01], [8, 4, 8, 4])  # a vehicle's 8 + 4 stiffnesses and dampings

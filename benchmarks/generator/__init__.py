@@ -5,8 +5,8 @@ integrates with a fixed-step Runge-Kutta method at 2 kHz (batched over recording
 files.  What it makes reaches the product only through those files.
 """
 
-from benchmarks.generator.draw import Case, draw_cases
-from benchmarks.generator.make import make_recordings, write_set
-from benchmarks.generator.vehicle import Vehicle, read_vehicle
+from sprung.benchmarks.generator.draw import Case, draw_cases
+from sprung.benchmarks.generator.make import make_recordings, write_set
+from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 
 __all__ = ["Case", "Vehicle", "draw_cases", "make_recordings", "read_vehicle", "write_set"]

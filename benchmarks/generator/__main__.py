@@ -1,4 +1,4 @@
-"""`python -m benchmarks.generator --count 60 --seed 7 --out DIR`: a set of recordings with labels.json."""
+"""`python -m sprung.benchmarks.generator --count 60 --seed 7 --out DIR`: a set of recordings with labels.json."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import argparse
 import sys
 from pathlib import Path
 
-from benchmarks.generator import draw_cases, read_vehicle, write_set
-from benchmarks.generator.make import FORMATS
+from sprung.benchmarks.generator import draw_cases, read_vehicle, write_set
+from sprung.benchmarks.generator.make import FORMATS
 
 DEFAULT = Path(__file__).resolve().parents[2] / "model" / "systems" / "manchester.yaml"
 
 
 def main() -> None:
     """Parses the command line, makes the set, says where it is."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.generator", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m sprung.benchmarks.generator", description=__doc__)
     parser.add_argument("--count", type=int, default=32)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path, required=True)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.generator.laws import LAWS
-from benchmarks.generator.track import HIGH_TRACK, LOW_TRACK
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator.laws import LAWS
+from sprung.benchmarks.generator.track import HIGH_TRACK, LOW_TRACK
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 # rms deflection (m) and rate (m/s) of the nominal vehicle's elements on the low track at 45 m/s, from this generator
 USUAL = {"primary": (7.2e-4, 0.032), "secondary": (2.5e-3, 0.026)}

@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.generator import track
-from benchmarks.generator.draw import Case
-from benchmarks.generator.integrate import LOW_PASS, SAMPLE_RATE, STEP_RATE
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator import track
+from sprung.benchmarks.generator.draw import Case
+from sprung.benchmarks.generator.integrate import LOW_PASS, SAMPLE_RATE, STEP_RATE
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -12,7 +12,7 @@ import numpy as np
 from mcap.writer import Writer
 from numpy.typing import NDArray
 
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from benchmarks.generator.laws import LAWS
-from benchmarks.generator.track import RATE as TABLE_RATE
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator.laws import LAWS
+from sprung.benchmarks.generator.track import RATE as TABLE_RATE
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 

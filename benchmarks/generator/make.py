@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.generator import track
-from benchmarks.generator.draw import Case
-from benchmarks.generator.exact import exact_response, is_linear
-from benchmarks.generator.files import WRITERS
-from benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
-from benchmarks.generator.oracle import SETTLE, oracle_snr
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator import track
+from sprung.benchmarks.generator.draw import Case
+from sprung.benchmarks.generator.exact import exact_response, is_linear
+from sprung.benchmarks.generator.files import WRITERS
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
+from sprung.benchmarks.generator.oracle import SETTLE, oracle_snr
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 

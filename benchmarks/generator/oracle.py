@@ -16,10 +16,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.generator.draw import Case
-from benchmarks.generator.exact import Transfer
-from benchmarks.generator.integrate import SAMPLE_RATE
-from benchmarks.generator.vehicle import Vehicle
+from sprung.benchmarks.generator.draw import Case
+from sprung.benchmarks.generator.exact import Transfer
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE
+from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

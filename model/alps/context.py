@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
-from model.alps.task import Task
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.task import Task
 
 HISTORY = 10  # samples that the context sees, as in the original
 CONTEXT = 10  # its size, as in the original

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
+from sprung.model.alps.config import NetworkConfig
 
 
 class DeconvolutionalDecoder(nn.Module):

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
+from sprung.model.alps.config import NetworkConfig
 
 
 class ConvolutionalEmbedding(nn.Module):

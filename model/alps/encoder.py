@@ -12,16 +12,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
-from model.alps.embedding import positions
-from model.alps.posterior import (
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.embedding import positions
+from sprung.model.alps.posterior import (
     MAX_CONCENTRATION,
     gaussian_divergence,
     gaussian_sample,
     von_mises_divergence,
     von_mises_sample,
 )
-from model.alps.task import WINDOW, Task
+from sprung.model.alps.task import WINDOW, Task
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
-from model.alps.task import WINDOW, Task
-from model.features import magnitudes
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.task import WINDOW, Task
+from sprung.model.identification.features import magnitudes
 
 Features = Callable[[Tensor], Tensor]
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.alps import metrics
-from model.alps.fit import Split, VisualModel
-from model.alps.task import ROLLOUT, WINDOW, Task, windows
+from sprung.model.alps import metrics
+from sprung.model.alps.fit import Split, VisualModel
+from sprung.model.alps.task import ROLLOUT, WINDOW, Task, windows
 
 _CHUNK = 100  # windows at a time
 SHOWN_WINDOWS = 50  # on which pictures are compared: pictures are the slow part

@@ -1,7 +1,7 @@
 """Training of the visual tasks: first the frame autoencoder, then each method on its embeddings.
 
-Checkpoints, learning-rate schedule and seeding are those of `model.training`: every update draws from (seed, step),
-so that an interrupted run ends in the same weights as one that was not.
+Checkpoints, learning-rate schedule and seeding are those of `model.identification.training`: every update draws from
+(seed, step), so that an interrupted run ends in the same weights as one that was not.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from model.alps.config import Method, NetworkConfig, TrainingConfig
-from model.alps.frames import FrameAutoencoder
-from model.alps.losses import loss_of, picture_loss, state_loss
-from model.alps.network import Network
-from model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
-from model.training import Run
+from sprung.model.alps.config import Method, NetworkConfig, TrainingConfig
+from sprung.model.alps.frames import FrameAutoencoder
+from sprung.model.alps.losses import loss_of, picture_loss, state_loss
+from sprung.model.alps.network import Network
+from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
+from sprung.model.identification.training import Run
 
 _STREAMS = {"train": 0, "test": 1, "unseen": 2}
 

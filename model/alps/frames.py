@@ -9,10 +9,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import NetworkConfig
-from model.alps.decoder import DeconvolutionalDecoder
-from model.alps.embedding import ConvolutionalEmbedding
-from model.alps.task import Task
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.decoder import DeconvolutionalDecoder
+from sprung.model.alps.embedding import ConvolutionalEmbedding
+from sprung.model.alps.task import Task
 
 
 class FrameAutoencoder(nn.Module):

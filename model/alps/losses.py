@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from model.alps.config import TrainingConfig
-from model.alps.network import Passed
-from model.alps.task import Task
+from sprung.model.alps.config import TrainingConfig
+from sprung.model.alps.network import Passed
+from sprung.model.alps.task import Task
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.alps import rendering
-from model.alps.rollout import held
-from model.alps.task import ROLLOUT, Range, Rollouts, Task
+from sprung.model.alps import rendering
+from sprung.model.alps.rollout import held
+from sprung.model.alps.task import ROLLOUT, Range, Rollouts, Task
 
 SAMPLE_RATE = 100.0  # Hz
 MASS = (1307.5, 8000.0)  # kg

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from model.alps.task import Task
+from sprung.model.alps.task import Task
 
 
 def state_error(task: Task, simulated: Tensor, true: Tensor) -> float:

@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from model.alps.config import Method, NetworkConfig
-from model.alps.context import ContextDynamics
-from model.alps.decoder import StateDecoder
-from model.alps.encoder import AttentionEncoder, DifferenceEncoder, Encoded
-from model.alps.estimator import Estimator, log_magnitudes, raw
-from model.alps.task import WINDOW, Task
+from sprung.model.alps.config import Method, NetworkConfig
+from sprung.model.alps.context import ContextDynamics
+from sprung.model.alps.decoder import StateDecoder
+from sprung.model.alps.encoder import AttentionEncoder, DifferenceEncoder, Encoded
+from sprung.model.alps.estimator import Estimator, log_magnitudes, raw
+from sprung.model.alps.task import WINDOW, Task
 
 
 @dataclass(frozen=True)

@@ -11,19 +11,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from model.alps import metrics
-from model.alps.config import NetworkConfig
-from model.alps.context import ContextDynamics
-from model.alps.embedding import FeedForwardEmbedding
-from model.alps.encoder import AttentionEncoder
-from model.alps.fit import Clock
-from model.alps.task import WINDOW, Task, windows
-from model.alps.train_estimator import LogRatioEstimator
-from model.alps.train_system import STEPS, TrainData, smoothed, train_task
-from model.features import magnitudes
-from model.simulate.linear import LinearSimulator
-from model.system import load_system
-from model.training import Run
+from sprung.model.alps import metrics
+from sprung.model.alps.config import NetworkConfig
+from sprung.model.alps.context import ContextDynamics
+from sprung.model.alps.embedding import FeedForwardEmbedding
+from sprung.model.alps.encoder import AttentionEncoder
+from sprung.model.alps.fit import Clock
+from sprung.model.alps.task import WINDOW, Task, windows
+from sprung.model.alps.train_estimator import LogRatioEstimator
+from sprung.model.alps.train_system import STEPS, TrainData, smoothed, train_task
+from sprung.model.identification.features import magnitudes
+from sprung.model.identification.training import Run
+from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.system import load_system
 
 _RIDGE = 1e-6  # of the diagonal
 

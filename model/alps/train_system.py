@@ -15,11 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.alps.task import Range, Rollouts, Task
-from model.excitation import simulate_runs
-from model.signals import FloatArray
-from model.simulate.linear import LinearSimulator
-from model.system import System, load_system
+from sprung.model.alps.task import Range, Rollouts, Task
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.system import System, load_system
 
 STEPS = 500
 TRAJECTORIES = 20

@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from model.alps import rendering
-from model.alps.rollout import runge_kutta
-from model.alps.task import ROLLOUT, Range, Rollouts, Task
+from sprung.model.alps import rendering
+from sprung.model.alps.rollout import runge_kutta
+from sprung.model.alps.task import ROLLOUT, Range, Rollouts, Task
 
 GRAVITY = 10.0
 SAMPLE_RATE = 6.0  # Hz

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from model.diagnosis.catalogue.base import ElementLaw, Motion, SpringDamper, Values
-from model.diagnosis.catalogue.trajectory import MemoryStep
-from model.signals import FloatArray
+from sprung.model.laws.base import ElementLaw, Motion, SpringDamper, Values
+from sprung.model.laws.trajectory import MemoryStep
+from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,10 +21,10 @@ import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
-from model.fusion import fuse
-from model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
-from model.signals import FloatArray
-from model.system import System
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.fusion import fuse
+from sprung.model.system import System
 
 _TAYLOR_NORM = 1.0  # 1-norm up to which the Taylor polynomial of degree 15 is exact to double precision
 _TAYLOR = torch.tensor([[1.0 / math.factorial(4 * i + j + 4) for j in range(4)] for i in range(4)], dtype=torch.float64)
@@ -280,8 +280,8 @@ def knot_columns(system: System) -> tuple[list[int], list[int | None]]:
 def knots(system: System, windows: FloatArray) -> FloatArray:
     """Values and slopes of all drives at the samples, (B, T, W) = [value, slope, value, slope, ...].
 
-    Where a support's displacement and velocity are both measured with noise they are fused (`model.fusion`); slopes
-    that are not measured come from the cubic spline through the samples (not-a-knot ends).
+    Where a support's displacement and velocity are both measured with noise they are fused (`model.simulate.fusion`);
+    slopes that are not measured come from the cubic spline through the samples (not-a-knot ends).
     """
     values, slopes = knot_columns(system)
     out = np.empty((*windows.shape[:2], 2 * len(values)))

@@ -15,12 +15,12 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import firwin, upfirdn
 
-from model.diagnosis.catalogue.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
-from model.mechanics import ACCELERATION, FORCE, Mechanics
-from model.signals import FloatArray
-from model.simulate.etd import ForceSteps, Site, force_steps
-from model.simulate.segments import Solution, solve
-from model.simulate.stepping import (
+from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
+from sprung.model.mechanics import ACCELERATION, FORCE, Mechanics
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.etd import ForceSteps, Site, force_steps
+from sprung.model.simulate.segments import Solution, solve
+from sprung.model.simulate.stepping import (
     cubic_chain,
     drive_columns,
     drive_positions,

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torchdiffeq import odeint, odeint_adjoint
 
-from model.simulate.linear import LinearSimulator
+from sprung.model.simulate.linear import LinearSimulator
 
 Rate = Callable[[Tensor, Tensor], Tensor]  # (time, state) -> d state / dt
 

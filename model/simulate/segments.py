@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.diagnosis.catalogue.base import Motion
-from model.signals import FloatArray
-from model.simulate.etd import ForceSteps, March, Site, march
+from sprung.model.laws.base import Motion
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.etd import ForceSteps, March, Site, march
 
 _WIDTH = 384  # runs that march together: enough to hide the interpreter, few enough for the cache
 _SHORTEST = 50  # samples of a segment

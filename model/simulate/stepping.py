@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from model.mechanics import Mechanics
-from model.signals import FloatArray
+from sprung.model.mechanics import Mechanics
+from sprung.model.signals import FloatArray
 
 
 def cubic_chain(knots: FloatArray, dt: float) -> FloatArray:

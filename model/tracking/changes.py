@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from model.signals import BoolArray, FloatArray, IntArray
-from model.tracking.settings import TrackerSettings, design
+from sprung.model.signals import BoolArray, FloatArray, IntArray
+from sprung.model.tracking.settings import TrackerSettings, design
 
 STEPS = 6.0  # windows that an alarm needs at least: one window counts at most threshold / STEPS
 QUIET = 0.25  # share of the threshold below which a baseline may still be refined

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg.lapack import dpotrf, dpotrs
 
-from model.signals import BoolArray, FloatArray
-from model.tracking.settings import ProcessNoise
+from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.tracking.settings import ProcessNoise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

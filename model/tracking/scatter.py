@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.signals import BoolArray, FloatArray
+from sprung.model.signals import BoolArray, FloatArray
 
 MEMORY = 60.0  # pairs of windows that the running mean remembers
 CLIP = 9.0  # a squared score counts at most as this: one outlier moves the mean by 0.13 at most

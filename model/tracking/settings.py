@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from model.signals import FloatArray
+from sprung.model.signals import FloatArray
 
 SECONDS_PER_MONTH = 365.25 / 12 * 86400.0
 

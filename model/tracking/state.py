@@ -9,12 +9,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from model.signals import FloatArray, IntArray
-from model.tracking.changes import Changes
-from model.tracking.filter import Belief
-from model.tracking.misfit import Fit
-from model.tracking.scatter import Scatter
-from model.tracking.surprise import Surprise
+from sprung.model.signals import FloatArray, IntArray
+from sprung.model.tracking.changes import Changes
+from sprung.model.tracking.filter import Belief
+from sprung.model.tracking.misfit import Fit
+from sprung.model.tracking.scatter import Scatter
+from sprung.model.tracking.surprise import Surprise
 
 FORMAT = 1
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.signals import BoolArray, FloatArray
+from sprung.model.signals import BoolArray, FloatArray
 
 REFERENCE = 0.5  # standard deviations of prediction and window: half of the smallest lag worth a reaction
 THRESHOLD = 14.0  # exp(2 * 0.5 * 14) = 1.2e6 windows between false reopenings of one side of one parameter

@@ -11,8 +11,8 @@ from fastapi.responses import Response
 from pydantic import TypeAdapter
 from sqlalchemy import Connection
 
-from service.api.problems import Problem
-from service.core import Core
+from sprung.service.api.problems import Problem
+from sprung.service.core import Core
 
 T = TypeVar("T")
 

@@ -9,10 +9,10 @@ from importlib.metadata import version
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 
-from service.api import diagnose, docs, fleet, health, identify, problems, recordings
-from service.api.limits import BodyLimit
-from service.core import Core
-from service.pages import routes as pages
+from sprung.service.api import diagnose, docs, fleet, health, identify, problems, recordings
+from sprung.service.api.limits import BodyLimit
+from sprung.service.core import Core
+from sprung.service.pages import routes as pages
 
 DESCRIPTION = (
     "Springs and dampers of rail vehicles, identified from running recordings. "

@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-from model.signals import FloatArray
-from service.api.problems import Problem
-from service.engine import Engine
-from service.times import from_iso
+from sprung.model.signals import FloatArray
+from sprung.service.api.problems import Problem
+from sprung.service.engine import Engine
+from sprung.service.times import from_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]

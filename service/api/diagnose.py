@@ -9,14 +9,14 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 from starlette.datastructures import UploadFile
 
-from service.api.access import CoreOf, json_response, known_vehicle, read
-from service.api.bodies import DiagnoseBody, VehicleId
-from service.api.problems import Problem, from_validation
-from service.api.recordings import job_dict, keep_upload
-from service.core import Core
-from service.errors import NotFound
-from service.store import fleet, work
-from service.store.work import JobRow, RecordingRow, ReportRow
+from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.bodies import DiagnoseBody, VehicleId
+from sprung.service.api.problems import Problem, from_validation
+from sprung.service.api.recordings import job_dict, keep_upload
+from sprung.service.core import Core
+from sprung.service.errors import NotFound
+from sprung.service.store import fleet, work
+from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 
 router = APIRouter(tags=["diagnosis"])
 PAGE = "report.html"

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 
-from service.pages.render import render
+from sprung.service.pages.render import render
 
 router = APIRouter(include_in_schema=False)
 

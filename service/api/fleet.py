@@ -10,14 +10,14 @@ from fastapi import APIRouter, Path, Query
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from service.api.access import CoreOf, json_response, known_vehicle, read
-from service.api.problems import Problem
-from service.core import Core
-from service.store import fleet
-from service.store import history as store_history
-from service.store.windows import latest_window
-from service.times import from_iso, optional_iso, to_iso
-from service.views import VehicleView, alarm_dict, vehicle_view
+from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.problems import Problem
+from sprung.service.core import Core
+from sprung.service.store import fleet
+from sprung.service.store import history as store_history
+from sprung.service.store.windows import latest_window
+from sprung.service.times import from_iso, optional_iso, to_iso
+from sprung.service.views import VehicleView, alarm_dict, vehicle_view
 
 router = APIRouter(tags=["vehicles"])
 

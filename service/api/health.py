@@ -9,8 +9,8 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from sqlalchemy import text
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.api.access import CoreOf, json_response, read
-from service.api.problems import Problem
+from sprung.service.api.access import CoreOf, json_response, read
+from sprung.service.api.problems import Problem
 
 router = APIRouter(tags=["health"])
 

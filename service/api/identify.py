@@ -11,16 +11,16 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from pydantic import ValidationError
 
-from model.identify import UnusableWindow
-from model.signals import Estimate, FloatArray, Window
-from service.api.access import CoreOf, json_response
-from service.api.bodies import WindowBody, start_of, window_values
-from service.api.problems import Problem, from_validation
-from service.compute import Priority
-from service.engine import Engine
-from service.store.windows import Solved
-from service.times import NANOSECONDS, now_ns
-from service.views import fit_dict, physical, sensor_dict
+from sprung.model.identification.identify import UnusableWindow
+from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.service.api.access import CoreOf, json_response
+from sprung.service.api.bodies import WindowBody, start_of, window_values
+from sprung.service.api.problems import Problem, from_validation
+from sprung.service.compute import Priority
+from sprung.service.engine import Engine
+from sprung.service.store.windows import Solved
+from sprung.service.times import NANOSECONDS, now_ns
+from sprung.service.views import fit_dict, physical, sensor_dict
 
 router = APIRouter(tags=["identify"])
 

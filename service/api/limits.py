@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.api.problems import Problem, problem_response
+from sprung.service.api.problems import Problem, problem_response
 
 
 class BodyTooLarge(Exception):

@@ -14,7 +14,7 @@ from fastapi.responses import Response
 from pydantic import ValidationError
 from starlette.exceptions import HTTPException
 
-from service.errors import Busy, NotFound, UserError
+from sprung.service.errors import Busy, NotFound, UserError
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers

@@ -10,15 +10,15 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from replay.recording import EXTENSIONS
-from service.api.access import CoreOf, json_response, read
-from service.api.bodies import VehicleId
-from service.api.problems import Problem
-from service.errors import NotFound
-from service.settings import Settings
-from service.store import work
-from service.store.work import JobRow, RecordingRow
-from service.times import now_ns, to_iso
+from sprung.replay.recording import EXTENSIONS
+from sprung.service.api.access import CoreOf, json_response, read
+from sprung.service.api.bodies import VehicleId
+from sprung.service.api.problems import Problem
+from sprung.service.errors import NotFound
+from sprung.service.settings import Settings
+from sprung.service.store import work
+from sprung.service.store.work import JobRow, RecordingRow
+from sprung.service.times import now_ns, to_iso
 
 router = APIRouter(tags=["recordings"])
 CHUNK = 1 << 20

@@ -14,7 +14,7 @@ INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; never a traceback, unless SPRUNG_DEBUG is set."""
-    from service.cli.app import app
+    from sprung.service.cli.app import app
 
     try:
         status = app(arguments, prog_name="sprung", standalone_mode=False)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from service.threads import hand_over_often, one_thread_each
+from sprung.service.threads import hand_over_often, one_thread_each
 
 app = typer.Typer(
     name="sprung",
@@ -66,7 +66,7 @@ def replay(
     Without --store nothing is kept: every run then depends on its files alone.
     """
     one_thread_each()
-    from service.cli.replay import run
+    from sprung.service.cli.replay import run
 
     return run(
         files,
@@ -105,7 +105,7 @@ def serve(
 ) -> int:
     """REST, metrics and pages, on an embedded store unless --store says otherwise."""
     one_thread_each()
-    from service.cli.serve import run
+    from sprung.service.cli.serve import run
 
     options = {
         "system": system,
@@ -135,7 +135,7 @@ def train(
     steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps.")] = None,
 ) -> int:
     """Train the estimator for a system; goes on after an interrupt when called again."""
-    from service.cli.train import run
+    from sprung.service.cli.train import run
 
     return run(
         system, [*(recordings or []), *(more or [])], dbc, out, {"seed": seed, "records": records, "steps": steps}
@@ -154,7 +154,7 @@ def diagnose(
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
-    from service.cli.diagnose import run
+    from sprung.service.cli.diagnose import run
 
     return run(file, system, dbc, out, name, json_lines)
 
@@ -165,7 +165,7 @@ def system(
     json_lines: Json = False,
 ) -> int:
     """Check a system file; print bodies, elements, modes, and what the sensors can identify."""
-    from service.cli.system import run
+    from sprung.service.cli.system import run
 
     return run(file, json_lines)
 
@@ -176,6 +176,6 @@ def bench(
     name: Annotated[str | None, typer.Argument(help="Without it, the names are listed.")] = None,
 ) -> int:
     """A benchmark, one JSON line per figure; further arguments go to it (--budget full, --data DIR)."""
-    from service.cli.bench import run
+    from sprung.service.cli.bench import run
 
     return run(name, context.args)

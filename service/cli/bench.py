@@ -8,8 +8,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks import BENCHMARKS, load
-from service.errors import UserError
+from sprung.benchmarks import BENCHMARKS, load
+from sprung.service.errors import UserError
 
 CONVERT: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path, "str": str}
 

@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from service.feed import OnBatch
-from service.pages.render import percent, quantity
-from service.pipeline import Batch
-from service.views import VehicleView
+from sprung.service.feed import OnBatch
+from sprung.service.pages.render import percent, quantity
+from sprung.service.pipeline import Batch
+from sprung.service.views import VehicleView
 
 PLAIN_SECONDS = 2.0  # between lines where there is no terminal
 HEALTH_STYLE = {"ok": "green", "maintenance_required": "yellow"}

@@ -6,12 +6,12 @@ import json
 import sys
 from pathlib import Path
 
-from model.diagnosis.channels import TooLittleError
-from model.diagnosis.report import Report
-from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
-from replay.record import Record, load_record
-from service.cli.console import errors, silent_stage, stages
-from service.diagnoses import load_excerpt
+from sprung.model.diagnosis.record.channels import TooLittleError
+from sprung.model.diagnosis.report.report import Report
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.replay.record import Record, load_record
+from sprung.service.cli.console import errors, silent_stage, stages
+from sprung.service.diagnoses import load_excerpt
 
 
 def run(
@@ -28,7 +28,7 @@ def run(
         print(f"sprung: {file}: {error}", file=sys.stderr)
         return 1
     if out is not None:
-        from service.report import write_report
+        from sprung.service.report import write_report
 
         files = write_report(report, system, out)
         if not json_lines:
@@ -48,7 +48,7 @@ def load(file: Path, system: System, dbc: Path | None) -> Record:
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
-    from model.diagnosis.diagnose import Options, diagnose
+    from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
 
     with stages(errors()) as show:
         return diagnose(system, record, Options(file=name), silent_stage if quiet else show)

@@ -9,16 +9,16 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from service.cli.console import parameter_table, print_table, progress
-from service.compute import Compute
-from service.engine import load_engine
-from service.feed import Fed, feed_file
-from service.pipeline import Batch, Pipeline
-from service.recordings import file_row, finish_row
-from service.settings import settings_with
-from service.store import Store, open_store, work
-from service.times import to_iso
-from service.views import VehicleView, alarm_dict, vehicle_view, window_dict
+from sprung.service.cli.console import parameter_table, print_table, progress
+from sprung.service.compute import Compute
+from sprung.service.engine import load_engine
+from sprung.service.feed import Fed, feed_file
+from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.recordings import file_row, finish_row
+from sprung.service.settings import settings_with
+from sprung.service.store import Store, open_store, work
+from sprung.service.times import to_iso
+from sprung.service.views import VehicleView, alarm_dict, vehicle_view, window_dict
 
 
 def run(

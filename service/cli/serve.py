@@ -9,13 +9,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from service.cli.console import parameter_table, plain_progress, print_table
-from service.cli.replay import closing_line, incomplete_line, readable
-from service.core import Core
-from service.feed import Fed, OnBatch
-from service.main import Feeds, serve
-from service.settings import settings_with
-from service.views import vehicle_view
+from sprung.service.cli.console import parameter_table, plain_progress, print_table
+from sprung.service.cli.replay import closing_line, incomplete_line, readable
+from sprung.service.core import Core
+from sprung.service.feed import Fed, OnBatch
+from sprung.service.main import Feeds, serve
+from sprung.service.settings import settings_with
+from sprung.service.views import vehicle_view
 
 
 def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:

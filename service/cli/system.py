@@ -10,10 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from model.identify import identifiability
-from model.linearise import PRIOR_STD
-from model.system import MANCHESTER, System, load_system
-from service.pages.render import quantity
+from sprung.model.identification.identify import identifiability
+from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.system import MANCHESTER, System, load_system
+from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
 

@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
-from model.signals import FloatArray
-from model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
-from replay import open_recording
-from replay.windowing import Windower
-from service.cli.console import errors
-from service.errors import UserError
+from sprung.model.signals import FloatArray
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.replay import open_recording
+from sprung.replay.windowing import Windower
+from sprung.service.cli.console import errors
+from sprung.service.errors import UserError
 
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
     """Train, and print what was reached."""
-    from model.training import TrainingSettings, train
+    from sprung.model.identification.training import TrainingSettings, train
 
     system = load_system(system_file or MANCHESTER)
     database = dbc or (MANCHESTER_DBC if system_file is None else None)

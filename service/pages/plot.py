@@ -8,8 +8,8 @@ from html import escape
 
 import numpy as np
 
-from model.signals import FloatArray
-from service.times import NANOSECONDS, to_iso
+from sprung.model.signals import FloatArray
+from sprung.service.times import NANOSECONDS, to_iso
 
 WIDTH, HEIGHT = 360, 150
 LEFT, RIGHT, TOP, BOTTOM = 44, 8, 22, 22

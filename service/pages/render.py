@@ -17,7 +17,7 @@ PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 @cache
 def _environment() -> Environment:
     environment = Environment(
-        loader=PackageLoader("service.pages"),
+        loader=PackageLoader("sprung.service.pages"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -9,14 +9,14 @@ from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
-from service.api.access import CoreOf, known_vehicle, read
-from service.api.fleet import load_view
-from service.core import Core
-from service.pages.plot import Trace, drift_svg
-from service.pages.render import render
-from service.store import fleet, history, work
-from service.times import to_iso
-from service.views import VehicleView, alarm_dict
+from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.fleet import load_view
+from sprung.service.core import Core
+from sprung.service.pages.plot import Trace, drift_svg
+from sprung.service.pages.render import render
+from sprung.service.store import fleet, history, work
+from sprung.service.times import to_iso
+from sprung.service.views import VehicleView, alarm_dict
 
 router = APIRouter(include_in_schema=False)
 

@@ -8,10 +8,10 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from model.diagnosis.report import Report
-from model.system import System
-from service.report import drawing, forces, ink, signals, values, words
-from service.report.page import render
+from sprung.model.diagnosis.report.report import Report
+from sprung.model.system import System
+from sprung.service.report import drawing, forces, ink, signals, values, words
+from sprung.service.report.page import render
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
-from model.schema import ElementSensor, ForceInput
-from model.system import System
-from service.report import ink
+from sprung.model.schema import ElementSensor, ForceInput
+from sprung.model.system import System
+from sprung.service.report import ink
 
 Point = tuple[float, float]
 

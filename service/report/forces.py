@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from model.diagnosis.report import Report
-from service.report import ink
+from sprung.model.diagnosis.report.report import Report
+from sprung.service.report import ink
 
 Array = NDArray[np.float64]
 BINS = 25

@@ -9,9 +9,9 @@ from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
-from model.diagnosis.report import Report
-from service.report import words
-from service.report.values import rows
+from sprung.model.diagnosis.report.report import Report
+from sprung.service.report import words
+from sprung.service.report.values import rows
 
 STYLE = """
 :root{--ink:#22303c;--quiet:#6b7885;--line:#e1e6eb;--bad:#c1121f;--good:#0b7a75}

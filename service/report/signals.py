@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import signal
 
-from model.diagnosis.report import Report
-from service.report import ink
+from sprung.model.diagnosis.report.report import Report
+from sprung.service.report import ink
 
 Array = NDArray[np.float64]
 

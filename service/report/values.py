@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-from model.diagnosis.report import Report
-from service.report import ink
+from sprung.model.diagnosis.report.report import Report
+from sprung.service.report import ink
 
 
 @dataclass(frozen=True)

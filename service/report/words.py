@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from model.diagnosis.report import Finding, LawParameter, Report
-from service.report.ink import engineering
-from service.report.values import largest_bias
+from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
+from sprung.service.report.ink import engineering
+from sprung.service.report.values import largest_bias
 
 VERDICTS = {
     "consistent": "Consistent: the nominal structure explains the recording",

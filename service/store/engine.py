@@ -15,7 +15,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 
-from service.errors import UserError
+from sprung.service.errors import UserError
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 UPSERT_DIALECTS = ("sqlite", "postgresql")

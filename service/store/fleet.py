@@ -8,9 +8,9 @@ from typing import Any
 
 from sqlalchemy import Connection, func, select, update
 
-from model.tracker import Alarm
-from service.store.engine import insert_or_ignore, upsert
-from service.store.schema import alarms, models, tracker_states, vehicles, windows
+from sprung.model.tracking.tracker import Alarm
+from sprung.service.store.engine import insert_or_ignore, upsert
+from sprung.service.store.schema import alarms, models, tracker_states, vehicles, windows
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from sqlalchemy import Column, Connection, Table, func, select
 
-from model.signals import FloatArray
-from service.store.engine import upsert
-from service.store.schema import posteriors, rollups, windows
-from service.store.windows import WindowRecord, pack, unpack
-from service.times import NANOSECONDS
+from sprung.model.signals import FloatArray
+from sprung.service.store.engine import upsert
+from sprung.service.store.schema import posteriors, rollups, windows
+from sprung.service.store.windows import WindowRecord, pack, unpack
+from sprung.service.times import NANOSECONDS
 
 LEVELS = (60, 3600)  # s
 NICE = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 900.0, 3600.0, 6 * 3600.0, 86400.0)  # s per point

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, select, update
 
-from service.store.schema import jobs, recordings, rollups, windows
-from service.store.work import UNFINISHED
+from sprung.service.store.schema import jobs, recordings, rollups, windows
+from sprung.service.store.work import UNFINISHED
 
 
 @dataclass(frozen=True, slots=True)

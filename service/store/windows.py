@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, select
 
-from model.signals import BoolArray, Estimate, FloatArray
-from service.store.engine import insert_or_ignore
-from service.store.schema import posteriors, windows
+from sprung.model.signals import BoolArray, Estimate, FloatArray
+from sprung.service.store.engine import insert_or_ignore
+from sprung.service.store.schema import posteriors, windows
 
 IN_LIMIT = 500  # values in one IN (...): below every dialect's bound on parameters
 

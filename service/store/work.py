@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, insert, select, update
 
-from service.store.schema import jobs, recordings, reports
+from sprung.service.store.schema import jobs, recordings, reports
 
 UNFINISHED = ("queued", "running")
 

@@ -1,0 +1,136 @@
+"""Noise levels, estimated: of inputs from their redundancy, of sensors from what neither model nor neighbours explain.
+
+A measured force has no second measurement, and between it and the body lies what nobody measured: the drive's ripple,
+friction in the transmission, the amplifier.  Its noise is estimated from the residual; through the plant it gives the
+residual of a real record its colour.
+
+Physics that was left out is concentrated in some bands and sensors, noise is white: the level of a sensor is the
+median over frequency blocks, so that the misfit of a missing law does not pass for noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.whitening import Whitener
+from sprung.model.diagnosis.record.signals import Noise, Part
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.signals import FloatArray
+
+if TYPE_CHECKING:
+    from sprung.model.diagnosis.fit.problem import Fit, Problem
+
+_BLOCKS = 24
+_ROUNDS = 4
+_OWN = 0.01  # least share of a sensor's own noise in a bin that tells its level
+_LEAST = 0.01  # share of a force's noise power that one round may leave
+_REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
+
+
+def input_noise(part: Part, noise: Noise) -> Noise:
+    """Levels of displacement and velocity channels from V / j w - D, by Fisher scoring per support.
+
+    What of the difference is a copy of the motion or of its derivative (a wrong gain, a lag) is taken out first.
+    """
+    band = part.grid.band
+    omega = part.grid.omega[band]
+    displacement, velocity = noise.displacement.copy(), noise.velocity.copy()
+    for at, support in enumerate(part.pairs):
+        levels = np.array([displacement[support] ** 2, velocity[support] ** 2])
+        weights = np.stack([np.ones(len(omega) - 1), 1 / omega[1:] ** 2])  # variance per bin = levels @ weights
+        difference = part.redundancy[band, at][1:]
+        motion = part.support[band, support][1:]
+        for _ in range(8):
+            variance = levels @ weights
+            regressors = np.stack([motion, 1j * omega[1:] * motion], axis=1) / np.sqrt(variance)[:, None]
+            target = difference / np.sqrt(variance)
+            both = np.concatenate([regressors.real, regressors.imag])
+            taken = np.linalg.lstsq(both, np.concatenate([target.real, target.imag]), rcond=None)[0]
+            rest = np.abs(target - regressors @ taken) ** 2  # mean 1 at the truth
+            relative = weights / variance
+            score = relative @ (rest - 1)
+            fisher = relative @ relative.T
+            levels = np.maximum(levels + np.linalg.solve(fisher, score), 0.01 * levels)
+        displacement[support], velocity[support] = np.sqrt(levels)
+    return replace(noise, displacement=displacement, velocity=velocity)
+
+
+def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise:
+    """Levels of the sensors from the residual (F, S) of a fit."""
+    band = forward.part.grid.band
+    residual = spectrum[band][1:]
+    variance = noise.sensor_variance(forward.part.grid, forward.part.rated)[band][1:] / noise.sensors**2
+    for _ in range(_ROUNDS):
+        factor = Whitener.of(forward, noise).factor[1:]
+        precision = factor.conj().transpose(0, 2, 1) @ factor
+        alone = np.real(np.einsum("fss->fs", precision))  # 1 / variance given the other sensors
+        surprise = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
+        share = alone * variance * noise.sensors**2  # of the own noise in the variance given the others
+        ratio = [_level(surprise[:, i], share[:, i]) for i in range(len(noise.sensors))]
+        noise = replace(noise, sensors=np.maximum(noise.sensors * np.sqrt(ratio), noise.least))
+    return noise
+
+
+def _level(surprise: FloatArray, share: FloatArray) -> float:
+    """Ratio of a sensor's noise power to the supposed one, from the bins (F,) where its own noise counts."""
+    own = share > _OWN
+    if np.sum(own) < 2 * _BLOCKS:
+        return 1.0
+    surprise, share = surprise[own], share[own]
+    edges = np.linspace(0, len(surprise), _BLOCKS + 1).astype(int)
+    blocks = np.array([surprise[a:b].mean() for a, b in pairwise(edges)])
+    return max(1 + (_robust(blocks, np.diff(edges)) - 1) / float(np.median(share)), 0.05)
+
+
+def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise:
+    """Levels of the measured forces from the residual (F, S) of a fit, by Fisher scoring of its likelihood."""
+    if not len(noise.force):
+        return noise
+    band = forward.part.grid.band
+    response = forward.plant.sensor_of_measured_force[band] * forward.sensor_factor[band, :, None]
+    for _ in range(_ROUNDS):
+        factor = Whitener.of(forward, noise).factor
+        seen = factor @ response  # whitened response to each force, (F, S, forces)
+        copied = np.abs(np.einsum("fsi,fs->fi", seen.conj(), (factor @ spectrum[band, :, None])[:, :, 0])) ** 2
+        size = np.sum(np.abs(seen) ** 2, axis=1)  # mean of `copied` at the truth
+        score, fisher = np.sum(copied - size, axis=0), np.sum(size**2, axis=0)
+        power = noise.force**2
+        noise = replace(noise, force=np.sqrt(np.maximum(power + score / fisher, _LEAST * power)))
+    return noise
+
+
+def _robust(blocks: FloatArray, counts: np.ndarray) -> float:
+    """Level over blocks, (blocks,): the mean of those that agree with the quiet half."""
+    middle, quiet = np.median(blocks), np.quantile(blocks, 0.3)
+    spread = 1 / np.sqrt(np.mean(counts))
+    base = min(middle, quiet * (1 + 2 * spread))
+    return float(np.mean(blocks[blocks <= base * (1 + 4 * spread)]))
+
+
+def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """Noise levels and whitening at a fit, and the fit again.
+
+    Sensors come after the forces: beside a force that is still taken for far too noisy, a sensor seems to have no
+    noise of its own, and then the force has to answer for that of the sensor.
+    """
+    settled = 0
+    for _ in range(_REFITS):
+        before = problem.noise
+        noise = force_noise(fit.forward, fit.spectrum, before)
+        if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
+            settled += 1
+            noise = sensor_noise(fit.forward, fit.spectrum, noise)
+        renewed = replace(problem, noise=noise, whitener=None, smoothed=None)
+        enough = settled == (2 if problem.follows else 1)
+        again = renewed.try_fit(fit.point, iterations=6 if enough else 2)
+        if again is None:
+            break
+        problem, fit = renewed, again
+        if enough:
+            break
+    return problem, fit

@@ -1,0 +1,248 @@
+"""How laws along the trajectory answer small changes of it: sensitivities through the loop of laws and plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.response.harmonic_balance import LawForces
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.along import force_along
+from sprung.model.laws.basis import StaticLaw
+from sprung.model.signals import FloatArray
+
+if TYPE_CHECKING:
+    from sprung.model.diagnosis.fit.problem import Problem
+
+_KRYLOV, _KRYLOV_TOLERANCE = 16, 3e-3
+_RELATIVE_STEP = 1e-4  # of finite differences
+
+
+def step_of(term: Term, parameter: int) -> float:
+    """Step of a finite difference in a term's internal parameter."""
+    if term.law.parameters[parameter].log:
+        return _RELATIVE_STEP
+    return _RELATIVE_STEP * max(abs(term.parameters[parameter]), term.scales[parameter])
+
+
+def law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) -> tuple[int, ComplexArray]:
+    """Port of a law and the spectrum of its force's derivative along the present trajectory, (F,)."""
+    port = forces.index(term)
+    if isinstance(term.law, StaticLaw):
+        values = term.law.values(forces.deflection[:, port], forces.rate[:, port])
+        return port, forward.part.grid.coarse_spectrum(values[parameter])
+    step = step_of(term, parameter)
+    change = (law_force(forward, term.moved(parameter, step), forces) - law_force(forward, term, forces)) / step
+    return port, forward.part.grid.coarse_spectrum(change)
+
+
+def wide_port(forward: Forward, port: FloatArray) -> FloatArray:
+    """A port's weights over the plant's elements, which may be more than the system's."""
+    return np.pad(port, (0, len(forward.plant.structure.H) - len(port)))
+
+
+def port_motions(
+    forward: Forward,
+    forces: LawForces,
+    theta_forces: ComplexArray,
+    loads: dict[int, ComplexArray],
+    law_forces: ComplexArray,
+    states: int,
+) -> FloatArray:
+    """Deflection and rate along the laws' ports per unit of every free value, (2, N, m, columns).
+
+    What acts along elements is in `theta_forces` and `law_forces`; `loads` (F, n), by column, push bodies.
+    """
+    plant, grid = forward.plant, forward.part.grid
+    structure = plant.structure
+    ports = np.array([wide_port(forward, w) for w in forces.ports])
+    P, p = theta_forces.shape[1], law_forces.shape[1]
+    spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
+    of_force = plant.compliance(ports, np.eye(len(structure.H)))  # (F, m, E)
+    for i, parameter in enumerate(forward.system.parameters):
+        if i not in loads:
+            e = forward.system.elements.index(parameter.element)
+            spectra[:, :, i] = of_force[:, :, e] * theta_forces[:, i, None]
+    spectra[:, :, P:] = (of_force @ ports.T) @ law_forces.transpose(0, 2, 1)
+    for column, load in loads.items():
+        spectra[:, :, column] = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), load)
+    free = plant.free_motion(structure.motion_rows(ports), grid.step, grid.samples).reshape(
+        grid.samples, 2, len(ports), states
+    )
+    result = np.empty((2, grid.samples, len(ports), P + p + states))
+    result[0, :, :, : P + p] = grid.inverse(spectra)
+    result[1, :, :, : P + p] = grid.inverse(1j * grid.omega[:, None, None] * spectra)
+    result[:, :, :, P + p :] = free.transpose(1, 0, 2, 3)
+    if plant.floats:
+        for i, parameter in enumerate(forward.system.parameters):
+            if i not in loads:
+                unit = np.eye(len(structure.H))[forward.system.elements.index(parameter.element)]
+                result[:, :, :, i] = _floating(forward, unit[None], ports, theta_forces[:, i, None, None])[..., 0]
+        for j in range(p):
+            result[:, :, :, P + j] = _floating(forward, ports, ports, law_forces[:, j, :, None])[..., 0]
+        for column, load in loads.items():
+            rest, line = plant.without_line(load)
+            steady = plant.polynomial_response(line_load(line)) @ (ports @ structure.H).T
+            swinging = np.einsum("fmn,fn->fm", plant.deflection_of_load(ports), rest)
+            result[0, :, :, column] = grid.inverse(swinging) + grid.monomials @ steady
+            rate = 1j * grid.omega[:, None] * swinging
+            result[1, :, :, column] = grid.inverse(rate) + grid.monomials @ plant.derivative(steady)
+    return result
+
+
+def line_load(line: FloatArray) -> FloatArray:
+    """Polynomial loads (DEGREE + 1, n) from their constants and slopes (2, n)."""
+    load = np.zeros((DEGREE + 1, line.shape[1]))
+    load[:2] = line
+    return load
+
+
+def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: ComplexArray) -> FloatArray:
+    """Motion along ports (m, E) of a floating system under forces (F, s, columns) along sources (s, E).
+
+    (2, N, m, columns): the mean of a force and the line that joins its ends act through polynomials.
+    """
+    plant, grid = forward.plant, forward.part.grid
+    H = plant.structure.H
+    shape = (len(grid.omega), len(sources), -1)
+    rest, line = plant.without_line(force.reshape(len(grid.omega), -1))
+    line = line.reshape(2, len(sources), -1)
+    answer = plant.compliance(ports, sources) @ rest.reshape(shape)
+    lines = np.array([plant.line_motion(w) for w in sources])  # (s, 2, DEGREE + 1, n)
+    polynomial = np.einsum("skpn,mn,ksc->pmc", lines, ports @ H, line)
+    steady = np.stack([polynomial, plant.derivative(polynomial)])
+    swinging = np.stack([grid.inverse(answer), grid.inverse(1j * grid.omega[:, None, None] * answer)])
+    return swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
+
+
+def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Taken | None) -> ComplexArray:
+    """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
+
+    The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant:
+    f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no tangent
+    in one instant; for them the preload stands.
+    """
+    plant, grid = forward.plant, forward.part.grid
+    slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
+    ports = np.array([wide_port(forward, w) for w in forces.ports])
+    compliance = plant.compliance(ports, ports)
+    if taken is not None:
+        compliance[grid.band] -= taken.deflection @ taken.seen
+    jw = 1j * grid.omega[:, None, None]
+    if not plant.floats:  # single precision is ample for what is solved to a few thousandths, and quick
+        slopes, motions = slopes.astype(np.float32), motions.astype(np.float32)
+        compliance, jw = compliance.astype(np.complex64), jw.astype(np.complex64)
+    along_d, along_v = slopes[0, :, :, None], slopes[1, :, :, None]
+
+    def close(force: FloatArray) -> FloatArray:
+        if plant.floats:
+            spectrum = grid.forward(force)
+            d, v = _floating(forward, ports, ports, spectrum)
+            if taken is not None:
+                d, v = (d, v) - taken.motion(taken.seen @ spectrum[grid.band])
+            return force - along_d * d - along_v * v
+        moved = compliance @ grid.forward(force)
+        return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
+
+    return grid.forward(_gmres(close, along_d * motions[0] + along_v * motions[1]).astype(np.float64))
+
+
+def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> FloatArray:
+    """x with apply(x) = right, one Krylov space per last-axis column, all at once (Saad and Schultz 1986)."""
+    size = np.sqrt(np.sum(right**2, axis=(0, 1)))
+    used = size > 0
+    if not used.any():
+        return right
+    scale = np.where(used, size, 1.0)
+    basis = [right / scale]
+    columns = len(scale)
+    hessenberg = np.zeros((columns, _KRYLOV + 1, _KRYLOV), right.dtype)
+    target = np.zeros((columns, _KRYLOV + 1, 1), right.dtype)
+    target[:, 0, 0] = size
+    for k in range(_KRYLOV):
+        w = apply(basis[k])
+        for j, v in enumerate(basis):
+            h = np.einsum("nmc,nmc->c", w, v)
+            hessenberg[:, j, k] = h
+            w = w - h * v
+        length = np.sqrt(np.sum(w**2, axis=(0, 1)))
+        hessenberg[:, k + 1, k] = length
+        solved = np.linalg.pinv(hessenberg[:, : k + 2, : k + 1]) @ target[:, : k + 2]
+        left = target[:, : k + 2] - hessenberg[:, : k + 2, : k + 1] @ solved
+        if np.max(np.linalg.norm(left[:, :, 0], axis=1)[used] / size[used]) < _KRYLOV_TOLERANCE:
+            break
+        basis.append(w / np.where(length > 1e-12, length, 1.0))
+    result = np.zeros_like(right)
+    for j in range(solved.shape[1]):
+        result += basis[j] * solved[:, j, 0]
+    return result
+
+
+def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
+    """Derivatives of a law's force by deflection and rate along the trajectory, less the preload, (2, N)."""
+    term = forces.terms[i]
+    grid = forward.part.grid
+    law = term.law
+    assert isinstance(law, ElementLaw)
+    if law.memory:
+        return np.zeros((2, grid.samples))
+    d, v = forces.deflection[:, i], forces.rate[:, i]
+    time = grid.start + grid.fine_time
+    element = forward.element_of(term)
+    result = np.empty((2, grid.samples))
+    for k, (signal, load) in enumerate(((d, term.preload[0]), (v, term.preload[1]))):
+        step = 1e-3 * float(np.std(signal)) + 1e-300
+        moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
+        up, down = (force_along(law, term.parameters, d + a, v + b, time, element) for a, b in moves)
+        slope = ((up - down) / (2 * step)).reshape(-1, OVERSAMPLING).mean(axis=1)
+        result[k] = slope - load
+    return result
+
+
+def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
+    i = forces.index(term)
+    grid = forward.part.grid
+    return force_along(
+        term.law,  # type: ignore[arg-type]
+        term.parameters,
+        forces.deflection[:, i],
+        forces.rate[:, i],
+        grid.start + grid.fine_time,
+        forward.element_of(term),
+    )
+
+
+class Taken:
+    """What of a motion along the laws' ports the smoothed inputs take back.
+
+    Inputs are smoothed anew when a value moves, so that the motion moves only as far as sensors and inputs allow: where
+    a force's noise is large, not at all.
+    """
+
+    def __init__(self, problem: Problem, forward: Forward, forces: LawForces) -> None:
+        assert problem.whitener is not None
+        plant, self.grid = forward.plant, forward.part.grid
+        band = self.grid.band
+        ports = np.array([wide_port(forward, w) for w in forces.ports])
+        inputs = plant.deflection_of_inputs[band]
+        self.deflection = ports @ inputs @ problem.whitener.blame  # of whitened sensor signals, (F, m, S)
+        self.rate = 1j * self.grid.omega[band, None, None] * self.deflection
+        if plant.floats:
+            steady = ports @ plant.structure.H @ plant.steady_rate @ plant.structure.F
+            self.rate[0] = steady @ problem.whitener.blame[0, plant.structure.G.shape[1] :]
+        shown = plant.sensor_of_force[band] * forward.sensor_factor[band, :, None]
+        self.seen = problem.whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
+
+    def motion(self, whitened: ComplexArray) -> FloatArray:
+        """Deflection and rate along the ports taken back of whitened sensor signals (F, S, c), (2, N, m, c)."""
+        result = np.empty((2, self.grid.samples, self.deflection.shape[1], whitened.shape[2]))
+        for k, rows in enumerate((self.deflection, self.rate)):
+            spectra = np.zeros((len(self.grid.omega), *result.shape[2:]), dtype=complex)
+            spectra[self.grid.band] = rows @ whitened
+            result[k] = self.grid.inverse(spectra)
+        return result

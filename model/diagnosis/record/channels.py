@@ -1,0 +1,208 @@
+"""From a recording's columns to signals that can be used: gaps closed, stuck and missing channels named."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.schema import SupportInput
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+MINIMUM_SAMPLES = 200
+_GAP_SECONDS = 0.05  # longest gap that is closed by interpolation
+_MOVES = 2.0  # standard deviations of its noise by which at least one sensor has to move
+_STUCK_SHARE = 0.02  # of the recording: a run of equal values this long (and at least a second) is no chance
+
+
+class DiagnosisError(ValueError):
+    """The recording cannot be diagnosed; the message says what is missing and what to do."""
+
+
+class TooLittleError(DiagnosisError):
+    """The recording is what it should be, but too short or too still to decide anything."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Signals, and what was wrong with the channels."""
+
+    signals: Signals
+    stuck: tuple[tuple[str, float], ...]  # channel, s from the start of the recording at which it froze
+    notes: tuple[str, ...]
+
+
+def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
+    """Sort columns (T, C) in the order of `system.channels` by role.
+
+    Errors: `DiagnosisError` when an input is missing, `TooLittleError` when too little is left or nothing moves.
+    """
+    names = [channel.name for channel in system.channels]
+    if values.ndim != 2 or values.shape[1] != len(names):
+        raise DiagnosisError(f"values: expected shape (samples, {len(names)}), came {values.shape}")
+    values = np.array(values, dtype=float)
+    notes: list[str] = []
+    resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
+    notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
+    stuck = _blank_stuck(values, names, sample_rate, resting)
+    first, last = _usable_stretch(system, values, sample_rate)
+    if last - first < MINIMUM_SAMPLES:
+        raise TooLittleError(
+            f"too short to decide anything: the recording has {last - first} usable samples in a row; "
+            f"at least {MINIMUM_SAMPLES} ({MINIMUM_SAMPLES / sample_rate:.1f} s) are needed"
+        )
+    if last - first < len(values):
+        notes.append(
+            f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
+        )
+    values = _close_gaps(values[first:last])
+    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
+    _require_motion(system, prepared.signals)
+    return prepared
+
+
+def _require_motion(system: System, signals: Signals) -> None:
+    listed = list(system.file.sensors.values())
+    noise = np.array([listed[index].noise for index in signals.sensor_index])
+    moves = np.std(signals.sensors, axis=0)
+    if np.all(moves < _MOVES * noise):
+        best = int(np.argmax(moves / noise))
+        raise TooLittleError(
+            f"too still to decide anything: no sensor moves by {_MOVES:g} times its noise "
+            f"({signals.sensor_names[best]}: {moves[best]:.2g}, noise {noise[best]:.2g}); "
+            "record faster or on rougher track"
+        )
+
+
+def _blank_stuck(
+    values: FloatArray, names: list[str], sample_rate: float, resting: set[str]
+) -> list[tuple[str, float]]:
+    """Columns that repeat one value for long become NaN, but for those that rest."""
+    found = []
+    for column, name in enumerate(names):
+        series = values[:, column]
+        good = np.flatnonzero(np.isfinite(series))
+        if len(good) < 2 or name in resting:
+            continue
+        change = np.flatnonzero(np.diff(series[good]) != 0)
+        edges = np.concatenate([[-1], change, [len(good) - 1]])
+        runs = np.diff(edges)
+        longest = int(np.argmax(runs))
+        if runs[longest] >= max(sample_rate, _STUCK_SHARE * len(values), 20):
+            found.append((name, float(good[edges[longest] + 1] / sample_rate)))
+            values[:, column] = np.nan
+    return found
+
+
+def _usable_stretch(system: System, values: FloatArray, sample_rate: float) -> tuple[int, int]:
+    """Longest run of samples in which every channel that is present at all has no long gap."""
+    present = np.isfinite(values).any(axis=0)
+    longest_gap = max(1, int(_GAP_SECONDS * sample_rate))
+    bad = np.zeros(len(values), dtype=bool)
+    for column in np.flatnonzero(present):
+        missing = ~np.isfinite(values[:, column])
+        edges = np.flatnonzero(np.diff(np.concatenate([[0], missing.astype(int), [0]])))
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
+            if stop - start > longest_gap or start == 0 or stop == len(values):
+                bad[start:stop] = True
+    edges = np.flatnonzero(np.diff(np.concatenate([[1], bad.astype(int), [1]])))
+    runs = [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    return max(runs, key=lambda run: run[1] - run[0], default=(0, 0))
+
+
+def _close_gaps(values: FloatArray) -> FloatArray:
+    """Short gaps by cubic interpolation through their neighbours."""
+    from scipy.interpolate import CubicSpline
+
+    for column in range(values.shape[1]):
+        missing = ~np.isfinite(values[:, column])
+        if missing.any() and not missing.all():
+            good = np.flatnonzero(~missing)
+            values[missing, column] = CubicSpline(good, values[good, column])(np.flatnonzero(missing))
+    return values
+
+
+def _by_role(
+    system: System,
+    values: FloatArray,
+    sample_rate: float,
+    stuck: tuple[tuple[str, float], ...],
+    notes: list[str],
+    first: int,
+) -> Prepared:
+    displacement, velocity, force = [], [], []
+    support_names, force_names = [], []
+    column = 0
+    frozen = {name for name, _ in stuck}
+    for name, source in system.file.inputs.items():
+        if not isinstance(source, SupportInput):
+            series = values[:, column]
+            column += 1
+            if np.isnan(series[0]):
+                raise DiagnosisError(_missing(name, frozen))
+            force.append(series)
+            force_names.append(name)
+            continue
+        d = values[:, column]
+        column += 1
+        v = np.full(len(values), np.nan)
+        if source.velocity is not None:
+            v = values[:, column]
+            column += 1
+        if np.isnan(d[0]):
+            if np.isnan(v[0]):
+                raise DiagnosisError(_missing(name, frozen))
+            d = _integral(v) / sample_rate
+            notes.append(f"{name}.displacement is missing: integrated from its velocity")
+        displacement.append(d)
+        velocity.append(v)
+        support_names.append(name)
+    sensors = values[:, column:]
+    present = np.isfinite(sensors).all(axis=0)
+    if not present.any():
+        raise DiagnosisError("no sensor of the system file has data in the recording")
+    for name in np.array(system.sensors)[~present]:
+        if name not in frozen:
+            notes.append(f"sensor {name} is missing: diagnosed without it")
+    empty = np.zeros((len(values), 0))
+    signals = Signals(
+        sample_rate=sample_rate,
+        displacement=np.column_stack(displacement) if displacement else empty,
+        velocity=np.column_stack(velocity) if velocity else empty,
+        force=np.column_stack(force) if force else empty,
+        sensors=sensors[:, present],
+        sensor_index=np.flatnonzero(present),
+        sensor_names=tuple(np.array(system.sensors)[present]),
+        support_names=tuple(support_names),
+        force_names=tuple(force_names),
+        integrated=np.array(_integrated(system, values), dtype=bool),
+        start=first / sample_rate,
+    )
+    return Prepared(signals, stuck, tuple(notes))
+
+
+def _integrated(system: System, values: FloatArray) -> list[bool]:
+    """Supports whose displacement had to be integrated."""
+    result, column = [], 0
+    for source in system.file.inputs.values():
+        if isinstance(source, SupportInput):
+            result.append(bool(np.isnan(values[0, column])))
+            column += 1 + (source.velocity is not None)
+        else:
+            column += 1
+    return result
+
+
+def _integral(series: FloatArray) -> FloatArray:
+    """Of unit-spaced samples, by the antiderivative of their cubic spline."""
+    from scipy.interpolate import CubicSpline
+
+    at = np.arange(len(series))
+    return np.asarray(CubicSpline(at, series).antiderivative()(at))
+
+
+def _missing(name: str, frozen: set[str]) -> str:
+    state = "is stuck" if any(f.startswith(name) for f in frozen) else "is missing from the recording"
+    return f"input {name} {state}: nothing can be simulated without it; record it again or mend the channel"

@@ -1,0 +1,212 @@
+"""The measured signals of a recording, sorted by role, and their spectra over one part of it.
+
+Displacement and velocity of the same support tell the same motion twice.  Both are used: the fused displacement
+
+    D = (D_d / s_d^2 + (V / j w) w^2 / s_v^2) / (1 / s_d^2 + w^2 / s_v^2),   var = 1 / (1 / s_d^2 + w^2 / s_v^2)
+
+drives the model, and the difference V / j w - D_d, which is noise alone and independent of D, tells the noise levels
+and the faults of the input channels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import comb
+
+import numpy as np
+
+from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
+from sprung.model.diagnosis.response.plant import loose_shapes
+from sprung.model.mechanics import DISPLACEMENT
+from sprung.model.schema import SupportInput
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
+_LEAST = 0.2  # of a sensor's declared noise, or of what its fastest changes leave room for
+_ORDER = 8  # of the differences that tell those
+_SEEN = 1e-9  # of a loose motion
+_END = 9  # samples that tell the slope at an end of a record
+
+
+@dataclass(frozen=True)
+class Signals:
+    """A gap-free recording by role.  Sensors that are absent are left out, not NaN."""
+
+    sample_rate: float
+    displacement: FloatArray  # of the supports, m, shape (T, supports)
+    velocity: FloatArray  # m/s, NaN column where it is not measured, shape (T, supports)
+    force: FloatArray  # measured forces, N, shape (T, forces)
+    sensors: FloatArray  # shape (T, S)
+    sensor_index: np.ndarray  # of the present sensors in the system's order, shape (S,)
+    sensor_names: tuple[str, ...]
+    support_names: tuple[str, ...]
+    force_names: tuple[str, ...]
+    integrated: np.ndarray  # supports whose displacement is only the integral of the velocity, (supports,)
+    start: float = 0.0  # s, time of the first sample since the start of the recording
+
+    @property
+    def samples(self) -> int:
+        return len(self.sensors)
+
+    def part(self, start: int, stop: int) -> Signals:
+        """A stretch of samples."""
+        return replace(
+            self,
+            displacement=self.displacement[start:stop],
+            velocity=self.velocity[start:stop],
+            force=self.force[start:stop],
+            sensors=self.sensors[start:stop],
+            start=self.start + start / self.sample_rate,
+        )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations of one sample of every measured signal."""
+
+    displacement: FloatArray  # m, shape (supports,)
+    velocity: FloatArray  # m/s, infinite where not measured, shape (supports,)
+    force: FloatArray  # N, shape (forces,)
+    sensors: FloatArray  # shape (S,)
+    least: FloatArray  # of the sensors' levels: far below what was declared, another noise has taken their place, (S,)
+
+    @property
+    def follows(self) -> bool:
+        """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
+        return len(self.force) > 0
+
+    def support_variance(self, omega: FloatArray) -> FloatArray:
+        """Variance of the fused displacement per bin, shape (F, supports)."""
+        return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)
+
+    def sensor_variance(self, grid: Grid, rated: np.ndarray) -> FloatArray:
+        """Variance of the compared sensor signals per bin, (F, S); of positions compared by their rates, of the rate.
+
+        The noise of the record's two ends, where the rate's line is anchored, spreads over all bins alike.
+        """
+        ends = 2 / (grid.samples * grid.step**2)
+        return self.sensors**2 * np.where(rated, grid.omega[:, None] ** 2 + ends, 1.0)
+
+
+@dataclass(frozen=True)
+class Part:
+    """Signals of one part of the recording on its grid: polynomial ends and periodic spectra."""
+
+    grid: Grid
+    support: ComplexArray  # fused displacement without polynomial, (F, supports)
+    support_polynomial: FloatArray  # (DEGREE + 1, supports)
+    force: ComplexArray  # (F, forces)
+    force_polynomial: FloatArray
+    sensors: ComplexArray  # (F, S), whole signal
+    rated: np.ndarray  # sensors that measure a position and are compared by its rate, (S,)
+    redundancy: ComplexArray  # V / j w - D_d of the supports with both, zero at zero frequency, (F, pairs)
+    pairs: np.ndarray  # which supports, shape (pairs,)
+    displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
+    velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
+
+
+def declared_noise(system: System, signals: Signals) -> Noise:
+    """Noise as the system file states it; where it states none, a thousandth of the signal."""
+    displacement, velocity, force = [], [], []
+    at_support = at_force = 0
+    for source in system.file.inputs.values():
+        if isinstance(source, SupportInput):
+            level = source.displacement.noise or 1e-3 * _size(signals.displacement[:, at_support])
+            displacement.append(level)
+            if signals.integrated[at_support]:
+                displacement[-1] = _INTEGRATED * max(level, _size(signals.displacement[:, at_support]))
+            measured = source.velocity is not None and np.isfinite(signals.velocity[0, at_support])
+            stated = source.velocity.noise if source.velocity is not None else 0.0
+            level = stated or 1e-3 * _size(signals.velocity[:, at_support])
+            velocity.append(level if measured else np.inf)
+            at_support += 1
+        else:
+            force.append(source.noise or 1e-3 * _size(signals.force[:, at_force]))
+            at_force += 1
+    listed = list(system.file.sensors.values())
+    sensors = [
+        listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
+    ]
+    levels = np.array(sensors)
+    least = _LEAST * np.minimum(levels, _roughness(signals.sensors))
+    return Noise(np.array(displacement), np.array(velocity), np.array(force), levels, least)
+
+
+def _roughness(series: FloatArray) -> FloatArray:
+    """The strongest white noise that series (T, m) can hold, (m,): that of their differences of high order."""
+    differences = np.diff(series, _ORDER, axis=0)
+    return np.asarray(np.std(differences, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER)))
+
+
+def _size(series: FloatArray) -> float:
+    return float(np.std(series)) or 1.0
+
+
+def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
+    """Which of the given sensors show the position of something that no stiffness holds, (sensors,).
+
+    Such a position is the integral of every disturbance since the start: it wanders without end, its two ends do not
+    meet, and its spectrum is all leakage.  Its rate is stationary.
+    """
+    mechanics = system.mechanics
+    stiffness = (mechanics.H.T * mechanics.stiffness) @ mechanics.H
+    seen = np.any(np.abs(mechanics.S[sensors] @ loose_shapes(stiffness)) > _SEEN, axis=1)
+    return seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
+
+
+def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
+    """Time derivative of series (N, m), exact within the band: what their ends leave open is a parabola's."""
+    ends = np.vander(np.arange(_END) * grid.step, 3)
+    slopes = [np.linalg.lstsq(ends, stretch, rcond=None)[0][1] for stretch in (position[:_END], position[::-1][:_END])]
+    polynomial = detrend_ends(position, (slopes[0], -slopes[1]), grid)
+    rest = grid.forward(position - grid.monomials @ polynomial)
+    slope = grid.monomials @ derivative(polynomial, grid.length)
+    return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
+
+
+def transform(signals: Signals, noise: Noise, rated: np.ndarray | None = None) -> Part:
+    """Spectra of a part.
+
+    `rated`: sensors whose series are compared by their rates (`drifting`), (S,).
+    """
+    grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start)
+    rated = np.zeros(signals.sensors.shape[1], dtype=bool) if rated is None else rated
+    sensors = signals.sensors
+    if rated.any():
+        sensors = np.where(rated, rate_of(sensors, grid), sensors)
+    omega = grid.omega[:, None]
+    has_rate = np.isfinite(noise.velocity)
+    d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
+    polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
+    if d.shape[1]:
+        polynomial = detrend_ends(d, None, grid)
+        with_rate = detrend_ends(d, (v[0], v[-1]), grid)
+        polynomial[:, has_rate] = with_rate[:, has_rate]
+    slope = np.zeros_like(polynomial)
+    slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
+    D = grid.forward(d - grid.monomials @ polynomial)
+    V = grid.forward(v - grid.monomials @ slope)
+    integrated = np.zeros_like(V)
+    integrated[1:] = V[1:] / (1j * omega[1:])
+    integrated[0] = D[0]
+    precision_d, precision_v = 1 / noise.displacement**2, (omega / noise.velocity) ** 2
+    fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
+    pairs = np.flatnonzero(has_rate & ~signals.integrated)
+    redundancy = (integrated - D)[:, pairs]
+    force_polynomial = np.zeros((grid.monomials.shape[1], signals.force.shape[1]))
+    if signals.force.shape[1]:
+        force_polynomial = detrend_ends(signals.force, None, grid)
+    return Part(
+        grid=grid,
+        support=np.asarray(fused, dtype=complex),
+        support_polynomial=polynomial,
+        force=grid.forward(signals.force - grid.monomials @ force_polynomial),
+        force_polynomial=force_polynomial,
+        sensors=grid.forward(sensors),
+        rated=rated,
+        redundancy=redundancy,
+        pairs=pairs,
+        displacement=D,
+        velocity=integrated,
+    )

@@ -1,0 +1,139 @@
+"""Discrete Fourier transforms of finite records, arranged so that a linear system maps bin to bin.
+
+A record of N samples is written as  polynomial + periodic remainder.  The polynomial matches value and slope at
+both ends, so the remainder continues smoothly around the record and its transform is mapped by the frequency
+response G(j omega) without leakage; the polynomial is mapped in closed form (`Plant.polynomial_response`).  What then
+remains between the periodic solution and the recorded one is a free motion of the system: 2n numbers.
+
+Transforms are scaled by 1/sqrt(N): white noise of variance s^2 has E|X|^2 = s^2 in every bin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from sprung.model.signals import FloatArray
+
+ComplexArray = NDArray[np.complexfloating[Any, Any]]
+
+DEGREE = 5  # of the polynomials: quadratic inputs, integrated twice by a free body
+OVERSAMPLING = 4  # laws with kinks make harmonics beyond the Nyquist frequency of the record
+BAND = 0.30  # of the sample rate: above it anti-alias filters are on their way down, laws' harmonics with them
+
+
+@dataclass(frozen=True)
+class Grid:
+    """The time and frequency grid of one record part: N samples every `step` seconds."""
+
+    samples: int
+    step: float
+    start: float = 0.0  # s, time of the first sample of this part since the start of the recording
+
+    @cached_property
+    def omega(self) -> FloatArray:
+        """Angular frequencies of the bins, rad/s, shape (F,)."""
+        return np.asarray(2 * np.pi * np.fft.rfftfreq(self.samples, self.step), dtype=np.float64)
+
+    @property
+    def nyquist(self) -> float:
+        """Half of the sample rate, Hz."""
+        return 0.5 / self.step
+
+    @cached_property
+    def band(self) -> slice:
+        """Bins that are compared."""
+        return slice(0, max(2, int(BAND * self.samples)))
+
+    @cached_property
+    def weight(self) -> FloatArray:
+        """sqrt of the real degrees of freedom of each compared bin: 1 for zero frequency, else sqrt 2."""
+        weight = np.full(self.band.stop, np.sqrt(2.0))
+        weight[0] = 1.0
+        return weight
+
+    @cached_property
+    def time(self) -> FloatArray:
+        """Seconds since the start of this part, shape (N,)."""
+        return np.arange(self.samples, dtype=np.float64) * self.step
+
+    @cached_property
+    def fine_time(self) -> FloatArray:
+        """The oversampled time axis, shape (OVERSAMPLING N,)."""
+        return np.arange(OVERSAMPLING * self.samples, dtype=np.float64) * (self.step / OVERSAMPLING)
+
+    @property
+    def length(self) -> float:
+        return self.samples * self.step
+
+    @cached_property
+    def monomials(self) -> FloatArray:
+        """(t / length)^k, shape (N, DEGREE + 1)."""
+        return np.vander(self.time / self.length, DEGREE + 1, increasing=True)
+
+    @cached_property
+    def monomial_spectra(self) -> ComplexArray:
+        """Their transforms, shape (F, DEGREE + 1)."""
+        return self.forward(self.monomials)
+
+    def forward(self, series: FloatArray) -> ComplexArray:
+        """Transform along the first axis: (N, ...) -> (F, ...)."""
+        return scipy.fft.rfft(series, axis=0, norm="ortho")
+
+    def inverse(self, spectrum: ComplexArray) -> FloatArray:
+        """(F, ...) -> (N, ...)."""
+        return scipy.fft.irfft(spectrum, self.samples, axis=0, norm="ortho")
+
+    def fine(self, spectrum: ComplexArray) -> FloatArray:
+        """Band-limited series on the oversampled axis: (F, ...) -> (OVERSAMPLING N, ...)."""
+        return scipy.fft.irfft(spectrum, OVERSAMPLING * self.samples, axis=0) * (OVERSAMPLING * np.sqrt(self.samples))
+
+    def coarse_spectrum(self, fine_series: FloatArray) -> ComplexArray:
+        """Transform of an oversampled series, kept up to the record's Nyquist frequency."""
+        full = scipy.fft.rfft(fine_series, axis=0)
+        return full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
+
+    def pack(self, spectrum: ComplexArray) -> FloatArray:
+        """Compared bins of whitened spectra (F, S, ...) as real vectors (2 F S, ...) of unit-variance noise."""
+        shape = (-1,) + (1,) * (spectrum.ndim - 1)
+        weighted = spectrum[self.band] * self.weight.reshape(shape)
+        real, imag = weighted.real, weighted.imag
+        flat = (-1, *spectrum.shape[2:])
+        return np.concatenate([real.reshape(flat), imag.reshape(flat)])
+
+
+def derivative(polynomial: FloatArray, length: float) -> FloatArray:
+    """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
+    result = np.zeros_like(polynomial)
+    orders = np.arange(1, len(polynomial)).reshape((-1,) + (1,) * (polynomial.ndim - 1))
+    result[:-1] = polynomial[1:] * orders / length
+    return result
+
+
+def detrend_ends(series: FloatArray, slopes: tuple[FloatArray, FloatArray] | None, grid: Grid) -> FloatArray:
+    """Polynomial coefficients over t / length that make the remainder continue around the record.
+
+    `series` (N, m); `slopes` its derivative at the first and last sample (each (m,), per second), where measured.
+    Returns (DEGREE + 1, m): quadratic with slopes, linear without, and a constant that leaves no mean.
+    The period is N steps, so the value after the last sample is extrapolated from the end.
+    """
+    n, length = grid.samples, grid.length
+    coefficients = np.zeros((DEGREE + 1, series.shape[1]))
+    if slopes is None:
+        after = 2 * series[-1] - series[-2] if n > 2 else series[-1]
+        coefficients[1] = after - series[0]
+    else:
+        first, last = slopes
+        after = series[-1] + last * grid.step
+        jump, bend = after - series[0], (last - first) * length
+        # p(1) - p(0) = jump and p'(1) - p'(0) = bend with p = a t + b t^2
+        coefficients[2] = bend / 2
+        coefficients[1] = jump - bend / 2
+    remainder = series - grid.monomials @ coefficients
+    coefficients[0] = remainder.mean(axis=0)
+    return coefficients

@@ -1,0 +1,55 @@
+"""Where a recording is cut: at quiet moments, into lengths that transform quickly.
+
+A part is continued around its ends as a parabola and a periodic rest.  What bends faster there than a parabola, a wheel
+on a rail joint for one, is not continued truly and leaves a mark in the first and last samples of the residual.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.signals import FloatArray
+
+_REACH_SECONDS, _REACH_SHARE = 0.5, 0.01  # of a cut from where it was meant to be, the smaller of the two
+_NEIGHBOURS = 7  # samples that tell how quiet a moment is
+_PRIMES = (2, 3, 5, 7, 11)  # factors that transforms are quick for
+
+
+def cut(signals: Signals, share: float) -> tuple[Signals, int]:
+    """A recording without its loud ends, and how many of its samples are fitted: about the first `share`."""
+    samples = signals.samples
+    reach = int(min(_REACH_SECONDS * signals.sample_rate, _REACH_SHARE * samples))
+    loud = _loudness(signals)
+    first, last = range(reach + 1), range(samples - reach, samples + 1)
+    start, stop = _quietest(loud, [(a, b) for a in first for b in last])
+    meant = start + round(share * (stop - start))
+    _, split = _quietest(loud, [(start, b) for b in range(meant - reach, meant + reach + 1)])
+    return signals.part(start, stop), split - start
+
+
+def _quietest(loud: FloatArray, stretches: list[tuple[int, int]]) -> tuple[int, int]:
+    """The stretch of samples with the quietest ends among those of quick length; if there is none, the first, cut."""
+    quick = [(a, b) for a, b in stretches if _is_quick(b - a)]
+    if not quick:
+        start, stop = stretches[0]
+        return next((start, b) for b in range(stop, start, -1) if _is_quick(b - start))
+    return min(quick, key=lambda ends: float(loud[ends[0]] + loud[ends[1] - 1]))
+
+
+def _loudness(signals: Signals) -> FloatArray:
+    """Power of the second differences around every sample, each channel over its mean, (T,)."""
+    moved = np.where(np.isfinite(signals.velocity), signals.velocity, signals.displacement)
+    bends = np.diff(np.column_stack([moved, signals.force, signals.sensors]), 2, axis=0, prepend=0, append=0) ** 2
+    bends[[0, -1]] = bends[[1, -2]]
+    mean = bends.mean(axis=0)
+    power = (bends[:, mean > 0] / mean[mean > 0]).mean(axis=1) if np.any(mean > 0) else np.zeros(len(bends))
+    return np.asarray(uniform_filter1d(power, _NEIGHBOURS, mode="nearest"))
+
+
+def _is_quick(length: int) -> bool:
+    for prime in _PRIMES:
+        while length % prime == 0 and length:
+            length //= prime
+    return length == 1

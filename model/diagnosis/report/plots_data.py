@@ -1,0 +1,147 @@
+"""Arrays that pictures of a report are drawn from (keys in `model.diagnosis.report.report`)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sprung.model.diagnosis.fit.problem import Fit
+from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.screening.screen import Projector
+from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.along import force_along
+from sprung.model.laws.basis import StaticLaw
+from sprung.model.laws.spline import SurfaceLaw
+from sprung.model.signals import FloatArray
+
+if TYPE_CHECKING:
+    from sprung.model.diagnosis.investigation.diagnose import Course
+
+_MOST = 4000  # samples of a scatter
+_BINS = 41
+
+
+def evidence_arrays(
+    course: Course, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
+) -> dict[str, NDArray[Any]]:
+    """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
+    rate = course.signals.sample_rate
+    start = course.held.split + round(course.signals.start * rate)
+    arrays: dict[str, NDArray[Any]] = {
+        "validation.time": (start + np.arange(len(before.measured))) / rate,
+        "validation.measured": before.measured,
+        "validation.baseline": before.simulated,
+        "validation.augmented": after.simulated,
+        "validation.noise": floor,
+    }
+    scores = course.first.localization()
+    arrays["localization.names"] = np.array(list(scores), dtype=str)
+    arrays["localization.score"] = np.array(list(scores.values()))
+    for term in course.fit.point.terms:
+        place = (term.location, term.law.name)
+        if isinstance(term.law, ElementLaw) and place in order:
+            arrays.update(_of_element(course, term, f"finding.{order.index(place)}"))
+    return arrays
+
+
+def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]:
+    """Motion of the element, the force that was missed before and after, and the law through it."""
+    fit, grid = course.fit, course.problem.part.grid
+    port = term.port(course.system)
+    d_all, v_all = fit.element_motion
+    d, v = (d_all @ port)[::4], (v_all @ port)[::4]
+    thin = slice(None, None, max(1, len(d) // _MOST))
+    time = grid.start + grid.time
+    if is_waveform(term):
+        law = force_along(term.law, term.parameters, d, v, time, fit.forward.element_of(term))  # type: ignore[arg-type]
+    else:
+        law = np.zeros_like(d)
+    after, deviation = latent_force(course, fit, port)
+    before, _ = latent_force(course, course.base, port)
+    by_rate = abs(_share(law, v)) > abs(_share(law, d)) if np.any(law) else False
+    x = v if by_rate else d
+    grid_x = _axis(x, 0.002)
+    mean, std, drawn = _binned(x, after + law, law, deviation, grid_x)
+    result: dict[str, NDArray[Any]] = {
+        f"{key}.time": time[thin],
+        f"{key}.deflection": d[thin],
+        f"{key}.rate": v[thin],
+        f"{key}.force_before": before[thin],
+        f"{key}.force_after": after[thin],
+        f"{key}.curve_axis": np.array("rate" if by_rate else "deflection"),
+        f"{key}.curve_x": grid_x,
+        f"{key}.curve_mean": mean,
+        f"{key}.curve_std": std,
+    }
+    if isinstance(term.law, StaticLaw):
+        result.update(_surface(course, term, term.law, key, d, v))
+    elif isinstance(term.law, SurfaceLaw) and term.law.latent is not None:
+        drawn_map = term.law.latent.map((_BINS, _BINS))
+        result[f"{key}.map_d"], result[f"{key}.map_v"] = drawn_map.deflection, drawn_map.rate
+        result[f"{key}.map_force"], result[f"{key}.map_std"] = drawn_map.force, drawn_map.std
+    else:
+        result[f"{key}.curve_law"] = drawn
+    if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):
+        part = slice(len(d) // 2, len(d) // 2 + int(3 / grid.step))
+        result[f"{key}.loop_x"], result[f"{key}.loop_y"] = d[part], law[part]
+    return result
+
+
+def _surface(
+    course: Course, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
+) -> dict[str, NDArray[Any]]:
+    """The unnamed force over deflection and rate, with the standard deviation that its weights have."""
+    axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
+    mesh_d, mesh_v = np.meshgrid(axis_d, axis_v)
+    values = np.stack([np.broadcast_to(b, mesh_d.shape) for b in law.values(mesh_d, mesh_v)])
+    keys = [other.key for other in course.fit.point.terms]
+    place = course.fit.place(keys.index(term.key))
+    block = course.fit.covariance[place, place]
+    variance = np.einsum("ivd,ij,jvd->vd", values, block, values)
+    return {
+        f"{key}.map_d": axis_d,
+        f"{key}.map_v": axis_v,
+        f"{key}.map_force": np.einsum("i,ivd->vd", np.array(term.parameters), values),
+        f"{key}.map_std": np.sqrt(np.maximum(variance, 0)),
+    }
+
+
+def latent_force(course: Course, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
+    """Force along a port that the residual of a fit asks for, N, (N,), and its standard deviation.
+
+    Bin by bin with a flat prior cut where the sensors see nothing: f = (r^H R^-1 y) / (r^H R^-1 r + prior).
+    """
+    projector = Projector(course.problem, fit)
+    response = projector.of_force[:, :, : len(port)] @ port
+    residual = projector.factor @ fit.spectrum[projector.grid.band][:, :, None]
+    seen = np.sum(np.abs(response) ** 2, axis=1)
+    prior = 1e-3 * float(np.max(seen)) + 1e-300
+    estimate = np.einsum("fs,fs->f", response.conj(), residual[:, :, 0]) / (seen + prior)
+    spectrum = np.zeros(len(projector.grid.omega), dtype=complex)
+    spectrum[projector.grid.band] = estimate
+    variance = float(np.mean(seen / (seen + prior) ** 2))
+    return projector.grid.inverse(spectrum), float(np.sqrt(variance))
+
+
+def _axis(x: FloatArray, outside: float) -> FloatArray:
+    low, high = np.quantile(x, [outside, 1 - outside])
+    return np.linspace(float(low), float(high), _BINS)
+
+
+def _share(force: FloatArray, signal: FloatArray) -> float:
+    return float(np.corrcoef(force, signal)[0, 1]) if np.std(signal) > 0 and np.std(force) > 0 else 0.0
+
+
+def _binned(
+    x: FloatArray, force: FloatArray, law: FloatArray, deviation: float, grid: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean of the force over bins of x, its standard deviation, and the law's mean in the same bins."""
+    edges = np.concatenate([[-np.inf], (grid[1:] + grid[:-1]) / 2, [np.inf]])
+    which = np.digitize(x, edges) - 1
+    count = np.maximum(np.bincount(which, minlength=len(grid)), 1)
+    mean = np.bincount(which, force, len(grid)) / count
+    drawn = np.bincount(which, law, len(grid)) / count
+    return mean, deviation / np.sqrt(count) * 2.0, drawn

@@ -1,0 +1,318 @@
+"""What the sensors should show: nominal structure with any terms in place, driven by the measured inputs.
+
+The linear part is mapped bin by bin; the forces of laws along the trajectory are found in `loop`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
+
+import numpy as np
+from scipy.linalg import expm
+
+from sprung.model.diagnosis.record.signals import Part
+from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
+from sprung.model.diagnosis.response.plant import Plant, Structure
+from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
+from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SpringDamper, SupportLaw
+from sprung.model.mechanics import VELOCITY
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+DELAY, BOTH = "delay", "lag and delay"  # variants of a sensor's lag, which is else of first order
+
+
+def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
+    """Structure for log-ratios `theta` (P,) of the system's parameters, with the laws of bodies in place."""
+    mechanics = system.mechanics
+    for term in terms:
+        if isinstance(term.law, BodyLaw) and term.law.load is None:
+            body = system.bodies.index(term.location)
+            mechanics = term.law.modify(mechanics, body, term.parameters, term.variant)
+    structure = Structure.nominal(mechanics, sensors)
+    stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
+    mass = structure.mass.copy()
+    for parameter, log_ratio in zip(system.parameters, theta, strict=True):
+        ratio = np.exp(log_ratio)
+        if parameter.quantity == "mass":
+            mass[structure.body_of_dof == system.bodies.index(parameter.element)] *= ratio
+        else:
+            values = stiffness if parameter.quantity == "stiffness" else damping
+            values[system.elements.index(parameter.element)] *= ratio
+    return replace(structure, stiffness=stiffness, damping=damping, mass=mass)
+
+
+@dataclass(frozen=True)
+class Forward:
+    """One model on one part of the recording."""
+
+    system: System
+    part: Part
+    sensors: np.ndarray  # indices of the present sensors, (S,)
+    theta: FloatArray  # (P,)
+    terms: tuple[Term, ...] = ()
+    start_force: tuple[FloatArray, ...] = ()  # forces of a nearby solution, to start the iteration from
+
+    @cached_property
+    def plant(self) -> Plant:
+        structure = structure_of(self.system, self.sensors, self.theta, self.terms)
+        structure = replace(structure, sensor_kind=np.where(self.part.rated, VELOCITY, structure.sensor_kind))
+        waveform, linear, _, _ = split(self.terms)
+        stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
+        for term in waveform:
+            if "|" not in term.location:
+                e = self.system.elements.index(term.location)
+                stiffness[e] += term.preload[0]
+                damping[e] += term.preload[1]
+        places = [self.system.elements.index(term.location) for term in linear]
+        found = [branch_of(term, e, structure.damping[e]) for term, e in zip(linear, places, strict=True)]
+        branches = tuple(branch for branch in found if branch is not None)
+        return Plant(replace(structure, stiffness=stiffness, damping=damping, branches=branches), self.part.grid)
+
+    def element_of(self, term: Term) -> SpringDamper:
+        """Spring and damper that a law belongs to, at the present parameters."""
+        structure = structure_of(self.system, self.sensors, self.theta)
+        e = self.system.elements.index(term.location.split("|")[0])
+        return SpringDamper(structure.stiffness[e], structure.damping[e])
+
+    @property
+    def elements(self) -> int:
+        return len(self.system.elements)
+
+    @cached_property
+    def polynomial(self) -> tuple[FloatArray, FloatArray]:
+        """Polynomial motion (DEGREE + 1, n) and deflections (DEGREE + 1, E) under the polynomial inputs."""
+        plant, s = self.plant, self.plant.structure
+        support = self.support_polynomial
+        moved = support @ s.G.T
+        load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
+        load = load + self.force_polynomial @ s.F.T
+        q = plant.polynomial_response(load)
+        return q, q @ s.H.T + moved
+
+    @cached_property
+    def linear_sensors(self) -> ComplexArray:
+        """True signals without laws' forces and free motion, (F, S)."""
+        return self.plant.sensors(self.support, self.force)
+
+    @cached_property
+    def _unmeasured(self) -> tuple[ComplexArray, FloatArray]:
+        """What the supports move besides what is measured: (F, supports) and (DEGREE + 1, supports)."""
+        grid = self.part.grid
+        spectrum = np.zeros(self.part.support.shape, dtype=complex)
+        polynomial = np.zeros(self.part.support_polynomial.shape)
+        time = grid.start + grid.time + CLOCK_LEAD
+        names = supports(self.system)
+        for term in self.terms:
+            if isinstance(term.law, SupportLaw):
+                at = [names.index(name) for name in term.location.split("|")]
+                d, v = (x[:, None] for x in term.law.movement(time, term.parameters, grid.nyquist))
+                line = detrend_ends(d, (v[0], v[-1]), grid)
+                spectrum[:, at] += grid.forward(d - grid.monomials @ line)
+                polynomial[:, at] += line
+        return spectrum, polynomial
+
+    @cached_property
+    def support(self) -> ComplexArray:
+        """Displacement of the supports, periodic part, (F, supports)."""
+        return self.part.support + self._unmeasured[0]
+
+    @property
+    def support_polynomial(self) -> FloatArray:
+        """The same, polynomial part, (DEGREE + 1, supports)."""
+        return self.part.support_polynomial + self._unmeasured[1]
+
+    @cached_property
+    def force_faults(self) -> tuple[FloatArray, FloatArray]:
+        """Gain and offset of every measured force, each (forces,)."""
+        count = self.part.force.shape[1]
+        gain, offset = np.ones(count), np.zeros(count)
+        for term in self.terms:
+            i = self.faulty_force(term)
+            if i is not None:
+                if term.law.name == "sensor_gain":
+                    gain[i] *= term.parameters[0]
+                elif term.law.name == "sensor_bias":
+                    offset[i] += term.parameters[0]
+        return gain, offset
+
+    def faulty_force(self, term: Term) -> int | None:
+        """Which measured force a term finds at fault."""
+        names = [n for n, source in self.system.file.inputs.items() if source.kind == "force"]
+        return names.index(term.location) if isinstance(term.law, SensorLaw) and term.location in names else None
+
+    def fault_load(self, term: Term) -> ComplexArray:
+        """Load on the degrees of freedom per rise of a measured force's gain or offset, (F, n)."""
+        i = self.faulty_force(term)
+        assert i is not None
+        gain = self.force_faults[0][i]
+        if term.law.name == "sensor_gain":
+            change = -(self.force + self.part.grid.monomial_spectra @ self.force_polynomial)[:, i] / gain
+        else:
+            change = np.zeros(len(self.part.grid.omega), dtype=complex)
+            change[0] = -np.sqrt(self.part.grid.samples) / gain
+        return change[:, None] * self.plant.structure.F[:, i]
+
+    @property
+    def of_inputs(self) -> ComplexArray:
+        """What the sensors show of supports and measured forces, (F, S, inputs)."""
+        both = np.concatenate([self.plant.sensor_of_support, self.plant.sensor_of_measured_force], axis=2)
+        return both * self.sensor_factor[:, :, None]
+
+    def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
+        """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
+        plant, s = self.plant, self.plant.structure
+        moved = plant.receptance @ plant.load_of_inputs
+        inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
+        return plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
+
+    @property
+    def force(self) -> ComplexArray:
+        """Measured forces with their faults taken out, periodic part, (F, forces)."""
+        return self.part.force / self.force_faults[0]
+
+    @property
+    def force_polynomial(self) -> FloatArray:
+        """The same, polynomial part, (DEGREE + 1, forces)."""
+        gain, offset = self.force_faults
+        result = self.part.force_polynomial.copy()
+        result[:1] -= offset
+        return result / gain
+
+    def shown(self, periodic: ComplexArray, polynomial: FloatArray) -> ComplexArray:
+        """What the sensors show of true signals (F, S) + polynomial (DEGREE + 1, S), faults in place."""
+        grid = self.part.grid
+        gain, lag, delay, offset = self.faults
+        late = _lagged(_later(polynomial, delay / grid.length), lag / grid.length)
+        shown = periodic * self.sensor_factor + grid.monomial_spectra @ (late * gain)
+        shown[0] += offset * np.sqrt(grid.samples)
+        return shown
+
+    @cached_property
+    def faults(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Gain, time constant of a lag (s), pure delay (s) and offset of every present sensor, each (S,)."""
+        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in (1.0, 0.0, 0.0, 0.0))
+        names = [self.system.sensors[i] for i in self.sensors]
+        for term in self.terms:
+            if not isinstance(term.law, SensorLaw) or term.location not in names:
+                continue
+            i = names.index(term.location)
+            if term.law.name == "sensor_gain":
+                gain[i] *= term.parameters[0]
+            elif term.law.name == "sensor_lag":
+                (delay if term.variant == DELAY else lag)[i] += term.parameters[0]
+                if term.variant == BOTH:
+                    delay[i] += term.parameters[1]
+            elif term.law.name == "sensor_bias":
+                offset[i] += term.parameters[0]
+        return gain, lag, delay, offset
+
+    @cached_property
+    def sensor_factor(self) -> ComplexArray:
+        """Shown over true signal of every sensor, (F, S)."""
+        gain, lag, delay, _ = self.faults
+        s = 1j * self.part.grid.omega[:, None]
+        return gain * np.exp(-s * delay) / (1 + s * lag)
+
+    @cached_property
+    def linear_motion(self) -> ComplexArray:
+        """Periodic part of the degrees of freedom without laws' forces and free motion, (F, n)."""
+        load = self.plant.load(self.support, self.force)
+        return np.einsum("fnm,fm->fn", self.plant.receptance, load)
+
+    @cached_property
+    def linear_deflection(self) -> ComplexArray:
+        """Periodic part of the deflections without laws' forces and free motion, (F, E)."""
+        s = self.plant.structure
+        return self.linear_motion @ s.H.T + self.support @ s.G.T
+
+    def free_rows(self) -> FloatArray:
+        """Sensors over the free state at the first sample, (N, S, 2n)."""
+        grid = self.part.grid
+        return self.plant.free_motion(self.free_rows_at_start(), grid.step, grid.samples)
+
+    def free_rows_at_start(self) -> FloatArray:
+        """What the sensors show of the state at the first sample, (S, 2n)."""
+        rows = self.plant.structure.sensor_rows()
+        gain, lag, delay, _ = self.faults
+        A = self.plant.structure.state_matrix()
+        for i in np.flatnonzero((lag != 0) | (delay != 0)):
+            rows[i] = rows[i] @ expm(-A * delay[i]) @ np.linalg.inv(np.eye(len(A)) + A * lag[i])
+        return rows * gain[:, None]
+
+    def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deflection and rate along ports (m, E) on the oversampled axis, laws' forces left out: 2 x (4N, m)."""
+        plant, grid = self.plant, self.part.grid
+        H = plant.structure.H
+        ports = np.pad(ports, ((0, 0), (0, len(H) - ports.shape[1])))
+        spectrum = self.linear_deflection @ ports.T
+        d = grid.fine(spectrum)
+        v = grid.fine(1j * grid.omega[:, None] * spectrum)
+        polynomial = self.polynomial[1] @ ports.T
+        powers = np.vander(grid.fine_time / grid.length, DEGREE + 1, increasing=True)
+        d += powers @ polynomial
+        v += powers @ plant.derivative(polynomial)
+        A, rows = plant.structure.state_matrix(), plant.structure.motion_rows(ports)
+        free = propagate(A, rows, state, grid.step / OVERSAMPLING, len(d))
+        return d + free[:, : len(ports)], v + free[:, len(ports) :]
+
+    def law_forces(self, state: FloatArray) -> LawForces | None:
+        """Forces of the laws along their own trajectory; None when no law needs it."""
+        loop = self.loop(state)
+        if loop is None:
+            return None
+        start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
+        return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start))
+
+    def loop(self, state: FloatArray) -> Loop | None:
+        """The laws that act along the trajectory and the plant between them; None when there is none."""
+        waveform, *_ = split(self.terms)
+        return Loop(self, waveform, state) if waveform else None
+
+    def driven_by(self, part: Part) -> Forward:
+        """The same model under other inputs."""
+        other = replace(self, part=part)
+        other.__dict__["plant"] = self.plant
+        return other
+
+
+def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:
+    """Coefficients of p(t - delay) from those of p(t), one delay per column."""
+    if not np.any(delay):
+        return polynomial
+    result = np.zeros_like(polynomial)
+    for k in range(len(polynomial)):
+        for j in range(k + 1):
+            result[j] += polynomial[k] * comb(k, j) * (-delay) ** (k - j)
+    return result
+
+
+def _lagged(polynomial: FloatArray, lag: FloatArray) -> FloatArray:
+    """Coefficients of p behind a first-order lag, p - lag p' + lag^2 p'' ..., one lag per column."""
+    if not np.any(lag):
+        return polynomial
+    result, derivative = polynomial.copy(), polynomial
+    orders = np.arange(1, len(polynomial))[:, None]
+    for k in range(1, len(polynomial)):
+        following = np.zeros_like(derivative)
+        following[:-1] = derivative[1:] * orders
+        derivative = following
+        result = result + (-lag) ** k * derivative
+    return result
+
+
+def propagate(A: FloatArray, rows: FloatArray, state: FloatArray, step: float, count: int) -> FloatArray:
+    """rows e^{A t} state at t = 0, step, ...: (count, len(rows)), states by doubling."""
+    power = expm(A * step)
+    states = np.empty((count, len(state)))
+    states[0] = state
+    done = 1
+    while done < count:
+        more = min(done, count - done)
+        states[done : done + more] = states[:more] @ power.T
+        power = power @ power
+        done += more
+    return states @ rows.T

@@ -1,0 +1,182 @@
+"""Laws and the motion along their ports: forces that depend on the motion that they shape.
+
+    d = d_linear + D f,   f = law(d, d')        over the whole record at once
+
+by a fixed-point iteration with Anderson acceleration (Walker and Ni 2011) on an oversampled grid, around the
+equivalent linear law (`Term.preload`, carried by the plant), so that only the law's curvature is left to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.fft import irfft, rfft
+
+from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws.along import force_along
+from sprung.model.signals import FloatArray
+
+if TYPE_CHECKING:
+    from sprung.model.diagnosis.response.forward import Forward
+
+_TOLERANCE = 1e-6  # of the law's force
+_ITERATIONS = 60
+_PATIENCE, _PROGRESS = 16, 0.5  # it is given up when the error has not fallen by this factor in so many iterations
+_HISTORY = 8
+_REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
+
+
+@dataclass(frozen=True)
+class LawForces:
+    """Solution of the loop for m laws; forces without the preload that the plant carries."""
+
+    terms: list[Term]
+    ports: FloatArray  # (m, E)
+    deflection: FloatArray  # (4N, m)
+    rate: FloatArray  # (4N, m)
+    force: FloatArray  # (4N, m)
+    converged: bool
+    sensors: ComplexArray  # what the forces add to the true signals, periodic part, (F, S)
+    deflections: ComplexArray  # what they add to the deflections, periodic part, (F, E)
+    q: ComplexArray  # what they add to the degrees of freedom, periodic part, (F, n)
+    motion: FloatArray  # polynomial motion that they add, (DEGREE + 1, n)
+
+    def index(self, term: Term) -> int:
+        """Which of the laws a term is, whatever its values."""
+        return next(i for i, own in enumerate(self.terms) if own.key == term.key)
+
+
+def near_of(forces: LawForces | None) -> tuple[FloatArray, ...]:
+    """The laws' forces as a start for a solution nearby, each (4N,)."""
+    return () if forces is None else tuple(forces.force.T)
+
+
+class Loop:
+    """Laws and the motion along their ports under the laws' forces, on the oversampled axis."""
+
+    def __init__(self, forward: Forward, terms: list[Term], state: FloatArray) -> None:
+        self.plant, self.grid = forward.plant, forward.part.grid
+        H = self.plant.structure.H
+        self.terms, self.ports = terms, np.array([t.port(forward.system) for t in terms])
+        self.wide = np.pad(self.ports, ((0, 0), (0, len(H) - self.ports.shape[1])))
+        self.elements = [forward.element_of(term) for term in terms]
+        self._drive(forward, state)
+        self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
+        self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
+        self.lines = np.array([self.plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
+        self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
+        self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+
+    def _drive(self, forward: Forward, state: FloatArray) -> None:
+        self.d0, self.v0 = forward.fine_motion(self.ports, state)
+        self.reach = _REACH * np.abs(self.d0).max(axis=0), _REACH * np.abs(self.v0).max(axis=0)
+
+    def driven(self, forward: Forward, state: FloatArray) -> Loop:
+        """The same loop under other inputs and from another state."""
+        other = copy(self)
+        other._drive(forward, state)
+        return other
+
+    def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
+        """Forces along a motion (4N, m), without what the plant carries."""
+        time = self.grid.start + self.grid.fine_time
+        d, v = np.clip(d, -self.reach[0], self.reach[0]), np.clip(v, -self.reach[1], self.reach[1])
+        columns = [
+            force_along(t.law, t.parameters, d[:, i], v[:, i], time, self.elements[i])  # type: ignore[arg-type]
+            - t.preload[0] * d[:, i]
+            - t.preload[1] * v[:, i]
+            for i, t in enumerate(self.terms)
+        ]
+        return np.column_stack(columns)
+
+    def answer(self, force: FloatArray, converged: bool = True) -> LawForces:
+        """What forces (4N, m) do to the system."""
+        plant, grid = self.plant, self.grid
+        d, v = self.motion(force)
+        fine_spectrum, line = self.decompose(force)
+        spectrum = fine_spectrum[: len(grid.omega)] / (OVERSAMPLING * np.sqrt(grid.samples))
+        motion = np.einsum("bkpn,kb->pn", self.lines, line[:2])
+        sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
+        q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
+        return LawForces(self.terms, self.ports, d, v, force, converged, sensors, q @ plant.structure.H.T, q, motion)
+
+    def _compliance(self, ports: FloatArray) -> ComplexArray:
+        """Deflection along the ports per force along them, also above the record's Nyquist frequency.
+
+        A law with a kink answers its own harmonics there: below from the plant, above from the state equations,
+        D = rows (j w - A)^-1 B by modes.
+        """
+        plant = self.plant
+        s = plant.structure
+        known = plant.compliance(ports, ports)
+        fine = 2 * np.pi * np.fft.rfftfreq(OVERSAMPLING * self.grid.samples, self.grid.step / OVERSAMPLING)
+        values, vectors = np.linalg.eig(s.state_matrix())
+        rows = s.motion_rows(ports)[: len(ports)] @ vectors
+        columns = np.linalg.lstsq(vectors, s.force_columns(ports).astype(complex), rcond=None)[0]
+        high = fine[len(known) :]
+        above = (rows / (1j * high[:, None] - values)[:, None, :]) @ columns
+        return np.concatenate([known, above])
+
+    def decompose(self, force: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Periodic spectrum on the oversampled axis' bins, (4N / 2 + 1, m), and polynomial, (DEGREE + 1, m).
+
+        The polynomial is the line that joins the ends, and the mean.
+        """
+        line = np.zeros((DEGREE + 1, force.shape[1]))
+        line[1] = force[-1] - force[0]
+        rest = force - self.powers[:, 1:2] * line[1]
+        line[0] = rest.mean(axis=0)
+        return rfft(rest - line[0], axis=0), line
+
+    def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deflection and rate, 2 x (4N, m)."""
+        spectrum, line = self.decompose(force)
+        answer = np.einsum("fab,fb->fa", self.compliance, spectrum)
+        polynomial = np.einsum("kpab,kb->pa", self.line_d, line[:2])
+        count = len(self.d0)
+        d = self.d0 + irfft(answer, count, axis=0) + self.powers @ polynomial
+        v = self.v0 + irfft(1j * self.fine_omega[:, None] * answer, count, axis=0)
+        return d, v + self.powers @ self.plant.derivative(polynomial)
+
+
+def fixed_point(
+    step: Callable[[FloatArray], FloatArray], start: FloatArray, tolerance: float = _TOLERANCE
+) -> tuple[FloatArray, bool]:
+    """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
+    shape = start.shape
+    x = start.ravel()
+    image = step(start).ravel()
+    past_x: list[FloatArray] = []
+    past_r: list[FloatArray] = []
+    best, best_size, sizes = image, np.inf, []
+    for iteration in range(_ITERATIONS):
+        residual = image - x
+        size = float(np.linalg.norm(residual))
+        if not np.isfinite(size):
+            break
+        if size < best_size:
+            best, best_size = image, size
+        if size <= tolerance * max(float(np.linalg.norm(image)), 1e-300):
+            return image.reshape(shape), True
+        sizes.append(best_size)
+        if iteration >= _PATIENCE and best_size > _PROGRESS * sizes[-_PATIENCE]:
+            break
+        past_x.append(x)
+        past_r.append(residual)
+        past_x, past_r = past_x[-_HISTORY:], past_r[-_HISTORY:]
+        if len(past_r) > 1:
+            dr = np.diff(np.array(past_r), axis=0)
+            dx = np.diff(np.array(past_x), axis=0)
+            gram = dr @ dr.T
+            gram[np.diag_indices_from(gram)] *= 1 + 1e-10
+            weights = np.linalg.lstsq(gram, dr @ residual, rcond=1e-14)[0]
+            x = x + residual - weights @ (dx + dr)
+        else:
+            x = image
+        image = step(x.reshape(shape)).ravel()
+    return best.reshape(shape), False

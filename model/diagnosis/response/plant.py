@@ -1,0 +1,346 @@
+"""The linear system as frequency responses on the bins of one record part.
+
+    (-w^2 M + H^T (k + j w c) H) q = -H^T ((k + j w c) G s + f) + F p + l
+
+q degrees of freedom, s moving supports, p measured forces, f forces of laws along the elements, l loads on degrees of
+freedom.  Letters: F bins, S sensors, E elements, n degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.diagnosis.record.spectra import DEGREE, ComplexArray, Grid, derivative
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, Mechanics
+from sprung.model.signals import FloatArray
+
+_HELD = 1e-9  # of the largest stiffness: less holds nothing
+
+
+def loose_shapes(stiffness: FloatArray) -> FloatArray:
+    """Motions (n, m) that a stiffness matrix (n, n) does not hold."""
+    values, shapes = np.linalg.eigh(stiffness)
+    return np.asarray(shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)])
+
+
+@dataclass(frozen=True)
+class Branch:
+    """A spring and a damper in series beside an element, force s' = stiffness v - s / time (Maxwell)."""
+
+    element: int
+    stiffness: float  # N/m
+    time: float  # s, damper over spring
+    replaces: float  # N s/m, what of the element's damper is in the branch
+
+    def impedance(self, omega: FloatArray) -> ComplexArray:
+        """What the branch adds to k + j w c, N/m, (F,)."""
+        jw = 1j * omega
+        return np.asarray(self.stiffness * jw * self.time / (1 + jw * self.time) - jw * self.replaces)
+
+
+@dataclass(frozen=True)
+class Structure:
+    """Matrices and values of a system, possibly with elastic modes appended as further degrees of freedom.
+
+    State of the free motion: [q, q', forces of the branches], 2n + b.
+    """
+
+    mass: FloatArray  # (n,)
+    stiffness: FloatArray  # (E,)
+    damping: FloatArray  # (E,)
+    own_stiffness: FloatArray  # of elastic modes against their body, (n,)
+    own_damping: FloatArray  # (n,)
+    H: FloatArray  # (E, n)
+    G: FloatArray  # (E, supports)
+    F: FloatArray  # (n, forces)
+    S: FloatArray  # (S, n)
+    L: FloatArray  # (S, E)
+    sensor_kind: np.ndarray  # (S,)
+    body_of_dof: np.ndarray  # (n,), -1 for an elastic mode
+    branches: tuple[Branch, ...] = ()  # b of them
+
+    @classmethod
+    def nominal(cls, mechanics: Mechanics, sensors: np.ndarray) -> Structure:
+        """The structure of the system file, seen by the sensors of the given indices."""
+        n = mechanics.n
+        return cls(
+            mass=mechanics.mass,
+            stiffness=mechanics.stiffness,
+            damping=mechanics.damping,
+            own_stiffness=np.zeros(n),
+            own_damping=np.zeros(n),
+            H=mechanics.H,
+            G=mechanics.G,
+            F=mechanics.F,
+            S=mechanics.S[sensors],
+            L=mechanics.L[sensors],
+            sensor_kind=mechanics.sensor_kind[sensors],
+            body_of_dof=mechanics.body_of_dof,
+        )
+
+    @property
+    def K(self) -> FloatArray:
+        return (self.H.T * self.stiffness) @ self.H + np.diag(self.own_stiffness)
+
+    @property
+    def C(self) -> FloatArray:
+        return (self.H.T * self.damping) @ self.H + np.diag(self.own_damping)
+
+    @property
+    def states(self) -> int:
+        return 2 * len(self.mass) + len(self.branches)
+
+    def state_matrix(self) -> FloatArray:
+        """A of the free motion, shape (2n + b, 2n + b)."""
+        n = len(self.mass)
+        A = np.zeros((self.states, self.states))
+        A[:n, n : 2 * n] = np.eye(n)
+        A[n : 2 * n, :n] = -self.K / self.mass[:, None]
+        A[n : 2 * n, n : 2 * n] = -self.C / self.mass[:, None]
+        for i, branch in enumerate(self.branches, 2 * n):
+            h = self.H[branch.element]
+            A[n : 2 * n, n : 2 * n] += branch.replaces * np.outer(h, h) / self.mass[:, None]
+            A[n : 2 * n, i] = -h / self.mass
+            A[i, n : 2 * n] = branch.stiffness * h
+            A[i, i] = -1 / branch.time
+        return A
+
+    def motion_rows(self, ports: FloatArray) -> FloatArray:
+        """Deflections along ports (m, E), then their rates, over the state, (2m, 2n + b)."""
+        along = ports @ self.H
+        m, n = along.shape
+        rows = np.zeros((2 * m, self.states))
+        rows[:m, :n], rows[m:, n : 2 * n] = along, along
+        return rows
+
+    def force_columns(self, ports: FloatArray) -> FloatArray:
+        """What forces along ports (m, E) do to the state's rate, (2n + b, m)."""
+        n = len(self.mass)
+        columns = np.zeros((self.states, len(ports)))
+        columns[n : 2 * n] = -(ports @ self.H).T / self.mass[:, None]
+        return columns
+
+    def sensor_rows(self) -> FloatArray:
+        """Sensors over the state of free motion, shape (S, 2n + b)."""
+        n = len(self.mass)
+        kind = self.sensor_kind[:, None]
+        A = self.state_matrix()
+        rows = np.where(kind == ACCELERATION, self.S @ A[n : 2 * n], 0.0)
+        rows[:, n : 2 * n] += np.where(kind == VELOCITY, self.S, 0.0)
+        rows[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0.0)
+        of_d = np.where(kind == FORCE, self.L * self.stiffness, np.where(kind == DEFLECTION, self.L, 0.0))
+        of_v = np.where(kind == FORCE, self.L * self.damping, 0.0)
+        rows[:, :n] += of_d @ self.H
+        rows[:, n : 2 * n] += of_v @ self.H
+        for i, branch in enumerate(self.branches, 2 * n):
+            at = np.where(self.sensor_kind == FORCE, self.L[:, branch.element], 0.0)
+            rows[:, n : 2 * n] -= np.outer(at * branch.replaces, self.H[branch.element])
+            rows[:, i] += at
+        return rows
+
+    def branch_forces(self, deflections: ComplexArray, omega: FloatArray) -> ComplexArray:
+        """Forces of the branches along periodic deflections (F, E), (F, b)."""
+        jw = 1j * omega
+        columns = [b.stiffness * b.time * jw / (1 + jw * b.time) * deflections[:, b.element] for b in self.branches]
+        return np.stack(columns, axis=1) if columns else np.zeros((len(omega), 0), dtype=complex)
+
+
+@dataclass(frozen=True)
+class Plant:
+    """A structure on a grid."""
+
+    structure: Structure
+    grid: Grid
+
+    @cached_property
+    def impedance(self) -> ComplexArray:
+        """k + j w c of each element and what its branches add, N/m, shape (F, E)."""
+        s = self.structure
+        result: ComplexArray = s.stiffness + 1j * self.grid.omega[:, None] * s.damping
+        for branch in s.branches:
+            result[:, branch.element] += branch.impedance(self.grid.omega)
+        return result
+
+    @cached_property
+    def receptance(self) -> ComplexArray:
+        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system floats."""
+        s, w = self.structure, self.grid.omega
+        n = len(s.mass)
+        outer = (s.H[:, :, None] * s.H[:, None, :]).reshape(len(s.H), n * n)
+        Z = (self.impedance @ outer).reshape(len(w), n, n)
+        index = np.arange(n)
+        Z[:, index, index] += s.own_stiffness + 1j * w[:, None] * s.own_damping - w[:, None] ** 2 * s.mass
+        if np.linalg.cond(Z[0].real) > 1e12:
+            result = np.zeros_like(Z)
+            result[1:] = np.linalg.inv(Z[1:])
+            return result
+        return np.linalg.inv(Z)
+
+    @property
+    def floats(self) -> bool:
+        """Whether a steady force moves the system away without end: no stiffness holds it."""
+        return not np.any(self.receptance[0])
+
+    def line_motion(self, port: FloatArray) -> FloatArray:
+        """Polynomial motions under a constant unit force along a port and under one that rises to 1.
+
+        (2, DEGREE + 1, n)
+        """
+        load = np.zeros((2, DEGREE + 1, self.structure.H.shape[1]))
+        for k in range(2):
+            load[k, k] = -port @ self.structure.H
+        return np.array([self.polynomial_response(one) for one in load])
+
+    def without_line(self, spectrum: ComplexArray) -> tuple[ComplexArray, FloatArray]:
+        """A force's spectrum (F, m) without the line that joins its ends and its mean, and their sizes (2, m)."""
+        series = self.grid.inverse(spectrum)
+        slope = 2 * series[-1] - series[-2] - series[0]
+        mean = (series - self.grid.monomials[:, 1:2] * slope).mean(axis=0)
+        line = np.stack([mean, slope])
+        return spectrum - self.grid.monomial_spectra[:, :2] @ line, line
+
+    @cached_property
+    def sensor_of_dof(self) -> ComplexArray:
+        """Sensor signal per degree of freedom, shape (F, S, n); moving supports left out."""
+        s, w = self.structure, self.grid.omega[:, None, None]
+        kind = s.sensor_kind[:, None]
+        jw: ComplexArray = 1j * w
+        result = np.asarray(np.where(kind == ACCELERATION, jw**2, np.where(kind == VELOCITY, jw, 1.0)) * s.S, complex)
+        if np.any(s.L):
+            return result + self._of_deflection @ s.H
+        return result
+
+    @cached_property
+    def _of_deflection(self) -> ComplexArray:
+        """Sensor signal per deflection of an element, shape (F, S, E)."""
+        s = self.structure
+        kind = s.sensor_kind[:, None]
+        return np.where(kind == FORCE, s.L * self.impedance[:, None, :], np.where(kind == DEFLECTION, s.L, 0.0))
+
+    @cached_property
+    def sensor_of_load(self) -> ComplexArray:
+        """Sensor signal per load on a degree of freedom, shape (F, S, n)."""
+        result = self.sensor_of_dof @ self.receptance
+        if self.floats:
+            s = self.structure
+            result[0] = np.where(s.sensor_kind[:, None] == VELOCITY, s.S @ self.steady_rate, 0.0)
+        return result
+
+    @cached_property
+    def steady_rate(self) -> FloatArray:
+        """Velocity under a steady unit load, of what no stiffness holds and a damper brakes, (n, n)."""
+        s = self.structure
+        loose = loose_shapes(s.K)
+        return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
+
+    @cached_property
+    def sensor_of_force(self) -> ComplexArray:
+        """Sensor signal per law force along an element, shape (F, S, E)."""
+        s = self.structure
+        result = -(self.sensor_of_load @ s.H.T)
+        if np.any(s.L):
+            result = result + np.where(s.sensor_kind[:, None] == FORCE, s.L, 0.0)
+        return result
+
+    def deflection_of_load(self, ports: FloatArray) -> ComplexArray:
+        """Deflection along ports (m, E) per load on a degree of freedom, shape (F, m, n)."""
+        return (ports @ self.structure.H) @ self.receptance
+
+    def compliance(self, ports: FloatArray, sources: FloatArray) -> ComplexArray:
+        """Deflection along ports (m, E) per law force along sources (s, E), shape (F, m, s)."""
+        return -(self.deflection_of_load(ports) @ (sources @ self.structure.H).T)
+
+    def load(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
+        """Load on the degrees of freedom under supports (F, supports) and measured forces (F, forces), (F, n)."""
+        s = self.structure
+        return np.asarray(force @ s.F.T - ((support @ s.G.T) * self.impedance) @ s.H)
+
+    def sensors(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
+        """True signals under supports (F, supports) and measured forces (F, forces), (F, S)."""
+        s = self.structure
+        result = np.einsum("fsn,fn->fs", self.sensor_of_load, self.load(support, force))
+        if np.any(s.L):
+            result += np.einsum("fse,fe->fs", self._of_deflection, support @ s.G.T)
+        return result
+
+    @property
+    def load_of_support(self) -> ComplexArray:
+        """Load on the degrees of freedom per support displacement, shape (F, n, supports)."""
+        s = self.structure
+        return -(self.impedance[:, None, :] * s.H.T) @ s.G
+
+    @cached_property
+    def sensor_of_support(self) -> ComplexArray:
+        """Sensor signal per support displacement, shape (F, S, supports)."""
+        s = self.structure
+        result = self.sensor_of_load @ self.load_of_support
+        if np.any(s.L):
+            result = result + self._of_deflection @ s.G
+        return result
+
+    @cached_property
+    def sensor_of_measured_force(self) -> ComplexArray:
+        """Sensor signal per measured force, shape (F, S, forces)."""
+        return self.sensor_of_load @ self.structure.F
+
+    @cached_property
+    def deflection_of_inputs(self) -> ComplexArray:
+        """Deflection of each element per support displacement and measured force, shape (F, E, inputs)."""
+        s = self.structure
+        result = s.H @ (self.receptance @ self.load_of_inputs)
+        result[:, :, : s.G.shape[1]] += s.G
+        return result
+
+    @property
+    def load_of_inputs(self) -> ComplexArray:
+        """Load on the degrees of freedom per support displacement and measured force, shape (F, n, inputs)."""
+        load, F = self.load_of_support, self.structure.F
+        return np.concatenate([load, np.broadcast_to(F, (len(load), *F.shape))], axis=2)
+
+    def polynomial_response(self, load: FloatArray) -> FloatArray:
+        """Polynomial motion q under polynomial loads on the degrees of freedom.
+
+        Coefficients over t / length: load (DEGREE + 1, n) -> q (DEGREE + 1, n), by matching powers of t.
+        """
+        s, T = self.structure, self.grid.length
+        n, p = len(s.mass), DEGREE + 1
+        first = np.diag(np.arange(1, p), 1) / T  # coefficients of the derivative
+        system = np.kron(np.eye(p), s.K) + np.kron(first, s.C) + np.kron(first @ first, np.diag(s.mass))
+        scale = np.abs(system).max(axis=1)
+        scale[scale == 0] = 1.0
+        columns = np.tile(1 / np.sqrt(np.maximum(np.abs(np.diag(s.K)), s.mass / T**2)), p)
+        solution = np.linalg.lstsq(system * columns / scale[:, None], load.reshape(-1) / scale, rcond=1e-13)[0]
+        return (solution * columns).reshape(p, n)
+
+    def polynomial_sensors(self, q: FloatArray, support: FloatArray) -> FloatArray:
+        """Sensor polynomials from motion (DEGREE + 1, n) and supports (DEGREE + 1, supports): (DEGREE + 1, S)."""
+        s = self.structure
+        q1, d = self.derivative(q), q @ s.H.T + support @ s.G.T
+        kind = s.sensor_kind
+        result = np.where(kind == ACCELERATION, self.derivative(q1) @ s.S.T, 0.0)
+        result += np.where(kind == VELOCITY, q1 @ s.S.T, 0.0) + np.where(kind == DISPLACEMENT, q @ s.S.T, 0.0)
+        force = d * s.stiffness + self.derivative(d) * s.damping
+        result += np.where(kind == DEFLECTION, d @ s.L.T, 0.0) + np.where(kind == FORCE, force @ s.L.T, 0.0)
+        return result
+
+    def derivative(self, polynomial: FloatArray) -> FloatArray:
+        """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
+        return derivative(polynomial, self.grid.length)
+
+    def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
+        """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""
+        from scipy.linalg import expm
+
+        power = expm(self.structure.state_matrix() * step)
+        result = np.empty((count, *rows.shape))
+        result[0] = rows
+        done = 1
+        while done < count:
+            more = min(done, count - done)
+            result[done : done + more] = result[:more] @ power
+            power = power @ power
+            done += more
+        return result

@@ -1,0 +1,42 @@
+"""Values of everything that a fit leaves free."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Point:
+    """Values of everything that is free."""
+
+    theta: FloatArray  # (P,)
+    terms: tuple[Term, ...]
+    state: FloatArray  # (2n + b,)
+    near: tuple[FloatArray, ...] = ()  # the laws' forces on a trajectory nearby, each (4N,), to start from
+
+
+def advance(point: Point, step: FloatArray) -> Point:
+    P = len(point.theta)
+    theta = point.theta + np.clip(step[:P], -1.0, 1.0)
+    at, terms = P, []
+    for term in point.terms:
+        count = len(term.parameters)
+        terms.append(term.advanced(step[at : at + count]))
+        at += count
+    return Point(theta, tuple(terms), point.state + step[at:], point.near)
+
+
+def held_back(point: Point, step: FloatArray) -> np.ndarray:
+    """Which entries of a step would take a law's parameter over a bound that it stands at, as the step."""
+    held = np.zeros(len(step), dtype=bool)
+    at = len(point.theta)
+    for term in point.terms:
+        here = slice(at, at + len(term.parameters))
+        held[here] = term.held_back(step[here])
+        at = here.stop
+    return held

@@ -1,0 +1,103 @@
+"""A law at a place with values: what is added to the nominal structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.diagnosis.response.plant import Branch
+from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+WIDER = "wider"  # variant of an element law: with more parameters than it has as a rule
+
+
+@dataclass(frozen=True)
+class Term:
+    """One law at one place.  Parameters in the law's order."""
+
+    law: Law
+    location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle
+    parameters: tuple[float, ...]
+    variant: str = ""  # of body laws: the mode's shape, the direction of a force
+    preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
+
+    def at(self, parameters: FloatArray) -> Term:
+        return replace(self, parameters=tuple(float(v) for v in parameters))
+
+    scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
+
+    def moved(self, index: int, step: float) -> Term:
+        """One internal parameter moved: the logarithm of those of unknown order, else the value."""
+        values = list(self.parameters)
+        values[index] = values[index] * np.exp(step) if self.law.parameters[index].log else values[index] + step
+        return replace(self, parameters=tuple(values))
+
+    def advanced(self, step: FloatArray) -> Term:
+        """All internal parameters moved, steps limited, values kept within the law's bounds."""
+        values = []
+        for spec, value, change in zip(self.law.parameters, self.parameters, step, strict=True):
+            new = value * np.exp(np.clip(change, -1.0, 1.0)) if spec.log else value + change
+            values.append(float(min(max(new, spec.low), spec.high)))
+        return replace(self, parameters=tuple(values))
+
+    def held_back(self, step: FloatArray) -> list[bool]:
+        """Which parameters stand at a bound that a step would take them over."""
+        triples = zip(self.law.parameters, self.parameters, step, strict=True)
+        return [(v <= spec.low and s < 0) or (v >= spec.high and s > 0) for spec, v, s in triples]
+
+    @property
+    def slopes(self) -> FloatArray:
+        """Derivative of each parameter with respect to its internal form."""
+        pairs = zip(self.law.parameters, self.parameters, strict=True)
+        return np.array([value if spec.log else 1.0 for spec, value in pairs])
+
+    @property
+    def bounded(self) -> bool:
+        """Whether a parameter has stopped at a bound."""
+        pairs = zip(self.law.parameters, self.parameters, strict=True)
+        return any(value <= spec.low or value >= spec.high for spec, value in pairs)
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return (self.location, self.law.name, self.variant)
+
+    def port(self, system: System) -> FloatArray:
+        """Weights over elements: the law sees port @ deflections and pulls the elements by port * force."""
+        weights = np.zeros(len(system.elements))
+        names = self.location.split("|")
+        weights[system.elements.index(names[0])] = 1.0
+        if len(names) == 2:
+            weights[system.elements.index(names[1])] = -1.0
+        return weights
+
+
+def supports(system: System) -> list[str]:
+    """The inputs that move: moving supports, in the order of their columns."""
+    return [name for name, source in system.file.inputs.items() if source.kind == "displacement"]
+
+
+def branch_of(term: Term, element: int, damping: float) -> Branch | None:
+    """The branch that a law with linear memory puts beside an element; None: the law is not linear."""
+    if term.law.name == "series_stiffness":
+        return Branch(element, term.parameters[0], damping / term.parameters[0], damping)
+    if term.law.name == "air_spring":
+        stiffness, time = term.parameters
+        return Branch(element, stiffness, time, 0.0)
+    return None
+
+
+def is_waveform(term: Term) -> bool:
+    """Whether the law's force is found along the trajectory, in the loop."""
+    return isinstance(term.law, ElementLaw) and term.law.name not in ("series_stiffness", "air_spring")
+
+
+def split(terms: tuple[Term, ...]) -> tuple[list[Term], list[Term], list[Term], list[Term]]:
+    """Terms by how they act: along the trajectory, as branches, on a body, on a measurement."""
+    waveform = [t for t in terms if is_waveform(t)]
+    linear = [t for t in terms if isinstance(t.law, ElementLaw) and not is_waveform(t)]
+    body = [t for t in terms if isinstance(t.law, BodyLaw)]
+    sensor = [t for t in terms if isinstance(t.law, SensorLaw)]
+    return waveform, linear, body, sensor

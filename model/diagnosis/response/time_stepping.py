@@ -1,0 +1,102 @@
+"""Forces of laws step by step in time, for trajectories on which the iteration of `forward` does not settle.
+
+A hard stop that is hit all over a long record makes the iteration on whole trajectories diverge when it starts far
+away.  Marching never does; it ends in a trajectory that the iteration then takes as its start.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
+from scipy.linalg import expm
+
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING
+from sprung.model.diagnosis.response.forward import Forward, propagate
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop
+from sprung.model.diagnosis.response.plant import Plant
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
+from sprung.model.laws.base import Values
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.etd import Site, force_steps
+from sprung.model.simulate.segments import solve
+
+_PARTS = 2 * OVERSAMPLING  # steps per sample
+_ROUNDS = 4  # for the start: the periodic motion that `forward` works with begins where it ends
+_SETTLED = 1e-3
+
+
+def march_forces(forward: Forward, state: FloatArray, first: int | None = None) -> FloatArray:
+    """Force of every law along its trajectory less its preload, (OVERSAMPLING N, laws).
+
+    state (2n + b,): the free motion at the first sample, as `forward` counts it.  From sample `first` on, the forces
+    up to there being known: those that `forward` starts from.  By default over the whole trajectory, which is periodic.
+    """
+    loop = forward.loop(state)
+    assert loop is not None
+    if first is None:
+        return _periodic(loop)
+    force = np.column_stack(forward.start_force)
+    held = slice(first * OVERSAMPLING, None)
+    begin = _state_at(loop.plant, loop.answer(force), first)
+    force[held] = _march(loop, held, begin)[0]
+    return force
+
+
+def _periodic(loop: Loop) -> FloatArray:
+    """Forces over the whole trajectory, which begins where it ends."""
+    begin = np.zeros(loop.plant.structure.states)
+    for _ in range(_ROUNDS):
+        force, size = _march(loop, slice(0, None), begin)
+        before, begin = begin, _state_at(loop.plant, loop.answer(force), 0)
+        if np.max(np.abs(begin - before)) <= _SETTLED * size:
+            break
+    return force
+
+
+def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, float]:
+    """Forces along a part of the fine axis, (4N', laws), from the state of their motion, and its largest size."""
+    grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0[part], loop.v0[part]
+    A, rows = s.state_matrix(), s.motion_rows(loop.wide)
+    step = grid.step / _PARTS
+    fine = grid.step / OVERSAMPLING * np.arange(len(d0))
+    nodes = step / 2 * np.arange(2 * _PARTS * (len(d0) // OVERSAMPLING - 1) + 1)
+    inputs = np.hstack([CubicHermiteSpline(fine, d0, v0)(nodes), CubicSpline(fine, v0)(nodes)])
+    solution = solve(
+        force_steps(A, s.force_columns(loop.wide), rows, step),
+        expm(A * grid.step),
+        [
+            Site(_preloaded(term, reach), term.parameters, element)
+            for term, element, reach in zip(loop.terms, loop.elements, np.transpose(loop.reach), strict=True)
+        ],
+        (inputs + propagate(A, rows, begin, step / 2, len(nodes)))[..., None],
+        parts=_PARTS,
+        start=grid.start + part.start * grid.step / OVERSAMPLING + CLOCK_LEAD,
+    )
+    force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
+    force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
+    return force, float(np.max(np.abs(solution.states)))
+
+
+def _preloaded(term: Term, reach: FloatArray) -> ElementLaw:
+    """The law less the linear part that the plant carries, flat beyond its reach (deflection, rate)."""
+    assert isinstance(term.law, ElementLaw)
+    law, (stiffness, damping) = term.law, term.preload
+
+    def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+        d, v = np.clip(motion.deflection, -reach[0], reach[0]), np.clip(motion.rate, -reach[1], reach[1])
+        return np.asarray(law.force(motion._replace(deflection=d, rate=v), p, element) - stiffness * d - damping * v)
+
+    return replace(law, force=force)
+
+
+def _state_at(plant: Plant, forces: LawForces, sample: int) -> FloatArray:
+    """State at a sample, (2n + b,), of the motion that periodic forces keep up."""
+    grid = plant.grid
+    q, bend = (grid.monomials[sample] @ p for p in (forces.motion, plant.derivative(forces.motion)))
+    position = grid.inverse(forces.q)[sample] + q
+    rate = grid.inverse(1j * grid.omega[:, None] * forces.q)[sample] + bend
+    branches = grid.inverse(plant.structure.branch_forces(forces.deflections, grid.omega))[sample]
+    return np.concatenate([position, rate, branches])

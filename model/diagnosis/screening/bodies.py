@@ -1,0 +1,158 @@
+"""Candidates at bodies: another mass, an elastic mode, a periodic force that nobody measured.
+
+An elastic mode and a periodic force are narrow: whole grids of their frequencies are scored at once, since a column
+is a fixed spectrum times a scalar function h(w) of the trial, so that all projections are one matrix product.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy import stats
+
+from sprung.model.diagnosis.response.forward import structure_of
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.screen import Channel, Hit, Projector
+from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
+from sprung.model.mechanics import ACCELERATION, VELOCITY
+from sprung.model.signals import FloatArray
+
+_RATIOS = (0.01, 0.03)  # damping ratios of trial modes
+_LOWEST = 1.0  # Hz, of trial modes
+_HIGHEST = 0.4  # of the sample rate
+
+
+def body_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+    """The best trial of every body law at every body, and how many were tried."""
+    system = projector.problem.system
+    for law in laws:
+        if not isinstance(law, BodyLaw):
+            continue
+        for index, name in enumerate(system.bodies):
+            if law.name == "mass_change":
+                if f"{name}.mass" not in {p.name for p in system.parameters}:
+                    yield _mass(projector, law, index, name), 1
+            elif law.load is not None:
+                yield _line(projector, law, index, name)
+            else:
+                yield from _modes(projector, law, index, name)
+
+
+def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Hit:
+    fit, grid = projector.fit, projector.grid
+    structure = fit.forward.plant.structure
+    dofs = structure.body_of_dof == index
+    load = np.where(dofs, -structure.mass * fit.motions.acceleration, 0.0)[grid.band]
+    column = projector.pack(np.einsum("fsn,fn->fs", projector.of_load, load))
+    spread = projector.spread(column, fit.forward.inputs_by_mass(dofs)[grid.band])
+    score, amplitude = projector.score(column, (spread, 0.0))
+    ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
+    term = Term(law, name, (ratio,), variant="", scales=(0.1,))
+    return Hit(term, score, 1, "mass", float(stats.chi2.sf(score, 1)))
+
+
+def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Hit, int]]:
+    """Elastic modes of a body, per shape: first order in the participation."""
+    fit, grid = projector.fit, projector.grid
+    system = projector.problem.system
+    plant = fit.forward.plant
+    band = grid.band
+    omega = grid.omega[band]
+    bare = structure_of(system, projector.problem.sensors, fit.point.theta)
+    element_force = bare.stiffness * fit.motions.deflection[band] + bare.damping * fit.motions.rate[band]  # (F, E)
+    kinds = plant.structure.sensor_kind
+    frequencies, ratios = _mode_grid(1 / grid.step)
+    w0 = 2 * np.pi * frequencies[:, None]
+    h = np.reciprocal(w0**2 - omega**2 + 2j * ratios[:, None] * w0 * omega)  # (trials, F)
+    for variant in law.variants(system.mechanics, index):
+        extended = law.modify(system.mechanics, index, (10.0, 0.02, 1.0), variant)
+        shape_e = extended.H[: fit.forward.elements, -1]
+        shape_s = extended.S[projector.problem.sensors, -1]
+        if not np.any(shape_e) and not np.any(extended.F[-1]):
+            continue
+        g = -(element_force @ shape_e) / extended.mass[-1]
+        jw = 1j * omega[:, None]
+        kinematic = np.where(kinds == ACCELERATION, jw**2, np.where(kinds == VELOCITY, jw, 1.0))
+        direct = (kinematic * shape_s * fit.forward.sensor_factor[band])[:, :, None]
+        answer = (projector.factor @ direct)[:, :, 0]
+        impedance = plant.impedance[band, : fit.forward.elements] * shape_e
+        answer = answer + np.einsum("fse,fe->fs", projector.of_force[:, :, : fit.forward.elements], impedance)
+        score, amplitudes = Channel(projector, answer * g[:, None]).scores(h)
+        score = np.where(amplitudes > 0, score, 0.0)
+        i = int(np.argmax(score))
+        amplitude = amplitudes[i]
+        values = (float(frequencies[i]), float(ratios[i]), float(min(max(amplitude, 1e-9), 5.0)))
+        term = Term(law, name, values, variant, scales=(1.0, 1.0, max(float(amplitude), 1e-6)))
+        yield Hit(term, float(score[i]), 1, "mode", float(stats.chi2.sf(score[i], 1))), len(frequencies)
+
+
+def _mode_grid(sample_rate: float) -> tuple[FloatArray, FloatArray]:
+    frequencies, ratios = [], []
+    for ratio in _RATIOS:
+        count = int(np.log(_HIGHEST * sample_rate / _LOWEST) / ratio)
+        grid = np.geomspace(_LOWEST, _HIGHEST * sample_rate, max(count, 2))
+        frequencies.append(grid)
+        ratios.append(np.full(len(grid), ratio))
+    return np.concatenate(frequencies), np.concatenate(ratios)
+
+
+def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Hit, int]:
+    """The strongest line of a force on one degree of freedom of a body.
+
+    At a bin's frequency a sine fills that bin; half way between two it fills both, in opposite phase.  Scores are
+    divided by their local median where that is more than chance, so that broad misfits do not pass for lines.
+    """
+    grid = projector.grid
+    system = projector.problem.system
+    r = projector.complex_residual
+    best: tuple[float, float, str] = (0.0, 0.0, "")
+    count = 0
+    for variant in law.variants(system.mechanics, index):
+        dof = system.mechanics.dofs.index(f"{name}.{variant}")
+        A = projector.of_load[:, :, dof] * grid.weight[:, None]
+        b = np.einsum("fs,fs->f", A.conj(), r)
+        n = np.maximum(np.sum(np.abs(A) ** 2, axis=1), 1e-300)
+        on = np.abs(b) ** 2 / n
+        between = np.abs(b[1:] - b[:-1]) ** 2 / (n[1:] + n[:-1])
+        scores = np.empty(2 * len(on) - 1)
+        scores[0::2], scores[1::2] = on, between
+        scores[:4] = 0.0
+        scores = scores / np.maximum(1.0, _local_median(scores) / 1.386)
+        i = int(np.argmax(scores))
+        count += len(scores)
+        if scores[i] > best[0]:
+            best = (float(scores[i]), i / 2, variant)
+    score, bin_number, variant = best
+    if not variant:
+        return Hit(Term(law, name, law.absent), 0.0, 2, "line", 1.0), count
+    return _refined_line(projector, law, name, variant, bin_number, score), count
+
+
+def _local_median(scores: FloatArray, reach: int = 24) -> FloatArray:
+    from scipy.ndimage import median_filter
+
+    return median_filter(scores, size=2 * reach + 1, mode="nearest")
+
+
+def _refined_line(projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float) -> Hit:
+    """Frequency, amplitude and phase of a line by exact columns near the bin."""
+    grid = projector.grid
+    dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
+    time = grid.start + grid.time + CLOCK_LEAD
+    best: tuple[float, float, FloatArray] = (-1.0, 0.0, np.zeros(2))
+    channel = Channel(projector, projector.of_load[:, :, dof])
+    for offset in np.linspace(-0.6, 0.6, 13):
+        frequency = (bin_number + offset) / grid.length
+        if frequency <= 0:
+            continue
+        angle = 2 * np.pi * frequency * time
+        spectra = grid.forward(np.column_stack([np.sin(angle), np.cos(angle)]))[grid.band]
+        score, solution = channel.joint(spectra.T)
+        if score > best[0]:
+            best = (score, frequency, solution)
+    score, frequency, (sine, cosine) = best
+    amplitude = float(np.hypot(sine, cosine))
+    values = (amplitude, float(frequency), float(np.arctan2(cosine, sine)))
+    term = Term(law, name, values, variant, scales=(max(amplitude, 1e-9), 1.0, 1.0))
+    return Hit(term, min(score, rough * 2.5), 2, "line", float(stats.chi2.sf(min(score, rough * 2.5), 2)))

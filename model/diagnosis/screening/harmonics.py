@@ -1,0 +1,98 @@
+"""What repeats itself under a wheel: all frequencies and phases of a periodic movement at once.
+
+The residual is taken back to the support, r -> z(t).  For a movement w(t) = Re sum_n W_n e^{2 pi j n (f t - p)} the
+product with the residual is sum_n Re W_n e^{-2 pi j n p} conj(Z(n f)): it needs nothing but the transform Z of z on a
+fine axis of frequencies, and a transform over n for the phases p.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import scipy.fft
+from scipy import stats
+from scipy.ndimage import median_filter
+
+from sprung.model.diagnosis.record.spectra import Grid
+from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.screening.screen import Channel, Hit, Projector, wheelsets
+from sprung.model.laws import CLOCK_LEAD, Law, SupportLaw
+from sprung.model.signals import FloatArray
+
+_FINER = 8  # frequencies per bin: the last harmonic drifts by half a turn at most over the recording
+_PHASES = 64
+_LOWEST, _HIGHEST = 0.5, 15.0  # Hz, of fundamentals: rail joints at walking pace to wheels at 150 km/h
+_LEAST = 2  # harmonics that are seen: one alone is a line
+_REACH = 24  # bins around one that tell the level of a coloured residual
+_MEDIAN = 1.386  # of chi-square with two degrees of freedom
+_COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
+
+
+def comb_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+    """The best movement of every such law at every support or axle, and how many were tried."""
+    system = projector.problem.system
+    for law in laws:
+        if isinstance(law, SupportLaw):
+            for location in wheelsets(system) if law.where == "axle" else supports(system):
+                yield _best(projector, law, location)
+
+
+def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, int]:
+    absent = Hit(Term(law, location, law.absent), 0.0, 1, "comb", 1.0)
+    names = supports(projector.problem.system)
+    at = [names.index(name) for name in location.split("|")]
+    channel = Channel(projector, projector.of_support[:, :, at].sum(axis=2))
+    fundamentals, products, sizes = _products(projector.grid, law, channel)
+    tests = len(fundamentals) * len(law.harmonics)
+    best = np.argmax(products, axis=1)
+    product = np.take_along_axis(products, best[:, None], axis=1)[:, 0]
+    scores = np.where(product > 0, product**2 / sizes, 0.0)
+    if not np.any(scores > 0):
+        return absent, tests
+    i = int(np.argmax(scores))
+    values, exact = _refined(projector.grid, law, channel, float(fundamentals[i]), best[i] / _PHASES)
+    score = min(exact, _COLOUR * float(scores[i]))
+    term = Term(law, location, values, scales=(max(values[0], 1e-9), 1.0, 0.1))
+    return Hit(term, score, 1, "comb", float(stats.chi2.sf(score, 1))), tests
+
+
+def _products(grid: Grid, law: SupportLaw, channel: Channel) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Fundamentals (m,) in Hz, products with the residual (m, phases) and squares (m,) of movements of unit depth.
+
+    Both are divided by how much stronger than noise the residual is around every bin.
+    """
+    scores = np.abs(channel.product) ** 2 / np.maximum(channel.size, 1e-300)
+    colour = np.maximum(1.0, median_filter(scores, size=2 * _REACH + 1, mode="nearest") / _MEDIAN)
+    product, size, bins = channel.product / colour, channel.size / colour, len(colour)
+    series = scipy.fft.ifft(np.pad(product, (0, grid.samples - bins))).real * np.sqrt(grid.samples)
+    spectrum = scipy.fft.rfft(series, _FINER * grid.samples)
+    first, last = (int(f * _FINER * grid.length) for f in (_LOWEST, _HIGHEST))
+    steps = np.arange(max(first, 1), min(last, _FINER * (bins - 1) // _LEAST) + 1)
+    turned = np.zeros((len(steps), _PHASES), dtype=complex)
+    squares = np.zeros(len(steps))
+    for n, weight in enumerate(law.harmonics, 1):
+        seen = n * steps <= _FINER * (bins - 1)
+        at = np.where(seen, n * steps, 0)
+        angle = 2 * np.pi * at / (_FINER * grid.length) * (grid.start + CLOCK_LEAD)
+        turned[:, n] = weight * seen * np.exp(1j * angle) * spectrum[at].conj()
+        squares += weight**2 * seen * np.interp(at / _FINER, np.arange(bins), size) * grid.samples / 4
+    return steps / (_FINER * grid.length), scipy.fft.fft(turned, axis=1).real, np.maximum(squares, 1e-300)
+
+
+def _refined(
+    grid: Grid, law: SupportLaw, channel: Channel, frequency: float, phase: float
+) -> tuple[tuple[float, float, float], float]:
+    """Depth, frequency and phase, and the statistic, by exact columns around a rough find."""
+    time = grid.start + grid.time + CLOCK_LEAD
+    middle = float(time.mean())  # a frequency turns the phase about the middle
+    trials = [
+        (f, (phase + (f - frequency) * middle + shift / _PHASES) % 1.0)
+        for f in frequency + np.linspace(-1, 1, 9) / (_FINER * grid.length)
+        for shift in np.linspace(-1, 1, 5)
+    ]
+    moved = np.column_stack([law.movement(time, (1.0, *trial), grid.nyquist)[0] for trial in trials])
+    scores, depths = channel.scores(grid.forward(moved)[grid.band].T)
+    scores = np.where(depths > 0, scores, 0.0)
+    i = int(np.argmax(scores))
+    return (float(depths[i]), float(trials[i][0]), float(trials[i][1])), float(scores[i])

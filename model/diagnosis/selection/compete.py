@@ -1,0 +1,366 @@
+"""Which candidate, if any: full fits of the best screened ones, compared by evidence, one finding after the other.
+
+Gain of a candidate:   sum over blocks (sensor, band) of  n log(chi^2 before / chi^2 after),
+
+twice the log-likelihood ratio with the noise level of every block profiled out, so that coloured noise of unknown
+level does not count as evidence; where the noise is white and known it equals the fall of chi^2.
+
+Evidence of a model, up to constants:   gain - sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
+
+(Laplace's approximation with a flat prior of `width`, MacKay 2003, chapter 28): a parameter costs what the recording
+tells about it, so a shape that does not matter costs nothing, where BIC would charge log n for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import stats
+
+from sprung.model.chunks import WORKERS, share
+from sprung.model.diagnosis.fit.noise import refreshed
+from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.response.forward import BOTH
+from sprung.model.diagnosis.response.point import Point, advance
+from sprung.model.diagnosis.response.terms import WIDER, Term, is_waveform
+from sprung.model.diagnosis.screening.screen import Hit, Screening
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.basis import SMALL, UNKNOWN
+from sprung.model.signals import FloatArray
+
+_LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
+_WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
+_UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
+_UNNAMED_RATIO = 1.3  # and explain this many times as much
+# laws that contain a commoner one, or imitate it: they must beat it by the same
+_RARE = frozenset({"air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"})
+_CLOSE = 0.25  # share of the best score from which a candidate is fitted
+_NEAR = 45.0  # or this close to it
+_MOST = 9  # candidates that are fitted
+_UNUSUAL = 4.0  # evidence that a factor e outside the usual range of a parameter costs
+_STRONGER = 1.1
+_HINT = 0.02  # share of a law's strength at which its first step is taken
+_BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
+_LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
+_FURTHER = 3  # candidates that are tried for a runner-up where none was close
+_QUIET = 0.5  # least noise power of a block over the estimated one
+_CHANCE = 4.0  # standard deviations by which what is noise exceeds it
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate with everything refitted around it."""
+
+    hit: Hit
+    fit: Fit
+    gain: float  # twice the log-likelihood ratio against the model without it
+    worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
+    evidence: float  # gain less what its parameters cost
+    freedom: int  # parameters of the law, and states that it brings
+    finished: bool = True
+
+    @property
+    def term(self) -> Term:
+        return self.fit.point.terms[-1]
+
+    @property
+    def explains(self) -> float:
+        """How much of what was missing: evidence, or power of forces that nobody measured."""
+        return self.worth if self.fit.noise.follows else self.gain
+
+    @property
+    def named(self) -> bool:
+        return self.term.law.name != UNKNOWN
+
+    def p_value(self, tests: int) -> float:
+        """Chance of such a gain among so many candidates, noise levels unknown."""
+        count = max(1, self.freedom)
+        return float(min(1.0, tests * stats.chi2.sf(max(self.gain, 0.0), count)))
+
+    def delta_bic(self) -> float:
+        """BIC with the candidate less BIC without."""
+        return -self.gain + len(self.term.parameters) * float(np.log(self.fit.count))
+
+
+def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Hit]:
+    """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
+    good = [h for h in screening.hits if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
+    if not good:
+        return []
+    good.sort(key=_strength, reverse=True)
+    top = _strength(good[0])
+    place = good[0].location
+    chosen: list[Hit] = []
+    unnamed: dict[str, int] = {}
+    for hit in good:
+        s = _strength(hit)
+        share = _CLOSE if hit.location == place else 0.6
+        if s < share * top and s < top - _NEAR:
+            continue
+        if hit.family == "unnamed":
+            unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
+            if unnamed[hit.location] > 2:
+                continue
+        chosen.append(hit)
+        if len(chosen) >= _MOST:
+            break
+    return chosen
+
+
+def _strength(hit: Hit) -> float:
+    """Score less what chance gives its degrees of freedom; input faults are weighed by the same measure."""
+    extra = 4.0 if hit.family == "unnamed" else 0.0
+    extra += 22.0 if hit.family in ("line", "comb") else 0.0
+    return hit.score - 2.0 * (hit.freedom - 1) - extra
+
+
+def compete(
+    problem: Problem,
+    base: Fit,
+    hits: list[Hit],
+    progress: Callable[[str], None] = lambda text: None,
+) -> list[Trial]:
+    """Fits of the hits around the present model, best evidence first."""
+    places = sorted({hit.location for hit in hits})
+    progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
+
+    def begun(chosen: list[Hit]) -> list[Trial]:
+        tried = share(lambda hit: _begun(problem, base, hit), chosen, WORKERS)
+        return [trial for trial in tried if trial is not None]
+
+    def finished(chosen: list[Trial]) -> list[Trial]:
+        return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
+
+    trials = begun([hit for hit in hits if hit.family != "unnamed"])
+    trials += begun([hit for hit in hits if hit.family == "unnamed" and _may_lead(problem, hit, trials)])
+    trials = _graded(problem, base, trials)
+    if not trials:
+        return []
+    best = trials[0].evidence
+
+    def close(rank: int, trial: Trial) -> bool:
+        near = problem.follows or trial.evidence > best - max(_NEAR, 0.3 * abs(best))
+        return rank < _LAST or (rank < _MOST_FINISHED and near)
+
+    leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
+    behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
+    named = finished([trial for trial in leading if trial.named])
+    unnamed = [trial for trial in leading if not trial.named]
+    if not any(_may_lead(problem, trial.hit, named) for trial in unnamed):
+        return _graded(problem, base, [*named, *(replace(trial, finished=False) for trial in unnamed), *behind])
+    return _graded(problem, base, [*named, *finished(unnamed), *behind])
+
+
+def runner_up(problem: Problem, base: Fit, hits: list[Hit], chosen: Trial, tried: list[Trial]) -> Trial | None:
+    """The best candidate with another law, at the same place before others; a hit is fitted where none was."""
+    rivals = [t for t in tried if t.term.law.name != chosen.term.law.name and t.gain > 0]
+    if rivals:
+        return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
+    fitted = {t.hit.term.key for t in tried}
+    others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
+    for hit in sorted(others, key=_strength, reverse=True)[:_FURTHER]:
+        trial = _begun(problem, base, hit)
+        if trial is not None and trial.gain > 0:
+            return replace(trial, finished=False)
+    return None
+
+
+def _begun(problem: Problem, base: Fit, hit: Hit) -> Trial | None:
+    """A hit fitted far enough to see what it is worth, from the best of several starts."""
+    starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+    tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
+    return max(tried, key=lambda t: t.evidence, default=None)
+
+
+def _may_lead(problem: Problem, unnamed: Hit, named: list[Trial]) -> bool:
+    """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
+    it promises is explained.  With one law alone it stays as what that one was chosen before."""
+    if problem.follows or len(named) < 2:
+        return True
+    best = max(named, key=lambda trial: trial.worth)
+    noise = 1 + _CHANCE * np.sqrt(2 / best.fit.count)
+    return unnamed.score > best.worth or not _QUIET <= best.fit.reduced <= noise
+
+
+def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
+    least = min((t.fit.reduced for t in trials), default=1.0)
+    if least < _QUIET and not problem.follows:
+        again = [_judged(problem, base, t.hit, t.fit, _QUIET * least) for t in trials]
+        trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
+    return sorted(trials, key=lambda t: -t.evidence)
+
+
+def start_of(base: Fit, hit: Hit) -> Point:
+    """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
+    point = base.point
+    state = point.state
+    if hit.family == "mode":  # one more degree of freedom, at the end of q and of q'
+        n = (len(state) - len(base.forward.plant.structure.branches)) // 2
+        state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
+    if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
+        state = np.append(state, 0.0)
+    near = point.near
+    if is_waveform(hit.term):
+        near = (*near, base.force_along(hit.term))
+    return Point(point.theta, (*point.terms, hit.term), state, near)
+
+
+def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
+    """Starts at other values of the element than those that were read without the law."""
+    if hit.effect == "series_stiffness":
+        return _behind_a_spring(problem, base, hit)
+    name = f"{hit.location}.damping"
+    names = [p.name for p in problem.system.parameters]
+    if hit.beyond == 1.0 or name not in names or not isinstance(hit.term.law, ElementLaw):
+        return []
+    # A law in shares of the damper asks for more than all of it: the damper is stronger than it was read.
+    start = start_of(base, hit)
+    theta = start.theta.copy()
+    theta[names.index(name)] += np.log(_STRONGER * hit.beyond)
+    term = hit.term.at(hit.term.law.scaled(hit.term.parameters, 1 / _STRONGER))
+    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
+
+
+def _behind_a_spring(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
+    """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
+
+    At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's
+    mean frequency, ks and the change of the spring follow from the assumed c and from the damping that was read.
+    """
+    names = [p.name for p in problem.system.parameters]
+    damping, stiffness = (f"{hit.location}.{quantity}" for quantity in ("damping", "stiffness"))
+    if damping not in names:
+        return []
+    at = names.index(damping)
+    nominal = problem.system.parameters[at].nominal
+    element = problem.system.elements.index(hit.location)
+    deflection, rate = base.element_motion
+    frequency = float(np.std(rate[:, element]) / np.std(deflection[:, element]))
+    start = start_of(base, hit)
+    read = nominal * float(np.exp(start.theta[at]))
+    assumed = max(2.6 * read, nominal)
+    ratio = np.sqrt(assumed / read - 1)
+    theta = start.theta.copy()
+    theta[at] += np.log(assumed / read)
+    if stiffness in names:
+        k = names.index(stiffness)
+        value = problem.system.parameters[k].nominal * np.exp(theta[k])
+        theta[k] += np.log(max(1 - frequency * read * ratio / value, 0.5))
+    term = hit.term.at(np.array([frequency * assumed / ratio]))
+    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
+
+
+def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
+    """The term at the strength that, with everything else moving along, the base's residual asks for.
+
+    The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
+    which have absorbed much of it, the model may be too far away for a first step.
+    """
+    start = start_of(base, hit)
+    law = hit.term.law
+    if not isinstance(law, ElementLaw) or law.strength is None or law.name == UNKNOWN:
+        return start
+    hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
+    faint = start_of(base, replace(hit, term=hint))
+    with np.errstate(all="ignore"):
+        own = replace(problem, smoothed=None)
+        faint = own.smooth(faint)
+        lin = own.linearise(faint)
+    count = len(hit.term.parameters)
+    first = lin.jacobian.shape[1] - len(faint.state) - count
+    kept = np.ones(lin.jacobian.shape[1], dtype=bool)
+    kept[first : first + count] = np.arange(count) == law.strength
+    columns = lin.jacobian[:, kept]
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = np.zeros(lin.jacobian.shape[1])
+    step[kept] = np.linalg.lstsq(columns / scale, lin.residual, rcond=1e-10)[0] / scale
+    moved = advance(faint, step)
+    if not moved.terms[-1].bounded and np.all(np.isfinite(step)):
+        return moved
+    return start
+
+
+def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
+    fit = replace(problem, smoothed=None).try_fit(start, iterations)
+    return None if fit is None else _judged(problem, base, hit, fit)
+
+
+def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
+    """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
+    if trial.fit.converged and not problem.follows:
+        return trial
+    finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
+    if not problem.follows or finished.fit.deviance > base.deviance:
+        return finished
+    _, fit = refreshed(replace(problem, smoothed=None), finished.fit)
+    return _judged(problem, base, trial.hit, fit)
+
+
+def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit, quiet: float = _QUIET) -> Trial:
+    sensors = len(problem.sensors)
+    if problem.follows:  # how noisy the forces are is what candidates differ in
+        gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
+        worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
+    else:
+        worth = base.chi_square - fit.chi_square
+        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet))
+    dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
+    freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
+    return Trial(hit, fit, gain, worth, gain - dear, freedom)
+
+
+def preferred(trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence, but an unnamed force leads only if it explains far more than every named candidate."""
+    if not trials or trials[0].named:
+        return trials
+    named = [t for t in trials if t.named]
+    if named and trials[0].explains < _UNNAMED_RATIO * named[0].explains:
+        return [named[0], *[t for t in trials if t is not named[0]]]
+    return trials
+
+
+def profile_gain(before: FloatArray, after: FloatArray, sensors: int, quiet: float) -> float:
+    """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out.
+
+    A block quieter than `quiet` times the estimated noise, which is white, owes that to its colour: no evidence.
+    """
+    power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
+    bins = len(power[0])
+    edges = np.unique(np.round(np.geomspace(_FIRST_BLOCK, bins, _BLOCKS)).astype(int))
+    edges = np.concatenate([[0], edges[edges > 0]])
+    counts = 2.0 * np.diff(edges)[:, None]
+    levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, quiet) for p in power]
+    return float(np.sum(counts * np.log(levels[0] / levels[1])))
+
+
+def cost(fit: Fit, count: int) -> float:
+    """What the last `count` law parameters cost in evidence."""
+    term = fit.point.terms[-1]
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[-count:], 0)) / np.abs(term.slopes) if count else np.zeros(0)
+    total = 0.0
+    for spec, scale, s in zip(term.law.parameters, term.scales, sigma, strict=True):
+        width = _LOG_WIDTH if spec.log else _WIDTHS * scale
+        if s > 0:
+            total += max(0.0, 2 * float(np.log(width / (s * np.sqrt(2 * np.pi)))))
+    return total
+
+
+def _unusual(term: Term) -> float:
+    """What values outside a law's usual range cost in evidence: look-alikes pass into each other there."""
+    total = 0.0
+    for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
+        low, high = spec.usual
+        relative = max(abs(value) / scale, 1e-12)
+        total += _UNUSUAL * float(np.log(max(1.0, low / relative, relative / high)))
+    return total
+
+
+def _prior_cost(hit: Hit) -> float:
+    if hit.term.variant in (BOTH, WIDER) or hit.effect in _RARE:
+        return _UNNAMED_COST
+    if hit.family != "unnamed":
+        return 0.0
+    return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))

@@ -1,0 +1,212 @@
+"""Free-run simulation over the whole recording, judged on the part that no fit saw."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.chunks import WORKERS, share
+from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.whitening import Whitener
+from sprung.model.diagnosis.record.signals import Noise, Part, Signals, drifting, rate_of, transform
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.forward import Forward, propagate
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.diagnosis.selection.compete import profile_gain
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_STILL = 0.05  # of the motion in the fitted part
+_CHANCE = 3.0  # standard deviations
+_ROUNDS = 4  # of laws' forces and the state at the start
+
+
+@dataclass(frozen=True)
+class FreeRun:
+    """What a model says of the held-out part, running on from the part it was fitted to."""
+
+    simulated: FloatArray  # (T, S), held-out samples
+    measured: FloatArray  # (T, S)
+    residual: FloatArray  # whitened
+    per_sensor: FloatArray  # rms(error) / rms(measured), (S,)
+    point: Point  # the model, with its starting state over the whole recording
+
+    @property
+    def nrmse(self) -> float:
+        return float(np.sqrt(np.mean(self.per_sensor**2)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What the held-out part says of one fit against another."""
+
+    gain: float  # by how much the second says more, as twice the log-likelihood ratio or alike
+    apart: float  # distance of what they say, in units of noise
+    scatter: float  # variance along it: noise, and what the parameters' own uncertainty adds to it at most
+
+    @property
+    def refuted(self) -> bool:
+        """Whether the second says less, and that is no chance.
+
+        Were it true, its gain would scatter about apart^2 by 2 apart: the error of the first is then apart and noise.
+        """
+        return self.gain < min(0.0, self.apart**2 - _CHANCE * 2 * self.apart * np.sqrt(self.scatter))
+
+
+class HeldOut:
+    """The whole recording, of which the first `split` samples were fitted."""
+
+    def __init__(self, system: System, signals: Signals, noise: Noise, split: int) -> None:
+        self.system, self.signals, self.noise, self.split = system, signals, noise, split
+        self.whole = transform(signals, noise)
+        self.whitener: Whitener | None = None
+        self.rated = drifting(system, signals.sensor_index)
+        self.later = transform(signals.part(split, signals.samples), noise, rated=self.rated)
+        self.grid = self.later.grid
+
+    @cached_property
+    def tracked(self) -> Part:
+        """The whole recording as it is followed: positions that drift by their rates."""
+        return transform(self.signals, self.noise, rated=self.rated)
+
+    @property
+    def still(self) -> bool:
+        """Whether the held-out part hardly moves, so that nothing can be judged on it."""
+        first, later = (np.std(part, axis=0) for part in np.split(self.signals.sensors, [self.split]))
+        return bool(np.all(later < _STILL * first))
+
+    def weigh(self, noise: Noise) -> None:
+        """Noise levels by which later runs are judged."""
+        self.noise, self.whitener = noise, None
+
+    def run(self, point: Point) -> FreeRun:
+        """Simulate with the measured inputs from the state that the fitted part ends in."""
+        return self._judge(*self._simulated(point))
+
+    def runs(self, *points: Point) -> list[FreeRun]:
+        """The same for several models, simulated beside each other."""
+        return [self._judge(*simulated) for simulated in share(self._simulated, points, WORKERS)]
+
+    def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
+        """Held-out samples (T, S), and the point with its starting state.
+
+        The periodic solution over the whole recording is another one than over the fitted part, so the free motion
+        is fitted again, to the fitted part alone.
+        """
+        point, part = self._up_to_split(point)
+        problem = Problem(self.system, part, self.signals.sensor_index, self.noise)
+        state = np.zeros_like(point.state)
+        trained = slice(0, self.split)
+        weights = 1 / self.noise.sensors
+        near = point.near if problem.follows else ()
+        for number in range(2 if problem.follows else _ROUNDS):
+            forward = problem.forward(replace(point, state=state, near=near))
+            shown, forces = self._free_run(problem, forward, state, number > 0)
+            near = near_of(forces)
+            rows = forward.free_rows_at_start()
+            free = forward.plant.free_motion(rows, part.grid.step, self.split)
+            particular = part.grid.inverse(shown)
+            target = (self.signals.sensors[trained] - particular[trained]) * weights
+            normal, right = _normal(free, target, weights)
+            scale = 1 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            solved = np.linalg.lstsq(normal * scale * scale[:, None], right * scale, rcond=1e-12)[0] * scale
+            moved = float(np.max(np.abs(solved - state) / np.maximum(np.abs(solved), 1e-12)))
+            state = solved
+            if forces is None or (moved < 1e-3 and not problem.follows):
+                break
+        A = forward.plant.structure.state_matrix()
+        simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
+        return simulated[self.split :], replace(point, state=state, near=near)
+
+    def compare(self, before: Fit, after: Fit) -> Comparison:
+        """Two fits on the held-out part.
+
+        Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
+        good the model.
+        """
+        if not before.noise.follows:
+            first, second = (run.residual for run in self.runs(before.point, after.point))
+            gain = float(first @ first - second @ second)
+        else:
+            (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
+            gain = profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0)
+            gain += first_log_det - second_log_det
+        return Comparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
+
+    def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
+        """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
+        problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
+        point = problem.smooth(replace(fit.point, near=()))
+        shown, forward, _ = problem.predict(point)
+        assert problem.whitener is not None
+        free = self.later.grid.forward(forward.free_rows() @ point.state)
+        return problem.whitener(self.later.sensors - shown - free, self.later), problem.whitener.log_det
+
+    def _up_to_split(self, point: Point) -> tuple[Point, Part]:
+        """The inputs as measured, but where laws follow the sensors' motion up to the split: smoothed until there.
+
+        With the point, whose `near` are then the laws' forces along that motion.
+        """
+        signals = self.signals
+        follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
+        if not follower.follows:
+            return point, self.whole
+        point = follower.smooth(replace(point, near=()))
+        assert follower.smoothed is not None
+        followed = follower.smoothed.part
+        force = followed.grid.inverse(followed.force) + followed.grid.monomials @ followed.force_polynomial
+        force[self.split :] = signals.force[self.split :]
+        return point, transform(replace(signals, force=force), self.noise)
+
+    def _free_run(
+        self, problem: Problem, forward: Forward, state: FloatArray, started: bool
+    ) -> tuple[ComplexArray, LawForces | None]:
+        """Shown sensor signals (F, S) and the laws' forces of a run that is free from the split on.
+
+        Forces that follow the sensors until there tell the state (`started`) from which the run goes on.
+        """
+        loop = forward.loop(state)
+        if loop is None:
+            return problem.shown(forward, None), None
+        forces: LawForces | None
+        if problem.follows:
+            known = np.column_stack(forward.start_force)
+            forces = loop.answer(march_forces(forward, state, self.split) if started else known)
+        else:
+            forces = forward.law_forces(state)
+            assert forces is not None
+            if not forces.converged and not forward.plant.floats:  # those never forget
+                led = replace(forward, start_force=tuple(march_forces(forward, state).T))
+                forces = led.law_forces(state)
+        return problem.shown(forward, forces), forces
+
+    def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
+        measured = self.signals.sensors[self.split :]
+        error = measured - simulated
+        if self.whitener is None or self.noise.follows:
+            problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
+            self.whitener = Whitener.of(problem.forward(point), self.noise)
+        compared = np.where(self.later.rated, rate_of(error, self.grid), error)
+        residual = self.whitener(self.grid.forward(compared), self.later)
+        size = np.sqrt(np.mean(measured**2, axis=0))
+        per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
+        return FreeRun(simulated, measured, residual, per_sensor, point)
+
+    def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
+        """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""
+        problem = Problem(self.system, self.whole, self.signals.sensor_index, noise)
+        plant = problem.forward(fit.point).plant
+        variance = noise.support_variance(self.whole.grid.omega)
+        power = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support) ** 2, variance)
+        power = power + np.abs(plant.sensor_of_measured_force) ** 2 @ noise.force**2
+        return np.sqrt(power.mean(axis=0) + noise.sensors**2)
+
+
+def _normal(free: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of target (N, S) = weights * free (N, S, 2n) @ state."""
+    columns = (free * weights[None, :, None]).reshape(-1, free.shape[2])
+    return columns.T @ columns, columns.T @ target.ravel()

@@ -1,0 +1,128 @@
+"""Synthetic running records: measured inputs as track (or random forces) give them, responses in steady state.
+
+Vertical track irregularity after ERRI B176: S(W) = b0 / (W^4 + 0.6803895 W^2 + 0.00028855) m^2/(rad/m), W the
+wave number in rad/m.  Every realisation is periodic in `_PERIOD` seconds, so displacements, velocities and the
+vehicle's response are exact sums of harmonics: no interpolation and no time integration is involved, which makes
+these records an independent check of the simulator.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.frequency import FrequencyModel
+from sprung.model.schema import ForceInput
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.linear import LinearSimulator, knot_columns
+from sprung.model.system import System
+
+ERRI_LOW, ERRI_HIGH = 2.741619e-7, 7.343623e-7  # b0
+_PERIOD = 8.0  # s
+_BAND = (0.5, 20.0)  # Hz, where measured axle-box motion carries signal
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Simulated running records."""
+
+    values: FloatArray  # with measurement noise, shape (B, T, C)
+    clean: FloatArray  # without, shape (B, T, C)
+    log_ratio: FloatArray  # truth, shape (B, P)
+
+
+def track_spectrum(wave_number: FloatArray, roughness: float = ERRI_LOW) -> FloatArray:
+    """ERRI B176 vertical power spectral density, m^2/(rad/m), of wave numbers in rad/m."""
+    return roughness / (wave_number**4 + 0.6803895 * wave_number**2 + 0.00028855)
+
+
+def draw_log_ratios(system: System, count: int, spread: float, rng: np.random.Generator) -> FloatArray:
+    """Parameters drawn evenly within nominal (1 +- spread), as log-ratios (count, P)."""
+    return np.log(rng.uniform(1 - spread, 1 + spread, (count, len(system.parameters))))
+
+
+def simulate_runs(
+    system: System,
+    log_ratio: FloatArray,
+    samples: int,
+    rng: np.random.Generator,
+    speed: tuple[float, float] = (40.0, 50.0),
+    roughness: tuple[float, float] = (ERRI_LOW, ERRI_LOW),
+) -> Runs:
+    """One record of `samples` for each parameter vector (B, P), each with its own track, speed (m/s) and phase.
+
+    Left and right rails share half of their power; every wheel of a rail sees it after its own delay.  Forces are
+    white in the band with a root mean square of the static scale of the system.
+    """
+    B = len(log_ratio)
+    fs = system.sample_rate
+    period = max(_PERIOD, 2.0 ** np.ceil(np.log2(samples / fs)))
+    size = round(period * fs)
+    band = _BAND if fs >= 50 else (0.005 * fs, 0.2 * fs)
+    bins = np.arange(max(1, int(band[0] * period)), int(band[1] * period) + 1)
+    omega = 2 * np.pi * bins / period
+    speeds = rng.uniform(*speed, B)
+    level = roughness[0] * (roughness[1] / roughness[0]) ** rng.random(B)
+    drives = _drive_spectra(system, omega, speeds, level, 2 * np.pi / period, rng)  # (B, F, W/2)
+    frequency = FrequencyModel(LinearSimulator(system), omega)
+    values = frequency.simulator.element_values(torch.as_tensor(log_ratio))
+    knots = torch.as_tensor(np.stack([drives, 1j * omega[:, None] * drives], axis=3).reshape(B, len(bins), -1))
+    out = (frequency.response(values) @ torch.as_tensor(drives).unsqueeze(3)).squeeze(3)
+    columns: Tensor = torch.zeros(B, len(bins), len(system.channels), dtype=out.dtype)
+    for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
+        columns[:, :, value] = knots[:, :, 2 * i]
+        if slope is not None:
+            columns[:, :, slope] = knots[:, :, 2 * i + 1]
+    columns[:, :, len(system.inputs) :] = out
+    spectrum = torch.zeros(B, size // 2 + 1, columns.shape[2], dtype=columns.dtype)
+    spectrum[:, bins] = columns
+    clean = torch.fft.irfft(spectrum, n=size, dim=1).numpy()[:, :samples] * (size / 2)
+    noise = np.array([channel.noise for channel in system.channels])
+    return Runs(clean + noise * rng.standard_normal(clean.shape), clean, log_ratio)
+
+
+def _drive_spectra(
+    system: System,
+    omega: FloatArray,
+    speeds: FloatArray,
+    level: FloatArray,
+    step: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Complex amplitudes of every drive, (B, F, drives): sum of cosines of power S(omega) d omega each."""
+    B, F = len(speeds), len(omega)
+
+    def phases(count: int) -> np.ndarray:
+        return np.exp(2j * np.pi * rng.random((B, F, count)))
+
+    wave = omega[None, :] / speeds[:, None]
+    amplitude = np.sqrt(2 * track_spectrum(wave, 1.0) * level[:, None] / speeds[:, None] * step)
+    both, left, right = np.moveaxis(phases(3), 2, 0)
+    rails = {1: (both + left) / np.sqrt(2), -1: (both + right) / np.sqrt(2)}
+    drives = np.empty((B, F, len(system.file.inputs)), dtype=complex)
+    scale = _force_scale(system)
+    for i, (name, source) in enumerate(system.file.inputs.items()):
+        if isinstance(source, ForceInput):
+            drives[:, :, i] = scale * np.sqrt(2 / F) * phases(1)[:, :, 0]
+            continue
+        x, y = _position(system, name)
+        rail = rails[1 if y >= 0 else -1]
+        drives[:, :, i] = amplitude * rail * np.exp(1j * wave * x)
+    return drives
+
+
+def _position(system: System, support: str) -> tuple[float, float]:
+    for element in system.file.elements.values():
+        if support in (element.upper, element.lower) and element.position is not None:
+            return element.position
+    return (0.0, 0.0)
+
+
+def _force_scale(system: System) -> float:
+    """A force that deflects the springs about a thousand times the finest displacement noise, or 1 N."""
+    noise = [c.noise for c in system.channels if c.unit == "m" and c.noise > 0]
+    stiffness = system.mechanics.stiffness
+    return float(1e3 * min(noise) * stiffness.max()) if noise and stiffness.max() > 0 else 1.0

@@ -1,0 +1,138 @@
+"""Windows in, estimates out: the trained estimator gives the start, the simulator refines it."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
+from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.system import System
+
+_FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
+
+
+class UnusableWindow(ValueError):
+    """A window that cannot be identified at all; the message names the channel and what to do."""
+
+
+@dataclass(slots=True)
+class StageTimes:
+    """Seconds spent in the stages of the last batch, for metrics."""
+
+    estimate: float = 0.0
+    refine: float = 0.0
+
+
+@dataclass(slots=True)
+class Identifier:
+    """Identifies windows of one system.  Stateless but for `times` and cached workspaces; use one per thread.
+
+    workers: threads that share a batch of windows (see `Refiner`).
+    """
+
+    system: System
+    estimator: Estimator | None = None
+    workers: int = 1
+    times: StageTimes = field(default_factory=StageTimes)
+    _refiners: dict[int, Refiner] = field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate: system, and weights where an estimator is used."""
+        return self.system.digest + (f"-{self.estimator.digest}" if self.estimator is not None else "")
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window.
+
+        windows: (B, T, C) in the order of `system.channels`, NaN columns for absent sensors.
+        start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
+        Errors: `UnusableWindow` for a wrong shape or an input that is not finite.
+        """
+        windows = self._checked(windows)
+        if len(windows) == 0:
+            return []
+        begin = time.perf_counter()
+        if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
+            start = self.estimator.estimate(windows, self.workers).log_ratio
+        between = time.perf_counter()
+        refined = self._refiner(windows.shape[1]).refine(windows, start, states=states)
+        self.times = StageTimes(between - begin, time.perf_counter() - between)
+        return _estimates(refined, states)
+
+    def _refiner(self, samples: int) -> Refiner:
+        if samples not in self._refiners:
+            self._refiners[samples] = Refiner(self.system, samples, self.workers)
+        return self._refiners[samples]
+
+    def _checked(self, windows: FloatArray) -> FloatArray:
+        windows = np.asarray(windows, dtype=np.float64)
+        channels = self.system.channels
+        if windows.ndim != 3 or windows.shape[2] != len(channels):
+            raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
+        bad = ~np.isfinite(windows)
+        inputs = len(self.system.inputs)
+        for column in np.flatnonzero(bad.any(axis=(0, 1))):
+            if column < inputs:
+                raise UnusableWindow(f"{channels[column].name}: input is missing or not finite; every input is needed")
+        sensors = windows[:, :, inputs:]
+        if np.isinf(sensors).any():
+            raise UnusableWindow(f"{channels[inputs + int(np.argwhere(np.isinf(sensors))[0][2])].name}: not finite")
+        return windows
+
+
+def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifier:
+    """The system's identifier with trained weights from `model` (a directory), or the bundled ones if they fit.
+
+    Without weights for the system the refinement starts from the nominal values.
+    """
+    estimator = load_estimator(model, system) if model is not None else bundled_estimator(system)
+    return Identifier(system, estimator, workers)
+
+
+def identifiability(system: System, seed: int = 0) -> FloatArray:
+    """Standard deviation of each log-ratio that one simulated window gives at the nominal values, shape (P,).
+
+    The median over 16 windows of running on an average track; `PRIOR_STD` where a window tells nothing.
+    """
+    from sprung.model.identification.excitation import simulate_runs
+
+    if not system.parameters:
+        return np.zeros(0)
+    truth = np.zeros((16, len(system.parameters)))
+    runs = simulate_runs(system, truth, system.window, np.random.default_rng(seed))
+    refined = Refiner(system).refine(runs.values, truth)
+    std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
+    return np.minimum(np.median(std, axis=0), PRIOR_STD)
+
+
+def _estimates(refined: Refined, states: bool) -> list[Estimate]:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
+    limit = 1 + _FIT_SIGMAS * np.sqrt(2 / np.maximum(refined.freedom, 1))
+    return [
+        Estimate(
+            log_ratio=refined.log_ratio[b],
+            covariance=refined.covariance[b],
+            identifiable=refined.identifiable[b],
+            nrmse=pooled_nrmse(per_sensor[b]),
+            per_sensor=per_sensor[b],
+            chi_square=float(refined.chi_square[b]),
+            adequate=bool(refined.chi_square[b] < limit[b] and refined.converged[b]),
+            converged=bool(refined.converged[b]),
+            iterations=int(refined.iterations[b]),
+            states=refined.states[b] if states else None,
+        )
+        for b in range(len(refined.log_ratio))
+    ]
+
+
+def pooled_nrmse(per_sensor: FloatArray) -> float:
+    """rms over sensors of each sensor's error divided by its own rms; NaN sensors are absent."""
+    shown = per_sensor[np.isfinite(per_sensor)]
+    return float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")

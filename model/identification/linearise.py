@@ -1,0 +1,324 @@
+"""A window's model linearised at given parameters, with everything weighed by the noise of sensors and inputs.
+
+Sensors that measure the same motion redundantly are compressed to independent signals of unit noise first (what is
+lost carries no information on the parameters), which also takes absent sensors out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
+from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, FORCE, VELOCITY
+from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
+from sprung.model.system import System
+
+BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
+PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
+_RIDGE = 1e-11  # relative, on the normalised free responses
+
+
+@dataclass(frozen=True, slots=True)
+class WindowBatch:
+    """Windows with the same sensors present, as the model needs them."""
+
+    w: Tensor  # knots of the drives, shape (B, T, W)
+    measured: Tensor  # sensors present, shape (B, T, S')
+    present: BoolArray  # which sensors these are, shape (S,)
+
+    def take(self, at: Tensor) -> WindowBatch:
+        return self if len(at) == len(self.w) else WindowBatch(self.w[at], self.measured[at], self.present)
+
+
+@dataclass(frozen=True, slots=True)
+class Linearisation:
+    """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
+
+    whiten: Tensor  # shape (B, F, R, R), weights of the bins included
+    free: Tensor  # whitened free responses, normalised, shape (B, N, K)
+    free_scale: Tensor  # what they were divided by, shape (B, N)
+    sensitivities: Tensor  # whitened, shape (B, P, K)
+    factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N, N)
+    across: Tensor  # free responses solved for the sensitivities, shape (B, N, P)
+    covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
+    x: Tensor  # log-ratios of this point, shape (B, P)
+    x0: Tensor  # best initial state here, shape (B, N)
+    cost: Tensor  # weighted squares with that state, shape (B,)
+    gradient: Tensor  # minus half the gradient of the cost, shape (B, P)
+    step: Tensor  # to the minimum of the linearised cost, shape (B, P)
+
+    def state_after(self, step: Tensor) -> Tensor:
+        """Best initial state when the log-ratios move by `step`."""
+        return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
+
+
+@dataclass(frozen=True, slots=True)
+class Chord:
+    """A second step of Gauss-Newton with the products of the first."""
+
+    cost: Tensor  # weighted squares before the step, shape (B,)
+    step: Tensor  # shape (B, P)
+    x0: Tensor  # best initial state after it, shape (B, N)
+    error: Tensor  # rms of measured minus simulated before it, shape (B, S')
+
+
+class WindowModel:
+    """The linear system over windows of a fixed length."""
+
+    def __init__(self, system: System, samples: int) -> None:
+        self.system, self.samples = system, samples
+        self.simulator = LinearSimulator(system)
+        omega = bin_frequencies(samples, system.sample_rate)
+        self.bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right"))
+        self.frequency = FrequencyModel(self.simulator, omega[: self.bins])
+        weight = np.full(self.bins, np.sqrt(2 / samples))
+        weight[0] = np.sqrt(1 / samples)
+        self.weight = torch.as_tensor(weight)
+        self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
+        self.sensor_noise = system.sensor_noise
+        self._compressions: dict[bytes, Tensor] = {}
+
+    @property
+    def states_count(self) -> int:
+        return 2 * self.simulator.H.shape[1]
+
+    def knots(self, windows: FloatArray) -> FloatArray:
+        """Knots of the drives, (B, T, W), of windows (B, T, C)."""
+        return self.simulator.knots(windows[:, :, : len(self.system.inputs)])
+
+    def batch(self, knots: FloatArray, windows: FloatArray, present: BoolArray) -> WindowBatch:
+        """Windows (B, T, C), their knots (B, T, W) at hand, in which exactly the sensors `present` are measured."""
+        sensors = windows[:, :, len(self.system.inputs) :][:, :, present]
+        return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present)
+
+    def compression(self, present: BoolArray) -> Tensor:
+        """Matrix (R, S') from the sensors present to independent signals of unit noise."""
+        key = present.tobytes()
+        if key not in self._compressions:
+            mechanics = self.system.mechanics
+            kind, S = mechanics.sensor_kind[present], mechanics.S[present]
+            noise = self.sensor_noise[present]
+            blocks = []
+            for motion in (ACCELERATION, VELOCITY, DISPLACEMENT):
+                at = np.flatnonzero(kind == motion)
+                if len(at):
+                    q, r = np.linalg.qr(S[at] / noise[at, None])
+                    rank = int(np.linalg.matrix_rank(r))
+                    basis = q[:, :rank] if rank == r.shape[1] else np.linalg.svd(S[at] / noise[at, None])[0][:, :rank]
+                    block = np.zeros((rank, len(kind)))
+                    block[:, at] = basis.T / noise[at]
+                    blocks.append(block)
+            of_elements = np.flatnonzero(kind > DISPLACEMENT)
+            blocks.append(np.diag(1 / noise)[of_elements])
+            self._compressions[key] = torch.as_tensor(np.concatenate(blocks))
+        return self._compressions[key]
+
+    def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
+        """Everything at log-ratios x (B, P)."""
+        s = self.simulator
+        values = s.element_values(x)
+        discrete = self._compressed(s.discretise(values), data)
+        forced = s.states(discrete, data.w, x.new_zeros(len(x), discrete.Ad.shape[1]))
+        residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
+        free = s.free_response(discrete, self.samples)
+
+        compliance, per_force, carried = self._transfer(values, data)
+        whiten = self._whitening(carried)
+        white_residual = whiten @ self._spectra(residual).unsqueeze(3)  # (B, F, R, 1)
+        white_free = whiten @ self._spectra(free)  # (B, F, R, N)
+        r, basis = _rows(white_residual), _rows(white_free)  # (B, 1, K), (B, N, K)
+        free_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
+        basis = basis / free_scale.unsqueeze(2)
+        products = basis @ basis.mT
+        factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(products.shape[1], dtype=x.dtype))
+        along = basis @ r.mT  # (B, N, 1)
+        x0_scaled = torch.cholesky_solve(along, factor).squeeze(2)
+        x0 = x0_scaled / free_scale
+        cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
+
+        left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
+        noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
+        states = forced + s.free_states(discrete, x0, self.samples)
+        J = self._sensitivities(values, compliance, whiten @ per_force, states, data, noise)
+        if s.estimates_mass:
+            J = torch.cat([J, self._mass_columns(values, compliance, whiten, states, data)], dim=3)
+        J = _rows(J)
+        across_products = basis @ J.mT
+        across = torch.cholesky_solve(across_products, factor)
+        information = J @ J.mT - across_products.mT @ across
+        gradient = (J @ r.mT - across.mT @ along).squeeze(2)
+        prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
+        covariance = torch.linalg.inv(information + prior)
+        step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
+        return Linearisation(whiten, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step)
+
+    def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
+        """One more step from (x, x0) with the products of `at`."""
+        s = self.simulator
+        discrete = self._present(s.discretise(s.element_values(x)), data)
+        states = s.states(discrete, data.w, x0)
+        error = data.measured - states @ discrete.C.mT - data.w @ discrete.D.mT
+        spectra = self._spectra(error @ self.compression(data.present).mT)
+        r = _rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
+        along = at.free @ r
+        free_part = torch.cholesky_solve(along, at.factor)
+        gradient = at.sensitivities @ r - at.across.mT @ along
+        step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
+        cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
+        x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.free_scale
+        return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt())
+
+    def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
+        """Simulated states, (B, T, N)."""
+        s = self.simulator
+        return s.states(s.discretise(s.element_values(x)), data.w, x0)
+
+    def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
+        """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
+
+        Near one, the window holds no excitation of the parameter: what looks like information is noise.
+        """
+        s, f = self.simulator, self.frequency
+        values = s.element_values(at.x)
+        compliance, per_force, carried = self._transfer(values, data)
+        kind = compliance.dtype
+        dynamic = f.dynamic(values)
+        load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)
+        direct = torch.zeros(s.H.shape[0], s.W // 2, dtype=kind)
+        if len(s.supports):
+            load[..., s.supports // 2] = -(s.H.T.to(kind) @ (dynamic.unsqueeze(3) * s.G.to(kind)))
+            direct[:, s.supports // 2] = s.G.to(kind)
+        if len(s.forces):
+            load[..., s.forces // 2] = s.F.to(kind)
+        deflection = (s.H.to(kind) @ (compliance @ load) + direct) * self.drive_noise[:, None]  # (B, F, E, W/2)
+        # Sensor noise reaches the fitted motion, at the least, as the motion that it cannot be told from.
+        motion = torch.linalg.pinv(self._sensing(values, data))
+        power = deflection.abs().square().sum(dim=3) + (s.H.to(kind) @ motion).abs().square().sum(dim=3)
+        power = power * self.samples
+        white = (self._whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
+        by_k = (white * values.stiffness.square().unsqueeze(1)).sum(dim=1)
+        by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
+        k_at, c_at = s.estimated_elements
+        noise = torch.cat([by_k[:, k_at], by_c[:, c_at]], dim=1)
+        shown = at.sensitivities.square().sum(dim=2)
+        share = torch.zeros_like(shown)
+        share[:, : noise.shape[1]] = noise / shown[:, : noise.shape[1]].clamp_min(1e-300)
+        return share
+
+    def _sensing(self, values: ElementValues, data: WindowBatch) -> Tensor:
+        """Compressed signals per degree of freedom, (B, F, R, n)."""
+        kind = self.frequency.jw.dtype
+        return self._signal_rows(data, kind) @ self.frequency.sensing(values)
+
+    def _signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
+        """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
+        select = torch.eye(len(data.present), dtype=kind)[data.present]
+        return self.compression(data.present).to(kind) @ select
+
+    def _spectra(self, signals: Tensor) -> Tensor:
+        """Bins within the band of signals (B, T, ...), (B, F, ...)."""
+        return torch.fft.rfft(signals, dim=1)[:, : self.bins]
+
+    def _signals(self, data: WindowBatch) -> Tensor:
+        return data.measured @ self.compression(data.present).mT
+
+    def _present(self, discrete: Discrete, data: WindowBatch) -> Discrete:
+        if data.present.all():
+            return discrete
+        at = torch.as_tensor(data.present)
+        return replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
+
+    def _compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
+        Q, discrete = self.compression(data.present), self._present(discrete, data)
+        return replace(discrete, C=Q @ discrete.C, D=Q @ discrete.D)
+
+    def _transfer(self, values: ElementValues, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
+        """Compliance (B, F, n, n); compressed signals per element force (B, F, R, E) and per unit drive noise."""
+        s, f = self.simulator, self.frequency
+        compliance = torch.linalg.inv(f.stiffness(values))
+        kind = compliance.dtype
+        Q = self._signal_rows(data, kind)
+        sensing = Q @ (f.sensing(values) if f.element_sensors else f.motion_sensing)
+        per_load = sensing @ compliance
+        per_force = -per_load @ s.H.T.to(kind)
+        dynamic = self.frequency.dynamic(values)
+        drive = per_load.new_zeros(*per_load.shape[:3], s.W // 2)
+        if len(s.supports):
+            drive[..., s.supports // 2] = (per_force * dynamic.unsqueeze(2)) @ s.G.to(kind)
+        if len(s.forces):
+            drive[..., s.forces // 2] = per_load @ s.F.to(kind)
+        if f.element_sensors:
+            drive[..., s.supports // 2] += Q @ f.element_response(values, s.G)
+            forces = torch.where((s.kind == FORCE)[:, None], s.L, torch.zeros_like(s.L))
+            per_force = per_force + Q @ forces.to(kind)
+        return compliance, per_force, drive * self.drive_noise[:, None]
+
+    def _whitening(self, carried: Tensor) -> Tensor:
+        R = carried.shape[2]
+        covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
+        factor = torch.linalg.cholesky(covariance)
+        unit = torch.diag_embed(self.weight[:, None].expand(-1, R)).to(carried.dtype).expand_as(factor)
+        return torch.linalg.solve_triangular(factor, unit, upper=False)
+
+    def _sensitivities(
+        self,
+        values: ElementValues,
+        compliance: Tensor,
+        per_force: Tensor,
+        states: Tensor,
+        data: WindowBatch,
+        noise: Tensor,
+    ) -> Tensor:
+        """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P')."""
+        s = self.simulator
+        n = s.H.shape[1]
+        d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
+        v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
+        spectra = torch.fft.rfft(torch.cat([d, v], dim=2), dim=1)[:, : self.bins]
+        E = s.H.shape[0]
+        # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
+        kind = compliance.dtype
+        dynamic = self.frequency.dynamic(values)
+        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)  # deflections, (B, F, E)
+        load = -(dynamic * support) @ s.H.to(kind)
+        if len(s.forces):
+            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
+        moved = (compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support
+        deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
+        rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
+        k_at, c_at = s.estimated_elements
+        return torch.cat(
+            [per_force[..., k_at] * deflection[:, :, None, k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3
+        )
+
+    def _mass_columns(
+        self,
+        values: ElementValues,
+        compliance: Tensor,
+        whiten: Tensor,
+        states: Tensor,
+        data: WindowBatch,
+    ) -> Tensor:
+        """Whitened sensitivities to the masses: inertia forces m q'' along the motion, (B, F, R, masses)."""
+        s = self.simulator
+        A, b_value, b_rate = s.continuous(values)
+        n = s.H.shape[1]
+        acceleration = (
+            states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
+        )
+        spectra = torch.fft.rfft(acceleration, dim=1)[:, : self.bins] * values.mass[:, None]
+        kind = compliance.dtype
+        per_load = -(whiten @ (self._sensing(values, data) @ compliance))
+        masses = s.m_of[-s.estimated_masses :].T.to(kind)  # (n, masses)
+        return (per_load * spectra[:, :, None]) @ masses
+
+
+def _rows(spectra: Tensor) -> Tensor:
+    """(B, F, R, X) complex to (B, X, 2 F R) real."""
+    B, F, R, X = spectra.shape
+    return torch.view_as_real(spectra).permute(0, 3, 1, 2, 4).reshape(B, X, F * R * 2)

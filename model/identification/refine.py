@@ -1,0 +1,209 @@
+"""Refinement: maximum-likelihood parameters of windows by Gauss-Newton on the simulated output.
+
+The unknown initial state is a linear nuisance.  Errors are weighed bin by bin of the DFT: sensor noise and the
+noise of the measured inputs are white over bins, so that the residual of bin w has the covariance
+
+    R(w) = R_s + G(w) S_u G(w)^H
+
+whatever the window length; what the DFT of a finite window adds (leakage) lies in the span of the free responses
+and is removed with the initial state.  In the time domain the same covariance would be a full (T S) x (T S) matrix.
+
+Noise of the inputs also enters the sensitivities and would pull the estimates towards zero force (errors in
+variables).  The likelihood over the true inputs as well has the same minimum as solving J(u^)^H R^-1 r = 0 with
+the sensitivities J taken along the smoothed inputs u^ = u + S_u G^H R^-1 r; this is what is iterated.
+
+One iteration is a full linearisation followed by a chord step: the model is simulated again at the new point and
+the old products give a second correction, at a tenth of the price.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.chunks import alike, chunks, share
+from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel
+from sprung.model.signals import BoolArray, FloatArray, IntArray
+from sprung.model.system import System
+
+IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
+_WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
+_NOISE_SHARE = 0.15  # of a sensitivity's power, at most
+_STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
+_CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Results of a batch; log-ratios, B windows."""
+
+    log_ratio: FloatArray  # shape (B, P)
+    covariance: FloatArray  # shape (B, P, P)
+    identifiable: BoolArray  # shape (B, P)
+    converged: BoolArray  # shape (B,)
+    iterations: np.ndarray  # full linearisations, shape (B,)
+    chi_square: FloatArray  # per degree of freedom, shape (B,)
+    freedom: np.ndarray  # degrees of freedom, shape (B,)
+    error: FloatArray  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
+    rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
+    states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
+
+
+class Refiner:
+    """Gauss-Newton for one system and one window length.
+
+    workers: threads that share the chunks of a batch, see `model.chunks`.
+    """
+
+    def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
+        self.system, self.workers = system, workers
+        self.model = WindowModel(system, samples or system.window)
+
+    @property
+    def observations(self) -> int:
+        """Real numbers that a window with every sensor is compared in."""
+        everything = np.ones(len(self.system.sensors), dtype=bool)
+        return (2 * self.model.bins - 1) * len(self.model.compression(everything))
+
+    def refine(
+        self, windows: FloatArray, start: FloatArray | None = None, *, iterations: int = 12, states: bool = False
+    ) -> Refined:
+        """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors."""
+        present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
+        everything = np.arange(len(windows))
+        knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
+        progress = _Progress.begin(start, present.shape, len(self.system.parameters), self.model.states_count)
+
+        def batch(at: IntArray) -> WindowBatch:
+            return self.model.batch(knots[at], windows[at], present[at[0]])
+
+        def iterate(at: IntArray) -> None:
+            with torch.no_grad():
+                self._iterate(batch(at), progress, torch.as_tensor(at))
+
+        def conclude(at: IntArray) -> Refined:
+            with torch.no_grad():
+                return self._result(batch(at), progress, torch.as_tensor(at), states)
+
+        active = everything
+        for _ in range(iterations):
+            share(iterate, self._pieces(present, active), self.workers)
+            # The few that need more are gathered from all chunks.
+            active = active[~progress.converged.numpy()[active]]
+            if len(active) == 0:
+                break
+        pieces = self._pieces(present, everything)
+        return _in_order(share(conclude, pieces, self.workers), np.concatenate(pieces))
+
+    def _pieces(self, present: BoolArray, of: IntArray) -> list[IntArray]:
+        return [piece for group in alike(present, of) for piece in chunks(group)]
+
+    def misfit(self, windows: FloatArray, log_ratio: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Weighted squares of the simulated outputs (B,) at given parameters and their gradient (B, P).
+
+        Every sensor must be present.
+        """
+        with torch.no_grad():
+            data = self.model.batch(self.model.knots(windows), windows, np.ones(len(self.system.sensors), dtype=bool))
+            at = self.model.linearise(torch.as_tensor(log_ratio), data)
+        return at.cost.numpy(), -2 * at.gradient.numpy()
+
+    def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor) -> None:
+        """A full linearisation and a chord step for the windows `rows`, whose data are given."""
+        x, cost, best = progress.x[rows], progress.cost[rows], progress.best[rows]
+        at = self.model.linearise(x, data)
+        step = _limited(at.step)
+        second = self.model.chord(at, x + step, at.state_after(step), data)
+        worse = at.cost > cost * (1 + 1e-6) + 1e-9
+        std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
+        held = second.cost <= at.cost * (1 + 1e-6) + 1e-9
+        small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
+        forward = torch.where(held[:, None], x + step + _limited(second.step), x + step / 3)
+        # A step that made things worse is taken back to a third.
+        progress.x[rows] = torch.where(worse[:, None], best + (x - best) / 3, forward)
+        progress.best[rows] = torch.where(worse[:, None], best, x)
+        done = small & ~worse
+        progress.cost[rows] = torch.where(done, second.cost, torch.where(worse, cost, at.cost))
+        progress.converged[rows] = done
+        progress.iterations[rows] += 1
+        progress.x0[rows], progress.covariance[rows] = second.x0, at.covariance
+        progress.error[rows[:, None], torch.as_tensor(np.flatnonzero(data.present))] = second.error
+
+    def _result(self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool) -> Refined:
+        x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
+        std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
+        identifiable = std < IDENTIFIABLE_STD
+        weak = (std > _WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = data.take(weak)
+            share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
+            identifiable[weak] &= share < _NOISE_SHARE
+        signals = len(self.model.compression(data.present))
+        freedom = (2 * self.model.bins - 1) * signals - x0.shape[1] - identifiable.sum(dim=1)
+        chi_square = progress.cost[rows] / freedom.clamp_min(1)
+        # What the model cannot follow is treated as more noise, so that intervals stay honest.
+        covariance = covariance * chi_square.clamp_min(1)[:, None, None]
+        both = identifiable[:, :, None] & identifiable[:, None, :]
+        prior = torch.eye(x.shape[1], dtype=torch.float64) * PRIOR_STD**2
+        rms = np.full((len(x), len(data.present)), np.nan)
+        rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
+        path = self.model.states(x, x0, data) if states else x0.new_zeros(len(x), 0, x0.shape[1])
+        return Refined(
+            log_ratio=torch.where(identifiable, x, torch.zeros_like(x)).numpy(),
+            covariance=torch.where(both, covariance, prior).numpy(),
+            identifiable=identifiable.numpy(),
+            converged=progress.converged[rows].numpy(),
+            iterations=progress.iterations[rows].numpy(),
+            chi_square=chi_square.numpy(),
+            freedom=freedom.numpy(),
+            error=progress.error[rows].numpy(),
+            rms=rms,
+            states=path.numpy(),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Progress:
+    """Where every window of a batch stands; chunks write their own rows."""
+
+    x: Tensor  # log-ratios, shape (B, P)
+    best: Tensor  # those of the lowest cost so far, shape (B, P)
+    cost: Tensor  # shape (B,)
+    x0: Tensor  # initial states, shape (B, N)
+    covariance: Tensor  # shape (B, P, P)
+    error: Tensor  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
+    converged: Tensor  # shape (B,)
+    iterations: Tensor  # shape (B,)
+
+    @classmethod
+    def begin(cls, start: FloatArray | None, shape: tuple[int, ...], P: int, N: int) -> _Progress:
+        B, sensors = shape
+        x = torch.zeros(B, P, dtype=torch.float64)
+        if start is not None:
+            x += torch.as_tensor(start)
+        return cls(
+            x=x,
+            best=x.clone(),
+            cost=torch.full((B,), torch.inf, dtype=torch.float64),
+            x0=torch.zeros(B, N, dtype=torch.float64),
+            covariance=torch.zeros(B, P, P, dtype=torch.float64),
+            error=torch.full((B, sensors), torch.nan, dtype=torch.float64),
+            converged=torch.zeros(B, dtype=torch.bool),
+            iterations=torch.zeros(B, dtype=torch.long),
+        )
+
+
+def _limited(step: Tensor) -> Tensor:
+    return step * (_STEP_LIMIT / step.abs().amax(dim=1, keepdim=True).clamp_min(_STEP_LIMIT))
+
+
+def _in_order(parts: list[Refined], order: np.ndarray) -> Refined:
+    back = np.argsort(order)
+    fields: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts])[back] for name in Refined.__slots__
+    }
+    return Refined(**fields)

@@ -1,0 +1,110 @@
+"""The catalogue of laws: what a system may do that its file does not say.  One table; docs/catalogue.md."""
+
+from __future__ import annotations
+
+from sprung.model.laws.base import (
+    CLOCK_LEAD,
+    BodyLaw,
+    ElementLaw,
+    Law,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SensorLaw,
+    SpringDamper,
+    SupportLaw,
+    grid,
+    observe,
+)
+from sprung.model.laws.bodies import EXTERNAL_FORCE, FLEXIBLE_MODE, MASS_CHANGE
+from sprung.model.laws.damping import (
+    COULOMB_FRICTION,
+    DAMPER_ASYMMETRY,
+    DAMPER_BLOWOFF,
+    QUADRATIC_DAMPING,
+)
+from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
+from sprung.model.laws.hysteresis import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
+from sprung.model.laws.own import LawFileError, load_laws
+from sprung.model.laws.running_gear import ANTI_ROLL_BAR, RAIL_JOINTS, WHEEL_FLAT
+from sprung.model.laws.sensor_faults import (
+    AXLE_DELAY,
+    SENSOR_BIAS,
+    SENSOR_GAIN,
+    SENSOR_LAG,
+    SENSOR_NOISE,
+    SENSOR_STUCK,
+)
+from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
+
+CATALOGUE: tuple[Law, ...] = (
+    CUBIC_STIFFNESS,
+    BUMP_STOP,
+    CLEARANCE,
+    COULOMB_FRICTION,
+    DAMPER_BLOWOFF,
+    DAMPER_ASYMMETRY,
+    QUADRATIC_DAMPING,
+    SERIES_STIFFNESS,
+    BOUC_WEN,
+    TIME_VARYING_STIFFNESS,
+    TIME_VARYING_DAMPING,
+    AIR_SPRING,
+    ANTI_ROLL_BAR,
+    WHEEL_FLAT,
+    RAIL_JOINTS,
+    FLEXIBLE_MODE,
+    EXTERNAL_FORCE,
+    MASS_CHANGE,
+    SENSOR_GAIN,
+    SENSOR_LAG,
+    SENSOR_BIAS,
+    SENSOR_NOISE,
+    SENSOR_STUCK,
+    AXLE_DELAY,
+)
+
+
+def element_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[ElementLaw, ...]:
+    """The laws that add a force to an element or a pair."""
+    return tuple(law for law in catalogue if isinstance(law, ElementLaw))
+
+
+def body_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[BodyLaw, ...]:
+    return tuple(law for law in catalogue if isinstance(law, BodyLaw))
+
+
+def sensor_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[SensorLaw, ...]:
+    return tuple(law for law in catalogue if isinstance(law, SensorLaw))
+
+
+def find_law(name: str, catalogue: tuple[Law, ...] = CATALOGUE) -> Law:
+    """The law of that name; a ValueError that lists the names otherwise."""
+    for law in catalogue:
+        if law.name == name:
+            return law
+    known = ", ".join(law.name for law in catalogue)
+    raise ValueError(f"no law is called {name!r}; the catalogue has {known}")
+
+
+__all__ = [
+    "CATALOGUE",
+    "CLOCK_LEAD",
+    "BodyLaw",
+    "ElementLaw",
+    "Law",
+    "LawFileError",
+    "Motion",
+    "Observed",
+    "ParameterSpec",
+    "SensorLaw",
+    "SpringDamper",
+    "SupportLaw",
+    "body_laws",
+    "element_laws",
+    "find_law",
+    "grid",
+    "load_laws",
+    "observe",
+    "sensor_laws",
+]

@@ -1,0 +1,233 @@
+"""What a law of the catalogue is: its parameters, its force, and what an engineer should know of it.
+
+An element law adds a force to the k d + c v of its element:
+
+    f = k d + c v + law.force(motion, p, element)          N, positive in extension
+    z' = law.memory_rate(motion, p, element)               for laws with memory
+
+`force` and `memory_rate` are pure and work on arrays of any shape: d, v, t and every parameter only have to
+broadcast, so that one call serves a whole record, a batch of candidates or one instant of a simulation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.polynomial.polynomial import polyval
+
+from sprung.model.mechanics import Mechanics
+from sprung.model.signals import FloatArray
+
+Where = Literal["element", "pair", "body", "sensor", "support", "axle"]  # "axle": both supports of one
+Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
+
+CLOCK_LEAD = 5.0  # s; the clock of the laws starts this long before the first sample of a recording
+
+
+class Motion(NamedTuple):
+    """The motion of an element that a law sees; all entries broadcast with each other."""
+
+    deflection: Any  # m, upper minus lower
+    rate: Any  # m/s
+    time: Any = 0.0  # s on the laws' clock: CLOCK_LEAD at the first sample
+    memory: Any = ()  # the law's own states, first axis: one per state
+
+
+class SpringDamper(NamedTuple):
+    """The linear element that a law belongs to."""
+
+    stiffness: Any  # N/m
+    damping: Any  # N s/m
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """What a recording says about the motion of one element: where knees, gaps and memories can be sought."""
+
+    deflection: FloatArray  # quantiles 0, 1 %, ..., 100 % of abs(deflection), m, shape (101,)
+    rate: FloatArray  # the same of abs(rate), m/s, shape (101,)
+    deflection_rms: float  # m
+    rate_rms: float  # m/s
+    stiffness: float  # N/m, of the element as identified without any law
+    damping: float  # N s/m
+    seconds: float  # length of the recording
+
+    def deflection_quantile(self, shares: Sequence[float]) -> FloatArray:
+        return np.interp(shares, np.linspace(0, 1, 101), self.deflection)
+
+    def rate_quantile(self, shares: Sequence[float]) -> FloatArray:
+        return np.interp(shares, np.linspace(0, 1, 101), self.rate)
+
+
+def observe(
+    deflection: FloatArray,
+    rate: FloatArray,
+    sample_rate: float,
+    stiffness: float,
+    damping: float,
+) -> Observed:
+    """Statistics of one element's motion, both of shape (T,)."""
+    shares = np.linspace(0, 1, 101)
+    return Observed(
+        deflection=np.quantile(np.abs(deflection), shares),
+        rate=np.quantile(np.abs(rate), shares),
+        deflection_rms=float(np.sqrt(np.mean(deflection**2))),
+        rate_rms=float(np.sqrt(np.mean(rate**2))),
+        stiffness=float(stiffness),
+        damping=float(damping),
+        seconds=len(deflection) / sample_rate,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSpec:
+    """One number of a law."""
+
+    name: str
+    unit: str
+    low: float  # smallest admissible value
+    high: float  # largest admissible value
+    meaning: str
+    typical: Callable[[Observed], float]  # size at which the law would matter, for scaling a fit
+    log: bool = False  # positive by nature and of unknown order: fitted as a logarithm
+    usual: tuple[float, float] = (0.0, float("inf"))  # range in multiples of `typical`, beyond which it is rare
+
+    def admits(self, value: float) -> bool:
+        return bool(self.low <= value <= self.high)
+
+
+class Parametrised:
+    """What every law has: names of its parameters, and whether it admits values of them."""
+
+    parameters: tuple[ParameterSpec, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(parameter.name for parameter in self.parameters)
+
+    def admits(self, p: Sequence[float]) -> bool:
+        return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+
+
+def empty_memory(motion: Motion, p: Values, element: SpringDamper) -> Any:
+    """A memory that knows nothing of the time before the recording."""
+    return 0.0
+
+
+def no_memory(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    """Rate of the memory of a law that has none."""
+    return np.zeros((0, *np.shape(motion.deflection)))
+
+
+@dataclass(frozen=True)
+class ElementLaw(Parametrised):
+    """A force that an element may have besides k d + c v (module docstring)."""
+
+    name: str
+    title: str  # in an engineer's words, without article: "dry friction"
+    parameters: tuple[ParameterSpec, ...]
+    force: Callable[[Motion, Values, SpringDamper], Any]  # N, added to k d + c v
+    shapes: Callable[[Observed], FloatArray]  # trial values for screening, shape (trials, P)
+    absent: tuple[float, ...]  # parameter values at which the law vanishes
+    looks_like: str
+    confused_with: tuple[str, ...]  # names of laws that similar data may suggest
+    sentence: str  # "dry friction of {force}"; each {parameter} becomes "395 +- 6 N"
+    strength: int | None = 0  # parameter in which the force is linear, counted from its `absent` value; None: none is
+    where: Where = "element"
+    memory: int = 0  # states of its own
+    memory_rate: Callable[[Motion, Values, SpringDamper], FloatArray] = no_memory  # shape (memory, ...)
+    memory_start: Callable[[Motion, Values, SpringDamper], Any] = empty_memory  # at the first sample
+    # Fast linear decay of each state, 1/s, shape (memory, ...): integrated exactly by the simulation
+    memory_decay: Callable[[Values, SpringDamper], Any] | None = None
+    passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
+    odd: bool = True  # force(-d, -v) = -force(d, v)
+    corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
+    wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
+
+    def clip(self, p: Sequence[float]) -> FloatArray:
+        """Nearest admissible values, shape (P,)."""
+        return np.array([min(max(float(v), q.low), q.high) for q, v in zip(self.parameters, p, strict=True)])
+
+    def scaled(self, p: Sequence[float], factor: float) -> FloatArray:
+        """Parameters whose force is `factor` times that of `p` where the law is linear, else `p`; not clipped."""
+        values = np.array(p, dtype=float)
+        if self.strength is not None:
+            zero = self.absent[self.strength]
+            values[self.strength] = zero + factor * (values[self.strength] - zero)
+        return values
+
+
+def grid(*columns: Sequence[float] | FloatArray) -> FloatArray:
+    """Every combination of the columns' values, shape (trials, columns)."""
+    mesh = np.meshgrid(*[np.asarray(column, dtype=float) for column in columns], indexing="ij")
+    return np.stack([axis.ravel() for axis in mesh], axis=-1)
+
+
+@dataclass(frozen=True)
+class BodyLaw(Parametrised):
+    """Physics of a body: it changes the mechanics, or loads a degree of freedom by a force nobody measured."""
+
+    name: str
+    title: str
+    parameters: tuple[ParameterSpec, ...]
+    variants: Callable[[Mechanics, int], tuple[str, ...]]  # discrete choices: a mode's shape, a direction
+    # The mechanics with the law: same signature for all; `mechanics.stiffness` etc. hold the present values
+    modify: Callable[[Mechanics, int, Values, str], Mechanics]
+    shapes: Callable[[Sequence[float]], FloatArray]  # trial values, from the frequencies of lines in the residual, Hz
+    absent: tuple[float, ...]
+    looks_like: str
+    confused_with: tuple[str, ...]
+    sentence: str
+    load: Callable[[FloatArray, Values], FloatArray] | None = None  # N over the laws' clock: one more force in u
+
+
+@dataclass(frozen=True)
+class SupportLaw(Parametrised):
+    """A movement of supports that repeats itself and that their measured motion does not show.
+
+    movement = depth sum_n harmonics[n - 1] cos(2 pi n (frequency t - phase)), t on the laws' clock
+    """
+
+    name: str
+    title: str
+    parameters: tuple[ParameterSpec, ...]  # depth m, frequency Hz, phase in periods
+    harmonics: tuple[float, ...]  # per unit of depth, from the fundamental on
+    absent: tuple[float, ...]
+    looks_like: str
+    confused_with: tuple[str, ...]
+    sentence: str
+    where: Where = "support"  # "axle": both supports of one axle together
+
+    def movement(self, time: FloatArray, p: Values, highest: float = np.inf) -> tuple[FloatArray, FloatArray]:
+        """What is added to the measured displacement (m) and velocity (m/s) at times on the laws' clock, each (T,).
+
+        highest: Hz, harmonics above it are left out, as anti-alias filters do.
+        """
+        depth, frequency, phase = p
+        n = np.arange(len(self.harmonics) + 1)
+        weights = depth * np.where(n * frequency < highest, (0.0, *self.harmonics), 0.0)
+        turn = np.exp(2j * np.pi * (np.asarray(time) * frequency - phase))
+        displacement, rate = polyval(turn, np.column_stack([weights, 2j * np.pi * n * frequency * weights]))
+        return displacement.real, rate.real
+
+
+@dataclass(frozen=True)
+class SensorLaw(Parametrised):
+    """A fault of a measurement: what it shows instead of the truth, along the last axis (samples)."""
+
+    name: str
+    title: str
+    parameters: tuple[ParameterSpec, ...]
+    distort: Callable[[FloatArray, Values, float], FloatArray]  # (truth (..., T), p, sample rate) -> shown
+    restore: Callable[[FloatArray, Values, float], FloatArray] | None  # its inverse; None: the signal is lost
+    absent: tuple[float, ...]
+    looks_like: str
+    confused_with: tuple[str, ...]
+    sentence: str
+    where: Where = "sensor"  # "axle": all inputs of one axle together
+
+
+Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw

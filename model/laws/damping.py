@@ -1,0 +1,119 @@
+"""Dampers that are not linear: dry friction, blow-off, asymmetry, quadratic damping."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.signals import FloatArray
+
+
+def _coulomb(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    force, smoothing = p
+    return force * np.tanh(motion.rate / smoothing)
+
+
+def _coulomb_shapes(seen: Observed) -> FloatArray:
+    widest = max(seen.rate_rms, 1e-12)
+    return grid([0.1 * seen.damping * widest + 0.05 * seen.stiffness * seen.deflection_rms], widest * _WIDTHS)
+
+
+_WIDTHS = np.array([0.02, 0.07, 0.2, 0.6])
+
+COULOMB_FRICTION = ElementLaw(
+    name="coulomb_friction",
+    title="dry friction",
+    parameters=(
+        ParameterSpec("force", "N", 0.0, 1e9, "friction force", lambda seen: _coulomb_shapes(seen)[0, 0]),
+        ParameterSpec(
+            "smoothing",
+            "m/s",
+            1e-6,
+            10.0,
+            "rate over which the force changes sign",
+            lambda seen: 0.05 * seen.rate_rms,
+            log=True,
+            usual=(0.0, 4.0),  # wider, it is a damper that saturates
+        ),
+    ),
+    force=_coulomb,
+    shapes=_coulomb_shapes,
+    absent=(0.0, 1.0),
+    looks_like="force of constant size against the motion; strongest relative effect at small amplitudes",
+    confused_with=("damper_blowoff", "quadratic_damping", "bouc_wen", "clearance"),
+    sentence="dry friction of {force}",
+    corner=1,
+)
+
+
+def _blowoff(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    knee, ratio = p
+    v = motion.rate
+    return (ratio - 1) * element.damping * (v - np.minimum(np.maximum(v, -knee), knee))
+
+
+DAMPER_BLOWOFF = ElementLaw(
+    name="damper_blowoff",
+    title="damper blow-off",
+    parameters=(
+        ParameterSpec(
+            "knee",
+            "m/s",
+            1e-7,
+            100.0,
+            "rate at which the valve opens",
+            lambda seen: seen.rate[50],
+            log=True,
+            usual=(0.45, float("inf")),  # a valve that opens long before usual rates acts as friction
+        ),
+        ParameterSpec("ratio", "1", 0.0, 0.98, "slope beyond the knee over slope below it", lambda seen: 0.3),
+    ),
+    force=_blowoff,
+    shapes=lambda seen: grid(seen.rate_quantile([0.08, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 0.96, 0.99]), [0.3]),
+    absent=(100.0, 1.0),
+    looks_like="the damper is softer at high rates, with a knee; the force stays odd in the rate",
+    confused_with=("coulomb_friction", "quadratic_damping", "series_stiffness"),
+    sentence="the damper blows off beyond {knee}; its slope falls to {ratio} of the nominal one",
+    strength=1,
+)
+
+
+def _asymmetry(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (a,) = p
+    return a * element.damping * np.abs(motion.rate)  # c (1 + a) v for v > 0, c (1 - a) v for v < 0
+
+
+DAMPER_ASYMMETRY = ElementLaw(
+    name="damper_asymmetry",
+    title="damper asymmetry",
+    parameters=(ParameterSpec("a", "1", -0.99, 0.99, "positive: harder in extension", lambda seen: 0.1),),
+    force=_asymmetry,
+    shapes=lambda seen: grid([0.3]),
+    absent=(0.0,),
+    looks_like="even harmonics and a shift of the mean deflection that grows with the rate",
+    confused_with=("sensor_bias",),
+    sentence="the damper is harder in one direction, a = {a} (positive: extension)",
+    odd=False,
+)
+
+
+def _typical_quadratic(seen: Observed) -> float:
+    return 0.3 * seen.damping / max(seen.rate_rms, 1e-30)
+
+
+def _quadratic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (c2,) = p
+    return c2 * motion.rate * np.abs(motion.rate)
+
+
+QUADRATIC_DAMPING = ElementLaw(
+    name="quadratic_damping",
+    title="quadratic (orifice) damping",
+    parameters=(ParameterSpec("c2", "N s^2/m^2", 0.0, 1e12, "quadratic coefficient", _typical_quadratic),),
+    force=_quadratic,
+    shapes=lambda seen: grid([_typical_quadratic(seen)]),
+    absent=(0.0,),
+    looks_like="damping grows with the rate, smoothly",
+    confused_with=("damper_blowoff", "coulomb_friction"),
+    sentence="the damper has a force with the square of the rate, c2 = {c2}",
+)

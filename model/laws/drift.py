@@ -1,0 +1,66 @@
+"""Springs and dampers that change during the recording: warming, leaking, settling."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.laws.base import (
+    CLOCK_LEAD,
+    ElementLaw,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SpringDamper,
+    Values,
+    grid,
+)
+from sprung.model.signals import FloatArray
+
+_CHANGE = ParameterSpec("p", "1", -0.95, 20.0, "relative change that is reached in the end", lambda seen: 0.1)
+_TAU = ParameterSpec("tau", "s", 0.05, 1e6, "time constant of the change", lambda seen: seen.seconds / 3, log=True)
+
+
+def _progress(time: FloatArray, tau: FloatArray) -> FloatArray:
+    """Share of the change that is done, 0 at the start of the laws' clock."""
+    return -np.expm1(-np.asarray(time) / tau)
+
+
+def _stiffness(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    change, tau = p
+    return element.stiffness * change * _progress(motion.time, tau) * motion.deflection
+
+
+def _damping(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    change, tau = p
+    return element.damping * change * _progress(motion.time, tau) * motion.rate
+
+
+def _shapes(seen: Observed) -> FloatArray:
+    spans = np.array([0.03, 0.08, 0.2, 0.5, 1.5])
+    return grid([0.1], np.maximum(spans * (seen.seconds + CLOCK_LEAD), 0.1))
+
+
+TIME_VARYING_STIFFNESS = ElementLaw(
+    name="time_varying_stiffness",
+    title="stiffness that changes during the recording",
+    parameters=(_CHANGE, _TAU),
+    force=_stiffness,
+    shapes=_shapes,
+    absent=(0.0, 1.0),
+    looks_like="a residual in phase with the deflection that changes sign once over the recording",
+    confused_with=("time_varying_damping", "air_spring"),
+    sentence="the stiffness changes by {p} (share of its first value) with a time constant of {tau}",
+    passive=False,
+)
+
+TIME_VARYING_DAMPING = ElementLaw(
+    name="time_varying_damping",
+    title="damping that changes during the recording",
+    parameters=(_CHANGE, _TAU),
+    force=_damping,
+    shapes=_shapes,
+    absent=(0.0, 1.0),
+    looks_like="a residual in phase with the rate that changes sign once over the recording",
+    confused_with=("time_varying_stiffness",),
+    sentence="the damping changes by {p} (share of its first value) with a time constant of {tau}",
+)

@@ -1,0 +1,161 @@
+"""Elements with memory: damper with series stiffness (Maxwell), air spring (Zener), Bouc-Wen hysteresis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.signals import FloatArray
+
+# Of the Bouc-Wen law as it is commonly written, z' = v - beta (abs(v) abs(z)^(n-1) z + gamma v abs(z)^n)
+GAMMA = 0.5
+# Corner frequencies, Hz, at which a branch with a spring and a damper in series is sought
+_CORNERS = np.array([0.5, 1.2, 3.0, 6.0, 10.0, 16.0, 25.0, 40.0, 70.0])
+
+
+def _series_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (branch,) = motion.memory  # N, force of spring and damper in series
+    return branch - element.damping * motion.rate
+
+
+def _series_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (ks,) = p
+    (branch,) = motion.memory
+    return (ks * (motion.rate - branch / element.damping))[None]
+
+
+def _series_decay(p: Values, element: SpringDamper) -> FloatArray:
+    (ks,) = p
+    return np.asarray(ks / element.damping)[None]
+
+
+def _series_start(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    return np.asarray(element.damping * motion.rate)[None]  # the branch without its spring
+
+
+SERIES_STIFFNESS = ElementLaw(
+    name="series_stiffness",
+    title="series stiffness of the damper",
+    parameters=(
+        ParameterSpec(
+            "ks",
+            "N/m",
+            1e-6,
+            1e12,
+            "stiffness of the damper's bushings and oil",
+            lambda seen: seen.damping * 2 * np.pi * 10,
+            log=True,
+        ),
+    ),
+    force=_series_force,
+    shapes=lambda seen: grid(max(seen.damping, 1e-12) * 2 * np.pi * _CORNERS),
+    absent=(np.inf,),
+    looks_like="the damper acts like a spring at high frequencies: less damping, more stiffness there; linear",
+    confused_with=("air_spring", "sensor_lag", "damper_blowoff", "flexible_mode"),
+    sentence="the damper gives way through a stiffness of {ks} in series",
+    strength=None,
+    memory=1,
+    memory_rate=_series_rate,
+    memory_decay=_series_decay,
+    memory_start=_series_start,
+)
+
+
+def _air_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (branch,) = motion.memory
+    return branch
+
+
+def _air_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    stiffness, tau = p
+    (branch,) = motion.memory
+    return (stiffness * motion.rate - branch / tau)[None]
+
+
+def _air_decay(p: Values, element: SpringDamper) -> FloatArray:
+    _, tau = p
+    return np.asarray(1 / tau)[None]
+
+
+AIR_SPRING = ElementLaw(
+    name="air_spring",
+    title="air spring with a reservoir behind an orifice",
+    parameters=(
+        ParameterSpec(
+            "stiffness", "N/m", 0.0, 1e12, "gain of stiffness when no air flows", lambda s: 0.3 * s.stiffness
+        ),
+        ParameterSpec("tau", "s", 1e-4, 1e4, "time in which reservoir and bellows even out", lambda s: 0.1, log=True),
+    ),
+    force=_air_force,
+    shapes=lambda seen: grid([0.3 * seen.stiffness], 1 / (2 * np.pi * _CORNERS)),
+    absent=(0.0, 1.0),
+    looks_like="soft below and stiff above a frequency, with most damping between; linear",
+    confused_with=("series_stiffness", "time_varying_stiffness", "sensor_lag"),
+    sentence="an air spring: stiffer by {stiffness} above the exchange time of {tau}",
+    memory=1,
+    memory_rate=_air_rate,
+    memory_decay=_air_decay,
+)
+
+
+def _bouc_wen_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    alpha = p[0]
+    (z,) = motion.memory
+    return alpha * z
+
+
+def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    _, beta, n, *further = p
+    gamma = further[0] if further else GAMMA
+    (z,) = motion.memory
+    v, size = motion.rate, np.abs(z)
+    level = beta * size**n
+    return (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
+
+
+def _bouc_wen_shapes(seen: Observed) -> FloatArray:
+    n = np.array([1.0, 2.0])
+    yields = max(seen.deflection_rms, 1e-12) * np.array([0.03, 0.1, 0.3, 1.0])
+    trials = grid([0.2 * seen.stiffness], yields, n)
+    trials[:, 1] = 1 / (1.5 * trials[:, 1] ** trials[:, 2])  # beta at which z saturates at the yield deflection
+    return trials
+
+
+def _free_shapes(seen: Observed) -> FloatArray:
+    yields = max(seen.deflection_rms, 1e-12) * np.array([0.03, 0.1, 0.3, 1.0])
+    return grid([0.2 * seen.stiffness], 1 / (1.5 * yields), [1.0], [-1.4, -0.7, 0.0, 1.5])
+
+
+_BOUC_WEN = ElementLaw(
+    name="bouc_wen",
+    title="hysteresis (Bouc-Wen)",
+    parameters=(
+        ParameterSpec("alpha", "N/m", 0.0, 1e12, "stiffness of the hysteretic part", lambda s: 0.2 * s.stiffness),
+        ParameterSpec(
+            "beta", "m^-n", 1e-6, 1e18, "inverse of the yield deflection^n, times 2/3", lambda s: 0.0, log=True
+        ),
+        ParameterSpec("n", "1", 1.0, 8.0, "sharpness of the yielding", lambda seen: 1.0),
+    ),
+    force=_bouc_wen_force,
+    shapes=_bouc_wen_shapes,
+    absent=(0.0, 1.0, 1.0),
+    looks_like="stiff for small reversals, then slipping; a loop whose area depends on amplitude, not on rate",
+    confused_with=("coulomb_friction", "clearance", "series_stiffness"),
+    sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n})",
+    memory=1,
+    memory_rate=_bouc_wen_rate,
+)
+# The loop's shape free: gamma below -1 stiffens while it is loaded, above 1 it hardly yields while it is unloaded
+_FREE = ParameterSpec("gamma", "1", -4.0, 4.0, "in z' = v - beta (abs(v) z + gamma v abs(z))", lambda seen: GAMMA)
+BOUC_WEN = replace(
+    _BOUC_WEN,
+    wider=replace(
+        _BOUC_WEN,
+        parameters=(*_BOUC_WEN.parameters, _FREE),
+        shapes=_free_shapes,
+        absent=(*_BOUC_WEN.absent, GAMMA),
+        sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
+    ),
+)

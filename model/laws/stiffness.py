@@ -1,0 +1,77 @@
+"""Springs that are not linear: cubic, bump stop, clearance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.signals import FloatArray
+
+
+def _typical_cubic(seen: Observed) -> float:
+    return 0.1 * seen.stiffness / max(3 * seen.deflection_rms**2, 1e-30)
+
+
+def _cubic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (k3,) = p
+    return k3 * motion.deflection**3
+
+
+CUBIC_STIFFNESS = ElementLaw(
+    name="cubic_stiffness",
+    title="progressive (cubic) spring",
+    parameters=(ParameterSpec("k3", "N/m^3", -1e15, 1e15, "cubic coefficient; negative: softening", _typical_cubic),),
+    force=_cubic,
+    shapes=lambda seen: grid([_typical_cubic(seen)]),
+    absent=(0.0,),
+    looks_like="stiffness grows smoothly with amplitude; odd harmonics; no hysteresis",
+    confused_with=("bump_stop", "clearance"),
+    sentence="the spring stiffens with the cube of its deflection, k3 = {k3}",
+    passive=True,
+)
+
+
+def _bump_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    gap, stiffness = p
+    d = motion.deflection
+    return stiffness * (d - np.minimum(np.maximum(d, -gap), gap))  # = kb max(|d| - gap, 0) sign d
+
+
+BUMP_STOP = ElementLaw(
+    name="bump_stop",
+    title="bump stop",
+    parameters=(
+        ParameterSpec("gap", "m", 1e-7, 1.0, "free travel to each side", lambda seen: seen.deflection[90], log=True),
+        ParameterSpec("stiffness", "N/m", 0.0, 1e12, "stiffness beyond the gap", lambda seen: seen.stiffness),
+    ),
+    force=_bump_stop,
+    shapes=lambda seen: grid(
+        seen.deflection_quantile([0.35, 0.5, 0.65, 0.75, 0.83, 0.9, 0.95, 0.98, 0.995]), [seen.stiffness]
+    ),
+    absent=(1.0, 0.0),
+    looks_like="the error appears only in the largest deflections, to both sides, and is elastic",
+    confused_with=("cubic_stiffness", "clearance"),
+    sentence="a stop of {stiffness} is touched beyond {gap} of travel",
+    strength=1,
+)
+
+
+def _clearance(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    (gap,) = p
+    return -element.stiffness * np.minimum(np.maximum(motion.deflection, -gap), gap)
+
+
+CLEARANCE = ElementLaw(
+    name="clearance",
+    title="clearance (lost motion) of the spring",
+    parameters=(
+        ParameterSpec("gap", "m", 0.0, 1.0, "half of the lost motion", lambda seen: 0.3 * seen.deflection_rms),
+    ),
+    force=_clearance,
+    shapes=lambda seen: grid(seen.deflection_quantile([0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8])),
+    absent=(0.0,),
+    looks_like="no spring force around the middle, full stiffness beyond: the error is largest at small deflections",
+    confused_with=("coulomb_friction", "bump_stop", "cubic_stiffness"),
+    sentence="the spring has a clearance of {gap} to each side before it acts",
+    strength=None,
+)

@@ -1,0 +1,114 @@
+"""The force of a law along a motion that is already known: for screening, pictures and tests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper, Values
+from sprung.model.signals import FloatArray
+
+_SERIES = 0.5  # below this the recursion for phi loses digits and the power series takes over
+
+
+def phi(x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """phi_0 = exp, phi_1, phi_2, phi_3 of real numbers: phi_l(x) = x phi_{l+1}(x) + 1/l!."""
+    x = np.asarray(x, dtype=float)
+    small = np.abs(x) < _SERIES
+    safe = np.where(small, 1.0, x)
+    one = np.expm1(safe) / safe
+    two = (one - 1) / safe
+    three = (two - 0.5) / safe
+    series = np.zeros_like(x)
+    y = np.where(small, x, 0.0)
+    for k in range(14, -1, -1):
+        series = series * y + 1 / math.factorial(k + 3)
+    three = np.where(small, series, three)
+    two = np.where(small, y * series + 0.5, two)
+    one = np.where(small, y * two + 1, one)
+    return np.exp(x), one, two, three
+
+
+def along(
+    law: ElementLaw,
+    p: Values,
+    deflection: FloatArray,
+    rate: FloatArray,
+    *,
+    sample_rate: float,
+    element: SpringDamper,
+    start: float = CLOCK_LEAD,
+) -> FloatArray:
+    """Force that the law adds, N, along deflection and rate of shape (..., T).
+
+    Every entry of `p` and of `element` broadcasts with the leading axes: give p = (gaps[:, None], ...) for many
+    trials at once.  `start` is the laws' clock at the first sample.  Memories start as
+    the law says (`memory_start`).
+    """
+    T = np.shape(deflection)[-1]
+    time = start + np.arange(T) / sample_rate
+    memory = recall(law, p, deflection, rate, time=time, element=element) if law.memory else ()
+    return np.asarray(law.force(Motion(deflection, rate, time, memory), p, element))
+
+
+def recall(
+    law: ElementLaw, p: Values, deflection: FloatArray, rate: FloatArray, *, time: FloatArray, element: SpringDamper
+) -> FloatArray:
+    """The law's own states, shape (memory, ..., T): ETDRK4 (Cox and Matthews 2002), one step per sample.
+
+    Between samples the deflection is the cubic through its values and rates.
+    """
+    h = time[1] - time[0]
+    p = tuple(_column(value) for value in p)
+    element = SpringDamper(_column(element.stiffness), _column(element.damping))
+    shape = np.broadcast_shapes(np.shape(deflection)[:-1], *[np.shape(v) for v in (*p, *element)])
+    d = np.moveaxis(np.broadcast_to(deflection, (*shape, len(time))), -1, 0)
+    v = np.moveaxis(np.broadcast_to(rate, (*shape, len(time))), -1, 0)
+    d_half = 0.5 * (d[1:] + d[:-1]) + h / 8 * (v[:-1] - v[1:])
+    v_half = 1.5 / h * (d[1:] - d[:-1]) - 0.25 * (v[:-1] + v[1:])
+    step = MemoryStep(law, p, element, h)
+    path = np.zeros((len(time), law.memory, *shape))
+    path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element)
+    for i in range(len(time) - 1):
+        z = path[i]
+        t = float(time[i])
+        n0 = step.source(d[i], v[i], t, z)
+        a = step.half * z + step.q * n0
+        na = step.source(d_half[i], v_half[i], t + h / 2, a)
+        b = step.half * z + step.q * na
+        nb = step.source(d_half[i], v_half[i], t + h / 2, b)
+        c = step.half * a + step.q * (2 * nb - n0)
+        nc = step.source(d[i + 1], v[i + 1], t + h, c)
+        path[i + 1] = step.full * z + step.f1 * n0 + step.f2 * (na + nb) + step.f3 * nc
+    return np.moveaxis(path, 0, -1)
+
+
+class MemoryStep:
+    """Coefficients of ETDRK4 for z' = -decay z + source(z, motion) with step h."""
+
+    def __init__(self, law: ElementLaw, p: Values, element: SpringDamper, h: float) -> None:
+        self.law, self.p, self.element = law, p, element
+        self.decay: Any = law.memory_decay(p, element) if law.memory_decay else 0.0
+        self.full, one, two, three = phi(-np.asarray(self.decay) * h)
+        self.half, half_one, *_ = phi(-np.asarray(self.decay) * h / 2)
+        self.q = h / 2 * half_one
+        self.f1 = h * (one - 3 * two + 4 * three)
+        self.f2 = 2 * h * (two - 2 * three)
+        self.f3 = h * (4 * three - two)
+
+    def source(self, d: FloatArray, v: FloatArray, t: float | FloatArray, z: FloatArray) -> FloatArray:
+        return self.law.memory_rate(Motion(d, v, t, z), self.p, self.element) + self.decay * z
+
+
+def _column(value: Any) -> Any:
+    """A parameter that broadcasts with (..., T), without the axis of samples."""
+    array = np.asarray(value, dtype=float)
+    return array[..., 0] if array.ndim else array
+
+
+def parameter_columns(trials: FloatArray) -> Sequence[FloatArray]:
+    """Trials (S, P) as P columns (S, 1), ready for `along`."""
+    return [trials[:, i, None] for i in range(trials.shape[1])]

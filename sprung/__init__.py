@@ -1,0 +1,1 @@
+"""Sprung: condition of a train's springs and dampers from running recordings."""
