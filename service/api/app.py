@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from importlib.metadata import version
 
 from fastapi import FastAPI
 from fastapi.concurrency import run_in_threadpool
 
+from sprung import __version__
 from sprung.service.api import diagnose, docs, fleet, health, identify, problems, recordings
 from sprung.service.api.limits import BodyLimit
 from sprung.service.core import Core
@@ -37,7 +37,7 @@ def create_app(
 
     app = FastAPI(
         title="Sprung",
-        version=version("sprung"),
+        version=__version__,
         description=DESCRIPTION,
         lifespan=lifespan,
         docs_url=None,  # both load scripts from other hosts; `docs` draws a page of its own

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from sprung import __version__
 from sprung.service.threads import hand_over_often, one_thread_each
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ Vehicle = Annotated[
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"sprung {version('sprung')}")
+        typer.echo(f"sprung {__version__}")
         raise typer.Exit
 
 
