@@ -22,7 +22,7 @@ from sprung import model
 from sprung.benchmarks.concealed_score import Score, explained, rate, score, summary
 from sprung.benchmarks.generator import draw_cases, read_vehicle, write_set
 from sprung.benchmarks.generator.laws import LAWS
-from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.replay.record import load_record

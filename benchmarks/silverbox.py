@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy import optimize, signal
 
 from sprung.benchmarks.generator.laws import LAWS
-from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import System, load_system
 from sprung.replay.record import Record, load_record
 

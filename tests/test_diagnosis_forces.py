@@ -5,8 +5,8 @@ import pytest
 from diagnosis_cases import Recorded
 from scipy.signal import resample
 
+from sprung.model.diagnosis.fit.baseline import baseline, refreshed
 from sprung.model.diagnosis.fit.problem import Fit, Problem
-from sprung.model.diagnosis.investigation.diagnose import baseline, refreshed
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise, drifting, rate_of
 from sprung.model.diagnosis.record.spectra import Grid

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.diagnose import Options, baseline, diagnose
 from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.system import parse_system

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
-from sprung.model.diagnosis.investigation.diagnose import diagnose
+from sprung.model.diagnosis.api import diagnose
 from sprung.model.laws import CLOCK_LEAD, find_law
 from sprung.model.laws.sensor_faults import delayed
 from sprung.model.system import MANCHESTER, load_system

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from diagnosis_cases import DAMPING, STIFFNESS, Recorded, quarter_car, simulate
 
-from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 
 

@@ -48,7 +48,7 @@ def load(file: Path, system: System, dbc: Path | None) -> Record:
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
-    from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+    from sprung.model.diagnosis.api import Options, diagnose
 
     with stages(errors()) as show:
         return diagnose(system, record, Options(file=name), silent_stage if quiet else show)

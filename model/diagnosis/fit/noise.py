@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,14 +21,10 @@ from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.signals import FloatArray
 
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.problem import Fit, Problem
-
 _BLOCKS = 24
 _ROUNDS = 4
 _OWN = 0.01  # least share of a sensor's own noise in a bin that tells its level
 _LEAST = 0.01  # share of a force's noise power that one round may leave
-_REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
 
 
 def input_noise(part: Part, noise: Noise) -> Noise:
@@ -110,27 +105,3 @@ def _robust(blocks: FloatArray, counts: np.ndarray) -> float:
     spread = 1 / np.sqrt(np.mean(counts))
     base = min(middle, quiet * (1 + 2 * spread))
     return float(np.mean(blocks[blocks <= base * (1 + 4 * spread)]))
-
-
-def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
-    """Noise levels and whitening at a fit, and the fit again.
-
-    Sensors come after the forces: beside a force that is still taken for far too noisy, a sensor seems to have no
-    noise of its own, and then the force has to answer for that of the sensor.
-    """
-    settled = 0
-    for _ in range(_REFITS):
-        before = problem.noise
-        noise = force_noise(fit.forward, fit.spectrum, before)
-        if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
-            settled += 1
-            noise = sensor_noise(fit.forward, fit.spectrum, noise)
-        renewed = replace(problem, noise=noise, whitener=None, smoothed=None)
-        enough = settled == (2 if problem.follows else 1)
-        again = renewed.try_fit(fit.point, iterations=6 if enough else 2)
-        if again is None:
-            break
-        problem, fit = renewed, again
-        if enough:
-            break
-    return problem, fit

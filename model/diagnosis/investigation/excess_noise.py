@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from scipy import stats
 
+from sprung.model.diagnosis.investigation.course import Investigation, NoiseFault
 from sprung.model.diagnosis.record.signals import declared_noise
-from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.holdout import FreeRun
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.investigation.diagnose import Course
 
 _LEAST = 1.12  # ratio to its peers from which a noise level is a fault
 _SIGMAS = 6.0
@@ -20,50 +15,50 @@ _INACCURACY = 0.05  # of the power of what the findings changed
 _UPPER = 0.38  # of the sample rate
 
 
-def noise_faults(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
+def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple[NoiseFault, ...]:
     """Sensors and input channels that are noisier than their peers by more than chance.
 
     before, after: free runs without and with the findings.  What these have changed at a sensor they may have got
     wrong by a little; that much is no noise of the sensor.
     """
-    declared = declared_noise(course.system, course.prepared.signals)
-    noise = course.problem.noise
-    grid = course.problem.part.grid
+    declared = declared_noise(state.system, state.prepared.signals)
+    noise = state.problem.noise
+    grid = state.problem.part.grid
     count = grid.band.stop
-    findings = []
-    names = list(course.signals.sensor_names)
-    known = declared.sensors[np.isin(course.prepared.signals.sensor_index, course.signals.sensor_index)]
+    found: list[NoiseFault] = []
+    names = list(state.signals.sensor_names)
+    known = declared.sensors[np.isin(state.prepared.signals.sensor_index, state.signals.sensor_index)]
     inside = noise.sensors / known
     # what is left of physics is no noise: noise goes on above the band that is compared
-    white = upper_ratio(course, known) > 1 + 0.5 * (inside - 1)
+    white = upper_ratio(state, known) > 1 + 0.5 * (inside - 1)
     inaccuracy = _INACCURACY * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
-    findings += _outliers(names, inside, white, count)
-    pairs = course.problem.part.pairs
+    found += _outliers(names, inside, white, count)
+    pairs = state.problem.part.pairs
     if len(pairs):
-        supports = [course.signals.support_names[i] for i in pairs]
+        supports = [state.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
-        findings += _outliers([f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count)
-        findings += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count)
-    return findings
+        found += _outliers([f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count)
+        found += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count)
+    return tuple(found)
 
 
-def upper_ratio(course: Course, declared: np.ndarray) -> np.ndarray:
+def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     """Residual over declared noise above the compared band, up to where anti-alias filters cut, per sensor."""
-    grid, plant = course.problem.part.grid, course.fit.forward.plant
+    grid, plant = state.problem.part.grid, state.fit.forward.plant
     upper = slice(grid.band.stop, int(_UPPER * grid.samples))
     if upper.stop - upper.start < 20:
         return np.full(len(declared), np.inf)
-    variance = course.problem.noise.support_variance(grid.omega[upper])
+    variance = state.problem.noise.support_variance(grid.omega[upper])
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
-    power = np.mean(np.abs(course.fit.spectrum[upper]) ** 2, axis=0)
+    power = np.mean(np.abs(state.fit.spectrum[upper]) ** 2, axis=0)
     return np.sqrt(np.maximum(power - through, 0.0)) / declared
 
 
-def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: float) -> list[Finding]:
+def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: float) -> list[NoiseFault]:
     """Channels whose ratio of noise to declared noise leaves that of the others."""
-    findings = []
+    found = []
     for i, name in enumerate(names):
         peers = [j for j in range(len(names)) if j != i]
         if len(peers) < 2 or not white[i]:
@@ -71,16 +66,8 @@ def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: flo
         usual = float(np.median(ratio[peers]))
         relative = float(ratio[i]) / usual
         sigma = 1 / np.sqrt(2 * max(count, 2.0))
-        z = np.log(relative) / sigma
+        z = float(np.log(relative) / sigma)
         if relative > _LEAST and z > _SIGMAS:
-            findings.append(
-                Finding(
-                    location=name,
-                    effect="sensor_noise",
-                    parameters=(LawParameter("ratio", float(ratio[i]), float(ratio[i] * sigma), "1"),),
-                    p_value=float(min(1.0, len(names) * stats.norm.sf(z))),
-                    delta_bic=-float(z**2),
-                    sentence=f"{name}: {ratio[i]:.3g} times the noise declared, its peers {usual:.3g} times",
-                )
-            )
-    return findings
+            p_value = float(min(1.0, len(names) * stats.norm.sf(z)))
+            found.append(NoiseFault(name, float(ratio[i]), float(ratio[i] * sigma), usual, z, p_value))
+    return found

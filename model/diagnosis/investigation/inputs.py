@@ -1,32 +1,32 @@
-"""Faults of input channels: estimated from their witness, mended before anything else is judged."""
+"""Faults of input channels: estimated from a redundant measurement, compensated before anything else is judged."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.investigation.course import InputFault, Nominal
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.screen import Hit, Screening, screen
-from sprung.model.laws import SensorLaw
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.investigation.diagnose import Course
+from sprung.model.laws import Law, SensorLaw
+from sprung.model.system import System
 
 _ROUNDS = 3
+_RIVAL, _RIVALS = 0.3, 3  # share of the leader's score from which others are tried, and how many
+_DONE = 0.01  # score below which nothing of the fault is left
 
 
-@dataclass(frozen=True)
-class InputFault:
-    """A fault of an input channel and what it explains."""
-
-    term: Term
-    std: float
-    score: float
-    p_value: float
-    runner_up: tuple[str, float] | None
+def nominal(
+    system: System, signals: Signals, declared: Noise, split: int, laws: tuple[Law, ...], project: bool
+) -> Nominal:
+    """The nominal structure on the first `split` samples, and all candidates screened on its residual."""
+    problem, fit = baseline(system, signals, declared, split)
+    return Nominal(signals, problem, fit, screen(problem, fit, laws, project))
 
 
 def best_input_fault(screening: Screening, alpha: float) -> Hit | None:
@@ -38,42 +38,56 @@ def best_input_fault(screening: Screening, alpha: float) -> Hit | None:
     return top if top.family == "input" else None
 
 
-def input_faults_of(course: Course, hit: Hit, declared: Noise) -> tuple[InputFault | None, Signals]:
-    """Estimate the leading input fault by mending, screening again and mending the rest."""
-    from sprung.model.diagnosis.investigation.diagnose import baseline
-
-    rivals = [h for h in course.first.hits if h.family == "input" and h.term.key != hit.term.key]
+def compensate(
+    system: System, present: Nominal, hit: Hit, declared: Noise, project: bool
+) -> tuple[InputFault, Signals]:
+    """The leading input fault, chosen among its rivals and estimated, and the signals without it."""
+    rivals = [h for h in present.screening.hits if h.family == "input" and h.term.key != hit.term.key]
     rivals.sort(key=lambda h: -h.score)
-    candidates = [hit, *[h for h in rivals if h.score > 0.3 * hit.score][:3]]
-    best: tuple[float, InputFault, Signals] | None = None
-    for candidate in candidates:
-        signals, term, std = course.signals, candidate.term, 0.0
-        value = term.parameters[0]
-        for _ in range(_ROUNDS):
-            signals = mended(course.signals, term.at(np.array([value])))
-            problem, fit = baseline(course.system, signals, declared, course.split)
-            rest = screen(problem, fit, (term.law,), course.options.project)
-            again = next((h for h in rest.hits if h.term.key == term.key), None)
-            if again is None or again.score < 0.01:
-                break
-            change = again.term.parameters[0]
-            neutral = 1.0 if term.law.name == "sensor_gain" else 0.0
-            std = abs(change - neutral) / max(np.sqrt(again.score), 1e-12)
-            value = value * change if neutral else value + change
-        rho = problem.part.redundancy
-        band = problem.part.grid.band
-        omega = problem.part.grid.omega[band][1:, None]
-        level = course.noise.displacement**2 + (course.noise.velocity / omega) ** 2
-        witness = 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, problem.part.pairs])) if rho.size else 0.0
-        total = fit.chi_square + witness
-        fault = InputFault(term.at(np.array([value])), float(std), hit.score, course.first.p_value(hit), None)
-        if best is None or total < best[0]:
-            best = (total, fault, mended(course.signals, fault.term))
-    assert best is not None
-    return best[1], best[2]
+    candidates = [hit, *[h for h in rivals if h.score > _RIVAL * hit.score][:_RIVALS]]
+    tried = [_estimated(system, present, candidate.term, declared, project) for candidate in candidates]
+    _, term, std = min(tried, key=lambda one: one[0])
+    fault = InputFault(term, std, hit.score, present.screening.p_value(hit), None)
+    return fault, compensated(present.signals, term)
 
 
-def mended(signals: Signals, term: Term) -> Signals:
+def _estimated(
+    system: System, present: Nominal, term: Term, declared: Noise, project: bool
+) -> tuple[float, Term, float]:
+    """Estimate an input fault by compensating, screening again and compensating the rest.
+
+    Chi-square of sensors and redundant inputs without the fault, the fault, and its standard deviation.
+    """
+    value, std = term.parameters[0], 0.0
+    neutral = 1.0 if term.law.name == "sensor_gain" else 0.0
+    for _ in range(_ROUNDS):
+        signals = compensated(present.signals, term.at(np.array([value])))
+        rest = nominal(system, signals, declared, present.split, (term.law,), project)
+        again = _of_key(rest.screening.hits, term)
+        if again is None or again.score < _DONE:
+            break
+        change = again.term.parameters[0]
+        std = abs(change - neutral) / max(np.sqrt(again.score), 1e-12)
+        value = value * change if neutral else value + change
+    total = rest.fit.chi_square + _redundant(present.problem.noise, rest.problem)
+    return total, term.at(np.array([value])), float(std)
+
+
+def _of_key(hits: Iterable[Hit], term: Term) -> Hit | None:
+    return next((h for h in hits if h.term.key == term.key), None)
+
+
+def _redundant(noise: Noise, problem: Problem) -> float:
+    """Chi-square of the differences between inputs that are measured twice."""
+    rho, band = problem.part.redundancy, problem.part.grid.band
+    if not rho.size:
+        return 0.0
+    omega = problem.part.grid.omega[band][1:, None]
+    level = noise.displacement**2 + (noise.velocity / omega) ** 2
+    return 2 * float(np.sum(np.abs(rho[band][1:]) ** 2 / level[:, problem.part.pairs]))
+
+
+def compensated(signals: Signals, term: Term) -> Signals:
     """Signals with the fault of an input channel taken out."""
     assert isinstance(term.law, SensorLaw) and term.law.restore is not None
     if term.location in signals.force_names:

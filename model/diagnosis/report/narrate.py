@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.problem import Fit
-from sprung.model.diagnosis.investigation.excess_noise import noise_faults
+from sprung.model.diagnosis.investigation.course import (
+    Found,
+    InputFault,
+    Investigation,
+    NoiseFault,
+    Outcome,
+    Recorded,
+)
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
 from sprung.model.diagnosis.report.report import (
     Candidate,
@@ -27,9 +33,6 @@ from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.investigation.diagnose import Course, Found, Recorded
-
 _NAMING_MARGIN = 6.0  # evidence by which a law must beat its look-alikes to be named alone (odds of 20 to 1)
 _CHANGED = 0.25  # a parameter this far from nominal, and surely so, is listed as changed
 _STRANGE = 0.6  # nrmse of the final model from which the system file does not describe this recording
@@ -37,17 +40,17 @@ _NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stop
 _LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts as undecided
 
 
-def narrate(course: Course, record: Recorded) -> Report:
+def narrate(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
-    before, after = course.held.runs(course.base.point, course.fit.point)
+    course, before, after = outcome.investigation, outcome.before, outcome.after
     names = course.signals.sensor_names
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     floor = course.held.noise_rms(course.fit, course.problem.noise)
     floor_figures = realised_floor(floor / np.where(size > 0, size, 1.0), after)
     findings = [_input_finding(f) for f in course.input_faults]
-    findings += [_stuck_finding(course, name, at) for name, at in course.prepared.stuck]
-    findings += noise_faults(course, before, after)
-    findings += _physics(course, before, after)
+    findings += [_stuck_finding(name, at) for name, at in course.prepared.stuck]
+    findings += [_noise_finding(f) for f in outcome.noise_faults]
+    findings += _physics(outcome)
     findings.sort(key=lambda f: f.delta_bic)
     advice = [*course.prepared.notes, *course.notes, *_undecided(course)]
     verdict = _verdict(findings)
@@ -71,12 +74,12 @@ def narrate(course: Course, record: Recorded) -> Report:
         baseline=_parameters(course.system, course.base),
         baseline_validation=_figures(names, before.per_sensor),
         findings=tuple(findings),
-        augmented=_parameters(course.system, course.reported),
+        augmented=_parameters(course.system, outcome.final),
         augmented_validation=_figures(names, after.per_sensor),
         noise_floor=_figures(names, floor_figures),
         localization=course.first.localization(),
         candidates=_candidates(course),
-        changes=_changes(course),
+        changes=_changes(outcome),
         explained=explained,
         summary=_summary(verdict, findings, explained),
         advice=tuple(advice),
@@ -84,7 +87,7 @@ def narrate(course: Course, record: Recorded) -> Report:
     )
 
 
-def _blamed(course: Course) -> float:
+def _blamed(course: Investigation) -> float:
     """Forces that nobody measured, as the noise of the measured ones, over the inertia forces, rms over rms."""
     fit = course.fit
     structure = fit.forward.plant.structure
@@ -179,12 +182,12 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
     return covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
 
 
-def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
+def _physics(outcome: Outcome) -> list[Finding]:
     """Findings of the fitted terms, in the order in which they were found: by evidence."""
-    findings = []
+    course, findings = outcome.investigation, []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[index]
-        parameters, block = _law_parameters(course.reported, index)
+        parameters, block = _law_parameters(outcome.final, index)
         rival = found.runner_up
         family, advice = _look_alikes(found)
         finding = Finding(
@@ -199,7 +202,7 @@ def _physics(course: Course, before: FreeRun, after: FreeRun) -> list[Finding]:
             advice=advice,
             parameter_covariance=block,
         )
-        findings.append(replace(finding, sentence=_sentence(course, term, finding, before, after)))
+        findings.append(replace(finding, sentence=_sentence(outcome, term, finding)))
     return findings
 
 
@@ -237,7 +240,7 @@ def _value(parameter: LawParameter) -> str:
     return f"{parameter.value:.{min(digits, 6)}g} +- {parameter.std:.2g}{unit}"
 
 
-def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, after: FreeRun) -> str:
+def _sentence(outcome: Outcome, term: Term, finding: Finding) -> str:
     values = {p.name: _value(p) for p in finding.parameters}
     try:
         words = term.law.sentence.format(**values)
@@ -246,15 +249,15 @@ def _sentence(course: Course, term: Term, finding: Finding, before: FreeRun, aft
     if finding.family is not None:
         words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
-    bias = _worst_bias(course)
+    bias = _worst_bias(outcome)
     if bias is not None:
         sentence += f"; without it {bias}"
     return sentence
 
 
-def _worst_bias(course: Course) -> str | None:
+def _worst_bias(outcome: Outcome) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
-    final = course.reported
+    course, final = outcome.investigation, outcome.final
     sigma = _deviations(course.system, final)
     shift = course.base.point.theta - final.point.theta
     if not len(shift):
@@ -268,7 +271,7 @@ def _worst_bias(course: Course) -> str | None:
     return f"{course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"
 
 
-def _input_finding(fault) -> Finding:
+def _input_finding(fault: InputFault) -> Finding:
     spec = fault.term.law.parameters[0]
     parameter = LawParameter(spec.name, fault.term.parameters[0], fault.std, spec.unit)
     words = fault.term.law.sentence.format(**{spec.name: _value(parameter)})
@@ -283,7 +286,18 @@ def _input_finding(fault) -> Finding:
     )
 
 
-def _stuck_finding(course: Course, name: str, at: float) -> Finding:
+def _noise_finding(fault: NoiseFault) -> Finding:
+    return Finding(
+        location=fault.location,
+        effect="sensor_noise",
+        parameters=(LawParameter("ratio", fault.ratio, fault.std, "1"),),
+        p_value=fault.p_value,
+        delta_bic=-(fault.sigmas**2),
+        sentence=f"{fault.location}: {fault.ratio:.3g} times the noise declared, its peers {fault.usual:.3g} times",
+    )
+
+
+def _stuck_finding(name: str, at: float) -> Finding:
     return Finding(
         location=name,
         effect="sensor_stuck",
@@ -304,7 +318,7 @@ def _verdict(findings: list[Finding]) -> Verdict:
     return "unknown_physics" if physics[0].effect == UNKNOWN else "missing_physics"
 
 
-def _undecided(course: Course) -> list[str]:
+def _undecided(course: Investigation) -> list[str]:
     """What the recording is too short or too still to tell."""
     sigma = _deviations(course.system, course.base)
     loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > _LOOSE]
@@ -317,9 +331,9 @@ def _undecided(course: Course) -> list[str]:
     ]
 
 
-def _changes(course: Course) -> tuple[str, ...]:
+def _changes(outcome: Outcome) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
-    final = course.reported
+    course, final = outcome.investigation, outcome.final
     sigma, theta = _deviations(course.system, final), final.point.theta
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
@@ -330,7 +344,7 @@ def _changes(course: Course) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _candidates(course: Course) -> tuple[Candidate, ...]:
+def _candidates(course: Investigation) -> tuple[Candidate, ...]:
     rows: dict[tuple[str, str], Candidate] = {}
     for found in course.found:
         for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sprung.model.diagnosis.fit.problem import Fit
+from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.screen import Projector
 from sprung.model.diagnosis.selection.holdout import FreeRun
@@ -17,15 +18,12 @@ from sprung.model.laws.basis import StaticLaw
 from sprung.model.laws.spline import SurfaceLaw
 from sprung.model.signals import FloatArray
 
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.investigation.diagnose import Course
-
 _MOST = 4000  # samples of a scatter
 _BINS = 41
 
 
 def evidence_arrays(
-    course: Course, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
+    course: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
 ) -> dict[str, NDArray[Any]]:
     """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
     rate = course.signals.sample_rate
@@ -47,7 +45,7 @@ def evidence_arrays(
     return arrays
 
 
-def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]:
+def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArray[Any]]:
     """Motion of the element, the force that was missed before and after, and the law through it."""
     fit, grid = course.fit, course.problem.part.grid
     port = term.port(course.system)
@@ -91,7 +89,7 @@ def _of_element(course: Course, term: Term, key: str) -> dict[str, NDArray[Any]]
 
 
 def _surface(
-    course: Course, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
+    course: Investigation, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
 ) -> dict[str, NDArray[Any]]:
     """The unnamed force over deflection and rate, with the standard deviation that its weights have."""
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
@@ -109,7 +107,7 @@ def _surface(
     }
 
 
-def latent_force(course: Course, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
+def latent_force(course: Investigation, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
     """Force along a port that the residual of a fit asks for, N, (N,), and its standard deviation.
 
     Bin by bin with a flat prior cut where the sensors see nothing: f = (r^H R^-1 y) / (r^H R^-1 r + prior).

@@ -20,7 +20,7 @@ import numpy as np
 from scipy import stats
 
 from sprung.model.chunks import WORKERS, share
-from sprung.model.diagnosis.fit.noise import refreshed
+from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.problem import Fit, Problem
 from sprung.model.diagnosis.response.forward import BOTH
 from sprung.model.diagnosis.response.point import Point, advance

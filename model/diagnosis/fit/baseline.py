@@ -1,0 +1,56 @@
+"""The nominal structure identified on a recording, with noise levels estimated on the way."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.noise import force_noise, input_noise, sensor_noise
+from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.system import System
+
+_REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
+
+
+def baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
+    """The nominal structure on the first `split` samples, with noise levels estimated on the way."""
+    first = signals.part(0, split)
+    noise = input_noise(transform(first, declared), declared)
+    part = transform(first, noise, rated=drifting(system, signals.sensor_index))
+    problem = Problem(system, part, signals.sensor_index, noise)
+    n = 2 * system.mechanics.n
+    start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
+    if len(noise.force):
+        # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
+        lin = problem.linearise(start)
+        noise = force_noise(lin.forward, lin.spectrum, noise)
+        problem = replace(problem, noise=noise, whitener=None)
+    fit = problem.fit(start, iterations=12)
+    return refreshed(problem, fit)
+
+
+def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
+    """Noise levels and whitening at a fit, and the fit again.
+
+    Sensors come after the forces: beside a force that is still taken for far too noisy, a sensor seems to have no
+    noise of its own, and then the force has to answer for that of the sensor.
+    """
+    settled = 0
+    for _ in range(_REFITS):
+        before = problem.noise
+        noise = force_noise(fit.forward, fit.spectrum, before)
+        if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
+            settled += 1
+            noise = sensor_noise(fit.forward, fit.spectrum, noise)
+        renewed = replace(problem, noise=noise, whitener=None, smoothed=None)
+        enough = settled == (2 if problem.follows else 1)
+        again = renewed.try_fit(fit.point, iterations=6 if enough else 2)
+        if again is None:
+            break
+        problem, fit = renewed, again
+        if enough:
+            break
+    return problem, fit

@@ -1,0 +1,124 @@
+"""The state of an investigation as frozen values: what goes in, every step between two findings, what comes out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.record.channels import Prepared
+from sprung.model.diagnosis.record.signals import Noise, Signals
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.screen import Screening
+from sprung.model.diagnosis.selection.compete import Trial
+from sprung.model.diagnosis.selection.holdout import FreeRun, HeldOut
+from sprung.model.laws import CATALOGUE, Law
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+Progress = Callable[[float, str], None]  # share done, what comes next
+
+
+class Recorded(Protocol):
+    """What is needed of a recording; `replay.record.Record` has it."""
+
+    @property
+    def sample_rate(self) -> float: ...
+    @property
+    def values(self) -> FloatArray: ...
+    @property
+    def lost(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to diagnose.  The first three switch parts off, for measuring what each is worth."""
+
+    project: bool = True  # take out of every candidate what the nominal parameters can imitate
+    multiplicity: bool = True  # account for the number of candidates tried
+    held_out: bool = True  # accept a finding only if it improves the part that no fit saw
+    alpha: float = 1e-3  # chance of a false finding per recording before the held-out check
+    train_share: float = 0.7  # of the recording, from its start
+    most_findings: int = 4
+    file: str = ""  # name of the recording, for the report
+    catalogue: tuple[Law, ...] = CATALOGUE
+
+
+@dataclass(frozen=True)
+class InputFault:
+    """A fault of an input channel and what it explains."""
+
+    term: Term
+    std: float
+    score: float
+    p_value: float
+    runner_up: tuple[str, float] | None
+
+
+@dataclass(frozen=True)
+class NoiseFault:
+    """A channel that is noisier than its peers by more than chance."""
+
+    location: str
+    ratio: float  # noise over the noise declared
+    std: float  # of the ratio
+    usual: float  # the same ratio of its peers
+    sigmas: float  # by which the logarithm of the ratio leaves theirs
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """The nominal structure identified on the first part of the signals, and what its residual shows."""
+
+    signals: Signals  # with input faults known so far compensated
+    problem: Problem
+    fit: Fit
+    screening: Screening
+
+    @property
+    def split(self) -> int:
+        """How many samples were fitted."""
+        return self.problem.part.grid.samples
+
+
+@dataclass(frozen=True)
+class Found:
+    """One accepted finding with what it was chosen among."""
+
+    trial: Trial
+    trials: tuple[Trial, ...]  # that could have been chosen instead
+    runner_up: Trial | None  # the best with another law
+    p_value: float
+
+
+@dataclass(frozen=True)
+class Investigation:
+    """Everything known between two findings."""
+
+    system: System
+    options: Options
+    prepared: Prepared
+    declared: Noise  # of the signals, as the system file states it
+    signals: Signals  # with input faults compensated
+    problem: Problem
+    base: Fit  # the nominal structure
+    fit: Fit  # with the findings so far, on the first part; what is judged on the held-out part
+    held: HeldOut
+    first: Screening
+    last: Screening
+    found: tuple[Found, ...] = ()
+    input_faults: tuple[InputFault, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A finished investigation, with everything that the report is made from."""
+
+    investigation: Investigation
+    final: Fit  # the model on the whole recording, where that succeeds: its values are reported
+    before: FreeRun  # held-out part without the findings
+    after: FreeRun  # held-out part with the findings
+    noise_faults: tuple[NoiseFault, ...]
