@@ -16,11 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from sprung.model.schema import Body, ElementSensor, ForceInput, SupportInput, SystemFile
+from sprung.model.schema import Body, ElementSensor, ForceInput, SystemFile
 from sprung.model.signals import FloatArray, IntArray
 
 ACCELERATION, VELOCITY, DISPLACEMENT, DEFLECTION, FORCE = range(5)
 SENSOR_KINDS = ("acceleration", "velocity", "displacement", "deflection", "force")
+RATES = ("roll_rate", "pitch_rate")  # velocities of the degrees of freedom roll and pitch
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,14 +160,14 @@ def assemble(file: SystemFile) -> Mechanics:
             row[at + 1] = x - body.position[0]
         return row
 
-    supports = [name for name, source in file.inputs.items() if isinstance(source, SupportInput)]
+    supports = [name for name, source in file.inputs.items() if not isinstance(source, ForceInput)]
     forces = [name for name, source in file.inputs.items() if isinstance(source, ForceInput)]
     support_drive: list[int] = []
     force_drive: list[int] = []
     at = 0
     for source in file.inputs.values():
-        (support_drive if isinstance(source, SupportInput) else force_drive).append(at)
-        at += 2 if isinstance(source, SupportInput) else 1
+        (force_drive if isinstance(source, ForceInput) else support_drive).append(at)
+        at += 1 if isinstance(source, ForceInput) else 2
 
     H = np.zeros((len(file.elements), n))
     G = np.zeros((len(file.elements), len(supports)))
@@ -187,6 +188,8 @@ def assemble(file: SystemFile) -> Mechanics:
     for i, sensor in enumerate(file.sensors.values()):
         if isinstance(sensor, ElementSensor):
             L[i, elements.index(sensor.element)] = 1.0
+        elif sensor.kind in RATES:
+            S[i, dofs.index(f"{sensor.body}.{sensor.kind.removesuffix('_rate')}")] = 1.0
         else:
             S[i] = point(sensor.body, sensor.position)
     return Mechanics(
@@ -200,7 +203,9 @@ def assemble(file: SystemFile) -> Mechanics:
         F=F,
         S=S,
         L=L,
-        sensor_kind=np.array([SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]),
+        sensor_kind=np.array(
+            [VELOCITY if s.kind in RATES else SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]
+        ),
         support_drive=np.array(support_drive, dtype=np.int64),
         force_drive=np.array(force_drive, dtype=np.int64),
     )

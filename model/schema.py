@@ -1,26 +1,28 @@
-"""The system file: its format, and reading it with errors that name the key and the line.
+"""The system file: what it may say.
 
-A lumped mechanical system in YAML, SI units, x forward, y left, z up.  Format: docs/system-file.md.
+A lumped mechanical system in YAML, SI units, x forward, y left, z up.  Format: docs/system-file.md; reading it:
+`model.systemfile`.
 """
 
 from __future__ import annotations
 
 import difflib
-import re
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
+
+from sprung.model.address import Address, Strict, TimeKey
+from sprung.model.units import FACTORS, UnitError, known
 
 
 class SystemFileError(ValueError):
-    """The system file cannot be used; the message names the key, the line and what to do."""
+    """The system file cannot be used; `problems` has one line each, with key, line and what to do."""
 
-
-class Strict(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    def __init__(self, message: str, problems: tuple[str, ...] = ()) -> None:
+        super().__init__(message)
+        self.problems = problems or (message,)
 
 
 class Value(Strict):
@@ -34,18 +36,27 @@ def _as_value(raw: Any) -> Any:
     return {"value": raw} if isinstance(raw, (int, float)) and not isinstance(raw, bool) else raw
 
 
-Quantity = Annotated[Value, BeforeValidator(_as_value)]
+Quantity = Annotated[Value, BeforeValidator(_as_value, json_schema_input_type=float | Value)]
 Point = tuple[float, float]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
 
-class Address(Strict):
-    """Where recordings keep one signal, and the standard deviation of one sample."""
+class Load(Strict):
+    """A body whose mass varies from ride to ride; its inertias vary with it."""
 
-    mcap: str | None = Field(default=None, pattern=r"^/.+\..+$")
-    can: str | None = Field(default=None, pattern=r"^[^.]+\.[^.]+$")
-    csv: str | None = None
-    noise: float = Field(default=0.0, ge=0)
+    min: float | None = None  # kg beside the nominal mass
+    max: float | None = None  # kg
+    pressure: Address | None = None  # of the air springs, Pa
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Load:
+        if self.min is not None and self.max is not None and self.min >= self.max:
+            raise ValueError("min must be less than max")
+        return self
+
+
+def _as_load(raw: Any) -> Any:
+    return {True: {}, False: None}[raw] if isinstance(raw, bool) else raw
 
 
 class Body(Strict):
@@ -55,6 +66,7 @@ class Body(Strict):
     roll_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     pitch_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     position: Point = (0.0, 0.0)  # m
+    load: Annotated[Load | None, BeforeValidator(_as_load, json_schema_input_type=bool | Load | None)] = None
 
     @model_validator(mode="after")
     def _has_mass(self) -> Body:
@@ -64,11 +76,36 @@ class Body(Strict):
 
 
 class SupportInput(Strict):
-    """A measured moving support."""
+    """A measured moving support, by any of its displacement, velocity and acceleration."""
 
-    kind: Literal["displacement"]
-    displacement: Address  # m
+    kind: Literal["displacement", "support"]
+    displacement: Address | None = None  # m
     velocity: Address | None = None  # m/s
+    acceleration: Address | None = None  # m/s^2
+
+    @model_validator(mode="after")
+    def _is_measured(self) -> SupportInput:
+        if not self.measured:
+            raise ValueError("give at least one of displacement, velocity, acceleration (or kind: track)")
+        return self
+
+    @property
+    def measured(self) -> dict[str, Address]:
+        """The measured quantities, in the order of their channels."""
+        signals = {
+            "displacement": self.displacement,
+            "velocity": self.velocity,
+            "acceleration": self.acceleration,
+        }
+        return {quantity: address for quantity, address in signals.items() if address is not None}
+
+
+class TrackInput(Strict):
+    """A support that nobody measures: a wheel on one of the rails, which the wheels before it have seen."""
+
+    kind: Literal["track"]
+    rail: Literal["left", "right"]
+    position: Point  # m, of the wheel
 
 
 class ForceInput(Address):
@@ -79,7 +116,7 @@ class ForceInput(Address):
     position: Point | None = None
 
 
-Input = Annotated[SupportInput | ForceInput, Field(discriminator="kind")]
+Input = Annotated[SupportInput | TrackInput | ForceInput, Field(discriminator="kind")]
 
 
 class Element(Strict):
@@ -93,7 +130,9 @@ class Element(Strict):
 
 
 class MotionSensor(Address):
-    kind: Literal["acceleration", "velocity", "displacement"]
+    """Vertical motion of a point of a body, or the rate (rad/s) at which the body rolls or pitches."""
+
+    kind: Literal["acceleration", "velocity", "displacement", "roll_rate", "pitch_rate"]
     body: str
     position: Point | None = None
 
@@ -109,6 +148,16 @@ Sensor = Annotated[MotionSensor | ElementSensor, Field(discriminator="kind")]
 EstimatedQuantity = Literal["stiffness", "damping", "mass"]
 
 
+class Speed(Address):
+    """The vehicle's speed: measured, or constant."""
+
+    value: float | None = Field(default=None, gt=0)  # m/s
+
+
+def _as_speed(raw: Any) -> Any:
+    return {"value": raw} if isinstance(raw, (int, float)) and not isinstance(raw, bool) else raw
+
+
 class SystemFile(Strict):
     """Everything a system file says, with references between its parts checked."""
 
@@ -116,7 +165,9 @@ class SystemFile(Strict):
     sample_rate: float = Field(gt=0)  # Hz
     window: int = Field(ge=8)  # samples, the paper's tau
     hop: int | None = Field(default=None, ge=1)  # samples between window starts; default half a window
-    bodies: dict[Name, Body] = Field(min_length=1)
+    time: TimeKey = TimeKey()
+    speed: Annotated[Speed | None, BeforeValidator(_as_speed, json_schema_input_type=float | Speed | None)] = None
+    bodies: dict[Name, Body] = Field(default_factory=dict)
     inputs: dict[Name, Input] = Field(default_factory=dict)
     elements: dict[Name, Element] = Field(default_factory=dict)
     sensors: dict[Name, Sensor] = Field(min_length=1)
@@ -124,153 +175,141 @@ class SystemFile(Strict):
 
     @model_validator(mode="after")
     def _references_exist(self) -> SystemFile:
-        ends = {*self.bodies, "ground", *(n for n, i in self.inputs.items() if i.kind == "displacement")}
-        for name, element in self.elements.items():
-            for side in ("upper", "lower"):
-                _require(getattr(element, side), ends, f"elements.{name}.{side}", "a body, a support or ground")
-            if element.upper == element.lower:
-                raise ValueError(f"elements.{name}.lower: both ends are {element.upper!r}")
-            if element.upper not in self.bodies and element.lower not in self.bodies:
-                raise ValueError(f"elements.{name}.upper: neither end is a body, so the element moves nothing")
-            for quantity in ("stiffness", "damping"):
-                value = getattr(element, quantity)
-                if quantity in self.estimate and not value.fixed and value.value == 0:
-                    raise ValueError(
-                        f"elements.{name}.{quantity}: a nominal value of 0 cannot be estimated; "
-                        "give a rough positive value or {value: 0.0, fixed: true}"
-                    )
-        for name, source in self.inputs.items():
-            if isinstance(source, ForceInput):
-                _require(source.body, set(self.bodies), f"inputs.{name}.body", "a body")
-        for name, sensor in self.sensors.items():
-            if isinstance(sensor, MotionSensor):
-                _require(sensor.body, set(self.bodies), f"sensors.{name}.body", "a body")
-            else:
-                _require(sensor.element, set(self.elements), f"sensors.{name}.element", "an element")
-        if "ground" in self.bodies or "ground" in self.inputs:
-            raise ValueError("bodies.ground: the name ground is reserved for the fixed support")
-        for name in set(self.inputs) & set(self.sensors):
-            raise ValueError(f"sensors.{name}: an input has this name already")
+        problems = list(Parts.of(self).problems())
         if len(set(self.estimate)) != len(self.estimate):
-            raise ValueError("estimate: a quantity is listed twice")
+            problems.append("estimate: a quantity is listed twice")
         if self.hop is not None and self.hop > self.window:
-            raise ValueError(f"hop: {self.hop} samples is longer than the window of {self.window}")
+            problems.append(f"hop: {self.hop} samples is longer than the window of {self.window}")
+        if problems:
+            raise ValueError("\n".join(problems))
         return self
 
 
-def _require(name: str, known: set[str], key: str, what: str) -> None:
-    if name not in known:
-        near = difflib.get_close_matches(name, known, n=1)
+SI = {
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "mass": "kg",
+    "acceleration": "m/s^2",
+    "velocity": "m/s",
+    "displacement": "m",
+    "deflection": "m",
+    "force": "N",
+    "roll_rate": "rad/s",
+    "pitch_rate": "rad/s",
+    "pressure": "Pa",
+    "speed": "m/s",
+}
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The parts of a system file whose references are checked; None: the part itself is wrong, only its name counts."""
+
+    bodies: Mapping[str, Body | None]
+    inputs: Mapping[str, SupportInput | TrackInput | ForceInput | None]
+    elements: Mapping[str, Element | None]
+    sensors: Mapping[str, MotionSensor | ElementSensor | None]
+    time: TimeKey | None
+    speed: Speed | None
+    estimate: Collection[str]
+
+    @staticmethod
+    def of(file: SystemFile) -> Parts:
+        """Those of a file."""
+        return Parts(file.bodies, file.inputs, file.elements, file.sensors, file.time, file.speed, file.estimate)
+
+    def problems(self) -> Iterator[str]:
+        """Each as `key: what is wrong`."""
+        yield from self._names()
+        yield from self._elements()
+        for name, source in self.inputs.items():
+            if isinstance(source, ForceInput):
+                yield from _missing(source.body, self.bodies, f"inputs.{name}.body", "a body")
+        for name, sensor in self.sensors.items():
+            if isinstance(sensor, ElementSensor):
+                yield from _missing(sensor.element, self.elements, f"sensors.{name}.element", "an element")
+            elif sensor is not None:
+                yield from _missing(sensor.body, self.bodies, f"sensors.{name}.body", "a body")
+                yield from self._turns(name, sensor)
+        yield from self._units()
+
+    def _names(self) -> Iterator[str]:
+        for group, members in (("bodies", self.bodies), ("inputs", self.inputs)):
+            if "ground" in members:
+                yield f"{group}.ground: the name ground is reserved for the fixed support"
+        for name in self.inputs:
+            if name in self.bodies:
+                yield f"inputs.{name}: a body has this name already"
+            if name in self.sensors:
+                yield f"sensors.{name}: an input has this name already"
+
+    def _elements(self) -> Iterator[str]:
+        supports = {name for name, source in self.inputs.items() if not isinstance(source, ForceInput)}
+        tested = {s.element for s in self.sensors.values() if isinstance(s, ElementSensor) and s.kind == "force"}
+        for name, element in self.elements.items():
+            if element is None:
+                continue
+            for side in ("upper", "lower"):
+                end = getattr(element, side)
+                yield from _missing(
+                    end, {*self.bodies, *supports, "ground"}, f"elements.{name}.{side}", "a body, a support or ground"
+                )
+            if element.upper == element.lower:
+                yield f"elements.{name}.lower: both ends are {element.upper!r}"
+            elif {element.upper, element.lower} <= {*supports, "ground"} - self.bodies.keys() and name not in tested:
+                yield (
+                    f"elements.{name}.upper: neither end is a body, so the element moves nothing; "
+                    "with a force sensor on it, it is a component test"
+                )
+            for quantity in ("stiffness", "damping"):
+                value = getattr(element, quantity)
+                if quantity in self.estimate and not value.fixed and value.value == 0:
+                    yield (
+                        f"elements.{name}.{quantity}: a nominal value of 0 cannot be estimated; "
+                        "give a rough positive value or {value: 0.0, fixed: true}"
+                    )
+
+    def _turns(self, name: str, sensor: MotionSensor) -> Iterator[str]:
+        """A rate sensor needs a body that turns about its axis."""
+        axis = sensor.kind.removesuffix("_rate")
+        body = self.bodies.get(sensor.body)
+        if axis in ("roll", "pitch") and body is not None and getattr(body, f"{axis}_inertia") is None:
+            yield f"sensors.{name}.body: {sensor.body} has no {axis}_inertia, so it does not {axis}"
+
+    def addresses(self) -> Iterator[tuple[str, str, Address]]:
+        """Key, quantity and address of every signal."""
+        for name, source in self.inputs.items():
+            if isinstance(source, SupportInput):
+                for quantity, address in source.measured.items():
+                    yield f"inputs.{name}.{quantity}", quantity, address
+            elif isinstance(source, ForceInput):
+                yield f"inputs.{name}", "force", source
+        for name, sensor in self.sensors.items():
+            if sensor is not None:
+                yield f"sensors.{name}", sensor.kind, sensor
+        for name, body in self.bodies.items():
+            if body is not None and body.load is not None and body.load.pressure is not None:
+                yield f"bodies.{name}.load.pressure", "pressure", body.load.pressure
+        if self.speed is not None:
+            yield "speed", "speed", self.speed
+
+    def _units(self) -> Iterator[str]:
+        for key, quantity, address in self.addresses():
+            try:
+                address.conversion(SI[quantity])
+            except UnitError as error:
+                yield f"{key}.unit: {error}"
+            if address.scale == 0:
+                yield f"{key}.scale: 0 would make every value the same"
+        unit = None if self.time is None else self.time.unit
+        if unit is not None and known(unit, "s") not in FACTORS["s"]:
+            yield f"time.unit: {unit!r} is no unit of time; known are s, ms, us, ns, min, h, d"
+        if self.time is not None and self.time.rate is not None and self.time.column is not None:
+            yield "time.rate: a table with a time column has its rate from there; give column or rate"
+
+
+def _missing(name: str, names: Collection[str], key: str, what: str) -> Iterator[str]:
+    if name not in names:
+        near = difflib.get_close_matches(name, names, n=1)
         hint = f"; did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"{key}: {name!r} is not {what}{hint}")
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML 1.2 floats (1e-5 is a number) and no silently repeated keys."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)$"),
-    list("-+0123456789."),
-)
-
-
-def _unique_mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
-    seen: set[Any] = set()
-    for key, _ in node.value:
-        if key.value in seen:
-            raise SystemFileError(f"line {key.start_mark.line + 1}: {key.value}: this key occurs twice")
-        seen.add(key.value)
-    return dict(loader.construct_pairs(node, deep=True))
-
-
-_Loader.add_constructor("tag:yaml.org,2002:map", _unique_mapping)
-
-
-def read_system_file(path: str | Path) -> SystemFile:
-    """Read and check a system file.
-
-    Errors: `SystemFileError`, one line: file, line, key, what is wrong.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise SystemFileError(f"{path}: cannot read the system file: {reason}") from None
-    return parse_system_file(text, str(path))
-
-
-def parse_system_file(text: str, source: str = "system file") -> SystemFile:
-    """Check the text of a system file; `source` names it in errors."""
-    try:
-        loader = _Loader(text)
-        try:
-            node = loader.get_single_node()
-            raw = loader.construct_document(node) if node is not None else None
-        finally:
-            loader.dispose()
-    except SystemFileError as error:
-        raise SystemFileError(f"{source}: {error}") from None
-    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
-        problem = " ".join(str(error).split())
-        raise SystemFileError(f"{source}: not YAML: {problem[:200]}") from None
-    if not isinstance(raw, Mapping):
-        raise SystemFileError(f"{source}: a mapping with name, bodies, elements, sensors is expected")
-    try:
-        return SystemFile.model_validate(raw)
-    except ValidationError as error:
-        raise SystemFileError(f"{source}: {_explain(error, node)}") from None
-
-
-def _explain(error: ValidationError, node: yaml.Node | None) -> str:
-    """The first problem as `line N: key: message`."""
-    first = error.errors()[0]
-    location = [str(part) for part in first["loc"]]
-    message = first["msg"].removeprefix("Value error, ")
-    keys = _existing_keys(node, location)
-    if first["type"] == "value_error" and ":" in message and not location:
-        key, message = message.split(": ", 1)
-        location = key.split(".")
-        keys = location
-    if first["type"] == "model_type":
-        message = "a number or a mapping is expected"
-    elif first["type"] == "extra_forbidden":
-        message = "unknown key"
-    elif first["type"] == "missing":
-        message = "this key is missing"
-        keys = [*keys, str(first["loc"][-1])]
-    line = _line_of(node, keys)
-    return f"line {line}: {'.'.join(keys)}: {message}"
-
-
-def _existing_keys(node: yaml.Node | None, location: list[str]) -> list[str]:
-    """Drop the parts of a pydantic location (union tags, validators) that are not keys of the file."""
-    keys: list[str] = []
-    for part in location:
-        child = _child(node, part)
-        if child is None:
-            continue
-        keys.append(part)
-        node = child[1]
-    return keys
-
-
-def _child(node: yaml.Node | None, key: str) -> tuple[yaml.Node, yaml.Node] | None:
-    if isinstance(node, yaml.MappingNode):
-        for name, value in node.value:
-            if name.value == key:
-                return name, value
-    if isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
-        return node.value[int(key)], node.value[int(key)]
-    return None
-
-
-def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
-    line = node.start_mark.line if node is not None else 0
-    for key in keys:
-        child = _child(node, key)
-        if child is None:
-            break
-        line, node = child[0].start_mark.line, child[1]
-    return line + 1
+        yield f"{key}: {name!r} is not {what}{hint}"

@@ -31,6 +31,24 @@ class Channel:
     mcap: str | None = None  # "/topic.field"
     can: str | None = None  # "Message.Signal"
     csv: str | None = None  # "column"
+    column: str | None = None  # column or variable of any tabular file
+    gain: float = 1.0  # value in `unit` = gain * recorded + offset
+    offset: float = 0.0
+
+    @property
+    def table(self) -> str | None:
+        """Its column in tables."""
+        return self.column or self.csv
+
+
+@dataclass(frozen=True, slots=True)
+class TimeColumn:
+    """Where tables keep the time and what it counts; None: to be found out from the file."""
+
+    name: str | None = None
+    seconds: float | None = None  # one unit of it, s
+    epoch: int | None = None  # ns since the Unix epoch at which it is 0
+    rate: float | None = None  # samples per second of a table without times
 
 
 @dataclass(frozen=True, slots=True)

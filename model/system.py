@@ -11,38 +11,21 @@ from pathlib import Path
 import numpy as np
 
 from sprung.model.mechanics import Mechanics, assemble
-from sprung.model.schema import (
-    Address,
-    ForceInput,
-    SupportInput,
-    SystemFile,
-    SystemFileError,
-    parse_system_file,
-    read_system_file,
-)
-from sprung.model.signals import Channel, FloatArray
+from sprung.model.schema import SI, Address, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
+from sprung.model.signals import Channel, FloatArray, TimeColumn
+from sprung.model.systemfile import parse_system_file, read_system_file
 
 BUNDLED = Path(__file__).parent / "systems"
 MANCHESTER = BUNDLED / "manchester.yaml"
 MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
-_UNITS = {
-    "stiffness": "N/m",
-    "damping": "N s/m",
-    "mass": "kg",
-    "acceleration": "m/s^2",
-    "velocity": "m/s",
-    "displacement": "m",
-    "deflection": "m",
-    "force": "N",
-}
-
-
-_USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0}
+_USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
+_WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit")  # an address without its noise
 
 
 def _channel(name: str, quantity: str, at: Address) -> Channel:
-    return Channel(name, _UNITS[quantity], at.noise, at.mcap, at.can, at.csv)
+    gain, offset = at.conversion(SI[quantity])
+    return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,15 +83,13 @@ class System:
 
     @cached_property
     def inputs(self) -> tuple[Channel, ...]:
-        """Measured input signals, in the order of the file, displacement before velocity."""
+        """Measured input signals, in the order of the file; a support's displacement, velocity, acceleration."""
         channels = []
         for name, source in self.file.inputs.items():
             if isinstance(source, ForceInput):
                 channels.append(_channel(name, "force", source))
-                continue
-            channels.append(_channel(f"{name}.displacement", "displacement", source.displacement))
-            if source.velocity is not None:
-                channels.append(_channel(f"{name}.velocity", "velocity", source.velocity))
+            elif isinstance(source, SupportInput):
+                channels += [_channel(f"{name}.{q}", q, address) for q, address in source.measured.items()]
         return tuple(channels)
 
     @cached_property
@@ -118,16 +99,32 @@ class System:
         return (*self.inputs, *sensors)
 
     @cached_property
+    def auxiliary(self) -> tuple[Channel, ...]:
+        """Measured signals that say how the vehicle runs: `speed`, and `BODY.pressure` of loads."""
+        speed = self.file.speed
+        channels = [] if speed is None or speed.value is not None else [_channel("speed", "speed", speed)]
+        for name, body in self.file.bodies.items():
+            if body.load is not None and body.load.pressure is not None:
+                channels.append(_channel(f"{name}.pressure", "pressure", body.load.pressure))
+        return tuple(channels)
+
+    @cached_property
+    def time(self) -> TimeColumn:
+        """Where tables keep the time."""
+        return self.file.time.as_column()
+
+    @cached_property
     def drive_channels(self) -> tuple[int | None, ...]:
-        """For each entry of the drive vector u its column in a window; None: a support's unmeasured velocity."""
+        """For each entry of the drive vector u (a support's displacement and velocity, a force) its column in a
+        window; None: not measured."""
         columns: list[int | None] = []
         at = 0
         for source in self.file.inputs.values():
-            columns.append(at)
-            at += 1
-            if isinstance(source, SupportInput):
-                columns.append(at if source.velocity is not None else None)
-                at += source.velocity is not None
+            measured = {"force": source} if isinstance(source, ForceInput) else getattr(source, "measured", {})
+            column = {quantity: at + i for i, quantity in enumerate(measured)}
+            at += len(column)
+            wanted = ("force",) if isinstance(source, ForceInput) else ("displacement", "velocity")
+            columns += [column.get(quantity) for quantity in wanted]
         return tuple(columns)
 
     @cached_property
@@ -138,7 +135,7 @@ class System:
                 for name, element in self.file.elements.items():
                     value = getattr(element, quantity)
                     if not value.fixed:
-                        found.append(Parameter(f"{name}.{quantity}", name, quantity, _UNITS[quantity], value.value))
+                        found.append(Parameter(f"{name}.{quantity}", name, quantity, SI[quantity], value.value))
         if "mass" in self.file.estimate:
             for name, body in self.file.bodies.items():
                 if not body.mass.fixed:
@@ -159,13 +156,21 @@ class System:
     @cached_property
     def digest(self) -> str:
         """Hash of everything that the mechanics depends on; addresses and comments do not count."""
-        keep = self.file.model_dump(mode="json")
-        for group in ("inputs", "sensors"):
-            for signal in keep[group].values():
-                for part in (signal, signal.get("displacement") or {}, signal.get("velocity") or {}):
-                    for address in ("mcap", "can", "csv"):
-                        part.pop(address, None)
-        keep.pop("hop")
+        keep = self.file.model_dump(mode="json", exclude={"hop", "time"})
+        signals = [*keep["inputs"].values(), *keep["sensors"].values()]
+        signals += [keep["speed"] or {}, *((body["load"] or {}) for body in keep["bodies"].values())]
+        signals += [part for signal in signals for part in signal.values() if isinstance(part, dict)]
+        for signal in signals:
+            for key in _WHERE:
+                signal.pop(key, None)
+        for source in keep["inputs"].values():
+            if source["kind"] == "support":
+                source["kind"] = "displacement"
+        added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
+        added += [(body, "load") for body in keep["bodies"].values()]
+        for part, key in [*added, (keep, "speed")]:
+            if part.get(key) is None:
+                part.pop(key, None)
         return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -184,7 +189,11 @@ def parse_system(text: str, source: str = "system file") -> System:
 
 
 def checked(system: System, source: str) -> System:
-    """Refuse a system whose sensors miss a whole mode: its parameters could not be told from any record."""
+    """Refuse a system that the model cannot treat yet, and one whose sensors miss a whole mode: its parameters could
+    not be told from any record."""
+    refused = unsupported(system.file)
+    if refused:
+        raise SystemFileError(f"{source}: {'; '.join(refused)}", tuple(f"{source}: {line}" for line in refused))
     if not system.parameters:
         return system
     hidden = system.mechanics.unobservable_mode(system.bodies)
@@ -194,3 +203,23 @@ def checked(system: System, source: str) -> System:
             f"add a sensor on {hidden.body} (or on an element attached to it)"
         )
     return system
+
+
+def unsupported(file: SystemFile) -> list[str]:
+    """What the format can say and identification cannot use yet, one line each."""
+    found = []
+    if not file.bodies:
+        found.append("bodies: a component test without bodies is not supported by identification yet")
+    for name, source in file.inputs.items():
+        if isinstance(source, TrackInput):
+            found.append(f"inputs.{name}: kind track is not supported by identification yet")
+        elif isinstance(source, SupportInput) and source.displacement is None:
+            found.append(f"inputs.{name}: a support without displacement is not supported by identification yet")
+        elif isinstance(source, SupportInput) and source.acceleration is not None:
+            found.append(f"inputs.{name}.acceleration: not supported by identification yet; leave it out")
+    for name, body in file.bodies.items():
+        if body.load is not None:
+            found.append(f"bodies.{name}.load: a varying load is not supported by identification yet")
+    if file.speed is not None and file.speed.value is None:
+        found.append("speed: a measured speed is not supported by identification yet; give a number in m/s")
+    return found

@@ -38,7 +38,7 @@ def _columns(path: Path, names: list[str], channels: Sequence[Channel]) -> list[
     """(channel, column) of every channel that the table has; raises when it has none or no time."""
     if TIME not in names:
         raise UnreadableRecording(f"{path}: no column {TIME!r} (seconds); its columns: {_some(names)}")
-    named = [(place, channel.csv) for place, channel in enumerate(channels) if channel.csv]
+    named = [(place, name) for place, channel in enumerate(channels) if (name := channel.csv or channel.column)]
     if not named:
         raise UnreadableRecording(
             "the system file names no CSV column; give its channels `csv: column` to read CSV recordings"

@@ -15,6 +15,7 @@ from cantools.database import Database
 from sprung.model.signals import Channel, SampleBlock, Tally
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candecode import CanDecoder
+from sprung.replay.convert import converter
 from sprung.replay.frames import EXTENDED, FrameBlock
 from sprung.replay.recording import CAN_READERS
 
@@ -53,6 +54,7 @@ class LiveBus:
         self.connected = False
         self.reconnects = 0
         self._decoder = CanDecoder(channels, dbc)
+        self._convert = converter(channels)
         self._latency = latency
         self._open = lambda: open_bus(interface=interface, channel=channel, **options)
 
@@ -75,7 +77,7 @@ class LiveBus:
                     self.connected = True
                     for messages in self._receive(bus):
                         retry = FIRST_RETRY
-                        block = self._decoder.decode(frame_block(messages, self.account), self.account)
+                        block = self._convert(self._decoder.decode(frame_block(messages, self.account), self.account))
                         if len(block.time):
                             yield block
             except BUS_ERRORS as error:

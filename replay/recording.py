@@ -12,6 +12,7 @@ from sprung.model.signals import Channel, SampleBlock, Tally
 from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candecode import CanDecoder
+from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
 
 FrameReader = Callable[[Path, Account], Iterator[FrameBlock]]
@@ -37,13 +38,14 @@ class Recording:
         self.account = account
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
         self._source = source
+        self._convert = converter(channels)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """Blocks in file order; raises UnreadableRecording when none of the channels is in the file."""
         for block in self._source:
             if len(block.time):
                 self.seen[block.channel[~np.isnan(block.value)]] = True
-                yield block
+                yield self._convert(block)
         if not self.seen.any():
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():

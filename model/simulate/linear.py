@@ -271,7 +271,7 @@ def knot_columns(system: System) -> tuple[list[int], list[int | None]]:
         value = columns[at]
         assert value is not None
         values.append(value)
-        support = source.kind == "displacement"
+        support = source.kind != "force"
         slopes.append(columns[at + 1] if support else None)
         at += 2 if support else 1
     return values, slopes
@@ -311,7 +311,7 @@ def _knot_of(system: System, drive: int) -> int:
     for i, source in enumerate(system.file.inputs.values()):
         if at == drive:
             return 2 * i
-        at += 2 if source.kind == "displacement" else 1
+        at += 1 if source.kind == "force" else 2
     raise AssertionError(drive)
 
 

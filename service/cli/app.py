@@ -163,11 +163,14 @@ def diagnose(
 def system(
     file: Annotated[Path | None, typer.Argument(help="System file; default: the Manchester vehicle.")] = None,
     json_lines: Json = False,
+    schema: Annotated[
+        bool, typer.Option("--schema", help="Print the JSON Schema of system files, for editors.")
+    ] = False,
 ) -> int:
     """Check a system file; print bodies, elements, modes, and what the sensors can identify."""
     from sprung.service.cli.system import run
 
-    return run(file, json_lines)
+    return run(file, json_lines, schema)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

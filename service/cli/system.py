@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +13,25 @@ from rich.table import Table
 
 from sprung.model.identification.identify import identifiability
 from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.schema import SystemFileError
 from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.systemfile import json_schema
 from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
 
 
-def run(file: Path | None, json_lines: bool) -> int:
-    """Check the file and print what it says."""
-    system = load_system(file or MANCHESTER)
+def run(file: Path | None, json_lines: bool, schema: bool) -> int:
+    """Check the file and print what it says, or one line for each problem; or print the JSON Schema of the format."""
+    if schema:
+        print(json.dumps(json_schema(), indent=2))
+        return 0
+    try:
+        system = load_system(file or MANCHESTER)
+    except SystemFileError as error:
+        for line in error.problems:
+            print(f"sprung: {' '.join(line.split())}", file=sys.stderr)
+        return 2
     told = identifiability(system)
     if json_lines:
         print(json.dumps(_as_dict(system, told), indent=None))

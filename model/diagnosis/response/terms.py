@@ -76,7 +76,7 @@ class Term:
 
 def supports(system: System) -> list[str]:
     """The inputs that move: moving supports, in the order of their columns."""
-    return [name for name, source in system.file.inputs.items() if source.kind == "displacement"]
+    return [name for name, source in system.file.inputs.items() if source.kind != "force"]
 
 
 def branch_of(term: Term, element: int, damping: float) -> Branch | None:

@@ -1,0 +1,246 @@
+"""Reading a system file: all that is wrong with it at once, each with its line and key, in plain words."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
+
+from sprung.model.address import TimeKey
+from sprung.model.schema import Body, Element, Input, Parts, Sensor, Speed, SystemFile, SystemFileError
+
+_ENTRIES: dict[str, TypeAdapter[Any]] = {
+    "bodies": TypeAdapter(Body),
+    "inputs": TypeAdapter(Input),
+    "elements": TypeAdapter(Element),
+    "sensors": TypeAdapter(Sensor),
+}
+_PATTERNS = {
+    "mcap": "/topic.field is expected",
+    "can": "Message.Signal is expected",
+}
+MOST_PROBLEMS = 20  # that are listed
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML 1.2 floats (1e-5 is a number); keys that occur twice are noted in `problems`."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self.problems: list[tuple[int, str]] = []  # line, key and message
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)$"),
+    list("-+0123456789."),
+)
+
+
+def _mapping(loader: _Loader, node: yaml.MappingNode) -> dict[Any, Any]:
+    seen: set[Any] = set()
+    for key, _ in node.value:
+        if key.value in seen:
+            loader.problems.append((key.start_mark.line + 1, f"{key.value}: this key occurs twice"))
+        seen.add(key.value)
+    return dict(loader.construct_pairs(node, deep=True))
+
+
+_Loader.add_constructor("tag:yaml.org,2002:map", _mapping)
+
+
+def read_system_file(path: str | Path) -> SystemFile:
+    """Read and check a system file.
+
+    Errors: `SystemFileError`, one line: file, and of each problem line, key, what is wrong.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise SystemFileError(f"{path}: cannot read the system file: {reason}") from None
+    return parse_system_file(text, str(path))
+
+
+def parse_system_file(text: str, source: str = "system file") -> SystemFile:
+    """Check the text of a system file; `source` names it in errors."""
+    try:
+        loader = _Loader(text)
+        try:
+            node = loader.get_single_node()
+            raw = loader.construct_document(node) if node is not None else None
+        finally:
+            loader.dispose()
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        problem = " ".join(str(error).split())
+        raise SystemFileError(f"{source}: not YAML: {problem[:200]}") from None
+    if not isinstance(raw, Mapping):
+        raise SystemFileError(f"{source}: a mapping with name, bodies, elements, sensors is expected")
+    problems, file = loader.problems, None
+    try:
+        file = SystemFile.model_validate(raw)
+    except ValidationError as error:
+        problems += [_explain(detail, node) for detail in error.errors() if detail["loc"]]
+        problems += [_placed(line, node) for line in _references(error, raw)]
+    if problems or file is None:
+        raise _error(source, problems)
+    return file
+
+
+def _error(source: str, problems: list[tuple[int, str]]) -> SystemFileError:
+    """All problems, by line, each once."""
+    lines = tuple(f"{source}: line {line}: {what}" for line, what in sorted(dict.fromkeys(problems)))
+    if len(lines) == 1:
+        return SystemFileError(lines[0])
+    listed = "; ".join(line.removeprefix(f"{source}: ") for line in lines[:MOST_PROBLEMS])
+    more = f"; and {len(lines) - MOST_PROBLEMS} more" if len(lines) > MOST_PROBLEMS else ""
+    return SystemFileError(f"{source}: {len(lines)} problems: {listed}{more}", lines)
+
+
+def _references(error: ValidationError, raw: Mapping[Any, Any]) -> list[str]:
+    """`key: what is wrong` of everything that is wrong between the parts, also where single parts are wrong."""
+    whole = [detail for detail in error.errors() if not detail["loc"]]
+    if whole:
+        return [line for detail in whole for line in _plain(detail["msg"]).split("\n")]
+    groups = {group: _sound(adapter, raw.get(group)) for group, adapter in _ENTRIES.items()}
+    time, speed = (
+        _sound(TypeAdapter(kind), {0: raw.get(key)})[0] for key, kind in (("time", TimeKey), ("speed", Speed))
+    )
+    estimate = raw.get("estimate", SystemFile.model_fields["estimate"].default)
+    known = estimate if isinstance(estimate, (list, tuple)) else ()
+    return list(Parts(**groups, time=time, speed=speed, estimate=[str(e) for e in known]).problems())
+
+
+def _sound(adapter: TypeAdapter[Any], group: Any) -> dict[Any, Any]:
+    """The entries of a group, None for those that are wrong in themselves."""
+    sound: dict[Any, Any] = {}
+    for name, entry in group.items() if isinstance(group, Mapping) else ():
+        try:
+            sound[name] = adapter.validate_python(entry)
+        except ValidationError:
+            sound[name] = None
+    return sound
+
+
+def _placed(problem: str, node: yaml.Node | None) -> tuple[int, str]:
+    """Line, and the problem, of a reference `key: what is wrong`."""
+    key = problem.split(": ", 1)[0]
+    return _line_of(node, key.split(".")), problem
+
+
+def _explain(detail: ErrorDetails, node: yaml.Node | None) -> tuple[int, str]:
+    """Line, and `key: what is wrong`, of one problem that pydantic found."""
+    location = [str(part) for part in detail["loc"]]
+    keys = _existing_keys(node, location)
+    if detail["type"] == "missing":
+        keys = [*keys, location[-1]]
+    return _line_of(node, keys), f"{'.'.join(keys)}: {_words(detail, keys)}"
+
+
+def _words(detail: ErrorDetails, keys: list[str]) -> str:
+    """What is wrong, in plain words."""
+    given, limits = detail["input"], detail.get("ctx", {})
+    value = f", not {given!r}" if isinstance(given, (str, int, float)) else ""
+    match detail["type"]:
+        case "missing":
+            return "this key is missing"
+        case "extra_forbidden":
+            return f"unknown key{_nearest(keys[-1], _all_keys())}"
+        case "union_tag_not_found":
+            return "kind: this key is missing"
+        case "union_tag_invalid":
+            known = str(limits["expected_tags"]).replace("'", "").split(", ")
+            return (
+                f"kind {limits['tag']!r} is unknown here; known are {', '.join(known)}{_nearest(limits['tag'], known)}"
+            )
+        case "literal_error":
+            known = str(limits["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
+            return f"one of {', '.join(known)} is expected{value}{_nearest(str(given), known)}"
+        case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" as kind:
+            words = kind.replace("_equal", "_or_equal_to").replace("than_or", "than or").replace("_", " ")
+            return f"must be {words} {next(iter(limits.values())):g}{value}"
+        case "finite_number":
+            return f"a finite number is expected{value}"
+        case "string_pattern_mismatch" if keys[-1] in _PATTERNS:
+            return f"{_PATTERNS[keys[-1]]}{value}"
+        case "string_pattern_mismatch":
+            return f"a name of letters, digits, _ and -, beginning with a letter, is expected{value}"
+        case "string_too_short" | "too_short":
+            return "must not be empty"
+        case "string_type":
+            return f"text is expected{value}"
+        case "int_parsing" | "int_type" | "int_from_float":
+            return f"a whole number is expected{value}"
+        case "float_parsing" | "float_type":
+            return f"a number is expected{value}"
+        case "bool_parsing" | "bool_type":
+            return f"true or false is expected{value}"
+        case "model_type" | "model_attributes_type" | "dict_type":
+            scalar = keys and keys[-1] in ("stiffness", "damping", "mass", "speed")
+            return f"a {'number or a ' if scalar else ''}mapping is expected{value}"
+        case "tuple_type":
+            return f"a list is expected{value}"
+    return _plain(detail["msg"])
+
+
+def _plain(message: str) -> str:
+    return message.removeprefix("Value error, ")
+
+
+def _nearest(name: str, known: list[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
+def _all_keys() -> list[str]:
+    """Every key that the format has anywhere."""
+    schema = SystemFile.model_json_schema()
+    kinds = [schema, *schema["$defs"].values()]
+    return sorted({key for kind in kinds for key in kind.get("properties", ())})
+
+
+def _existing_keys(node: yaml.Node | None, location: list[str]) -> list[str]:
+    """Drop the parts of a pydantic location (union tags, validators) that are not keys of the file."""
+    keys: list[str] = []
+    for part in location:
+        child = _child(node, part)
+        if child is None:
+            continue
+        keys.append(part)
+        node = child[1]
+    return keys
+
+
+def _child(node: yaml.Node | None, key: str) -> tuple[yaml.Node, yaml.Node] | None:
+    if isinstance(node, yaml.MappingNode):
+        for name, value in reversed(node.value):  # of a repeated key the last one counts
+            if name.value == key:
+                return name, value
+    if isinstance(node, yaml.SequenceNode) and key.isdigit() and int(key) < len(node.value):
+        return node.value[int(key)], node.value[int(key)]
+    return None
+
+
+def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
+    line = node.start_mark.line if node is not None else 0
+    for key in keys:
+        child = _child(node, key)
+        if child is None:
+            break
+        line, node = child[0].start_mark.line, child[1]
+    return line + 1
+
+
+def json_schema() -> dict[str, Any]:
+    """JSON Schema of the format, for editors that complete and check while typing."""
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Sprung system file",
+        **{key: value for key, value in SystemFile.model_json_schema().items() if key != "title"},
+    }

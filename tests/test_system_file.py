@@ -1,0 +1,250 @@
+"""What a system file can say about own data, and how everything that is wrong with it is told at once."""
+
+import json
+from datetime import date
+
+import numpy as np
+import pytest
+
+from sprung.model.schema import SI, SystemFileError
+from sprung.model.system import System, load_system, parse_system
+from sprung.model.systemfile import json_schema, parse_system_file
+from sprung.model.units import FACTORS, UnitError, to_si
+from sprung.service.cli import main
+from tests.test_system import QUARTER_CAR
+
+RIG = """
+name: rig
+sample_rate: 200
+window: 128
+time: {column: Zeit, unit: ms, epoch: 2026-09-21T14:00:00Z}
+speed: 40
+bodies:
+  mass: {mass: 2.0, roll_inertia: 0.1, pitch_inertia: 0.2}
+inputs:
+  rod: {kind: support, displacement: {column: stroke, unit: mm, noise: 1e-6}}
+elements:
+  spring: {upper: mass, lower: rod, position: [0.5, 0.0], stiffness: 800.0, damping: 4.0}
+  left: {upper: mass, lower: rod, position: [0.0, 0.5], stiffness: 800.0, damping: 4.0}
+  right: {upper: mass, lower: rod, position: [0.0, -0.6], stiffness: 700.0, damping: 4.0}
+sensors:
+  top: {kind: acceleration, body: mass, column: acc, unit: g, noise: 0.01}
+  rolls: {kind: roll_rate, body: mass, csv: gyro_x, unit: deg/s, sign: -1, noise: 1e-4}
+  pitches: {kind: pitch_rate, body: mass, csv: gyro_y, noise: 1e-4}
+  cell: {kind: force, element: spring, column: 3, unit: V, scale: 500, offset: -20, noise: 1.0}
+"""
+
+
+def problems(text):
+    with pytest.raises(SystemFileError) as caught:
+        parse_system(text, "rig.yaml")
+    assert "\n" not in str(caught.value)
+    return caught.value.problems
+
+
+def converted(system, name, recorded):
+    channel = next(c for c in system.channels if c.name == name)
+    return channel.gain * recorded + channel.offset
+
+
+def test_recorded_numbers_become_si_by_scale_offset_sign_and_unit():
+    system = parse_system(RIG)
+    assert converted(system, "rod.displacement", 12.0) == pytest.approx(0.012)
+    assert converted(system, "top", 1.0) == 9.80665
+    assert converted(system, "rolls", 180.0) == pytest.approx(-np.pi)
+    assert converted(system, "cell", 2.0) == 980.0
+    assert [c.table for c in system.channels] == ["stroke", "acc", "gyro_x", "gyro_y", "3"]
+
+
+@pytest.mark.parametrize(
+    ("unit", "si", "one"),
+    [
+        ("kN", "N", 1000.0),
+        ("lbf", "N", 4.4482216152605),
+        ("kip", "N", 4448.2216152605),
+        ("kgf", "N", 9.80665),
+        ("lb", "kg", 0.45359237),
+        ("in", "m", 0.0254),
+        ("in/s", "m/s", 0.0254),
+        ("ft/s²", "m/s^2", 0.3048),
+        ("mm/s2", "m/s^2", 0.001),
+        ("m/s/s", "m/s^2", 1.0),
+        ("g", "m/s^2", 9.80665),
+        ("g", "kg", 0.001),
+        ("[µm]", "m", 1e-6),
+        ("°/s", "rad/s", np.pi / 180),
+        ("rpm", "rad/s", 2 * np.pi / 60),
+        ("bar", "Pa", 1e5),
+        ("psi", "Pa", 6894.757293168361),
+        ("km/h", "m/s", 1 / 3.6),
+        ("msec", "s", 1e-3),
+    ],
+)
+def test_units_are_what_the_standards_say(unit, si, one):
+    assert to_si(unit, si, None, 0.0, 1) == (pytest.approx(one, rel=1e-12), 0.0)
+
+
+def test_every_unit_of_the_tables_is_found_by_its_own_name():
+    for si, names in FACTORS.items():
+        assert names[si] == 1.0
+        for name, factor in names.items():
+            assert to_si(name, si, 2.0, 3.0, -1) == (pytest.approx(-2 * factor), pytest.approx(-3 * factor))
+
+
+def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale():
+    with pytest.raises(UnitError, match=r"'mm' is no unit of N; known are N, mN"):
+        to_si("mm", "N", None, 0.0, 1)
+    with pytest.raises(UnitError, match=r"did you mean 'kN'"):
+        to_si("KN", "N", None, 0.0, 1)
+    with pytest.raises(UnitError, match=r"mV alone says nothing about N; give `scale:` in N per V"):
+        to_si("mV", "N", None, 0.0, 1)
+    assert to_si("mV", "N", 2000.0, 5.0, -1) == (-2.0, -5.0)
+
+
+def test_a_rate_sensor_measures_the_degree_of_freedom_that_turns():
+    mechanics = parse_system(RIG).mechanics
+    _, _, C, D = mechanics.matrices()
+    rate = {dof: mechanics.n + i for i, dof in enumerate(mechanics.dofs)}
+    for row, dof in ((1, "mass.roll"), (2, "mass.pitch")):
+        assert C[row, rate[dof]] == 1.0
+        assert np.count_nonzero(C[row]) == 1
+        assert not D[row].any()
+    (line,) = problems(RIG.replace(", pitch_inertia: 0.2", ""))
+    assert line.endswith("sensors.pitches.body: mass has no pitch_inertia, so it does not pitch")
+
+
+def test_time_of_tables_has_a_column_a_unit_and_an_epoch():
+    time = parse_system(RIG).time
+    assert (time.name, time.seconds, time.rate) == ("Zeit", 1e-3, None)
+    assert time.epoch == 1_790_000_000_000_000_000 - 800 * 10**9
+    labview = parse_system(RIG.replace("unit: ms, epoch: 2026-09-21T14:00:00Z", "epoch: labview")).time
+    assert labview.epoch == -(date(1970, 1, 1) - date(1904, 1, 1)).days * 86400 * 10**9
+    days = parse_system(RIG.replace("unit: ms, epoch: 2026-09-21T14:00:00Z", "unit: d, epoch: matlab")).time
+    assert 719529 * 86400 * 10**9 + days.epoch == 0  # datenum of 1970-01-01
+
+
+def test_what_only_says_where_data_are_does_not_change_the_digest():
+    base = parse_system(RIG).digest
+    moved = RIG.replace("unit: mm", "unit: in, sign: -1").replace("column: stroke", "csv: x").replace("Zeit", "t")
+    assert parse_system(moved).digest == base
+    assert parse_system(RIG.replace("kind: support", "kind: displacement")).digest == base
+    assert parse_system(RIG.replace("noise: 1e-6", "noise: 2e-6")).digest != base
+    assert load_system().digest == "9861e064700180be"  # the bundled weights belong to it
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "channels"),
+    [
+        ("displacement: {csv: z, noise: 1e-5}, velocity", "velocity", ["road.velocity"]),
+        (
+            "displacement: {csv: z, noise: 1e-5}, velocity: {csv: vz",
+            "acceleration: {csv: az",
+            ["road.acceleration"],
+        ),
+        (
+            "velocity: {csv: vz, noise: 1e-3}",
+            "acceleration: {csv: az}",
+            ["road.displacement", "road.acceleration"],
+        ),
+    ],
+)
+def test_a_support_may_give_any_of_its_motions(old, new, channels):
+    system = System(parse_system_file(QUARTER_CAR.replace(old, new)))
+    assert [c.name for c in system.inputs] == channels
+    assert [c.unit for c in system.inputs] == [SI[name.split(".")[1]] for name in channels]
+    assert len(system.drive_channels) == 2
+
+
+def test_track_load_speed_and_tests_without_a_body_can_be_said():
+    track = "road: {kind: track, rail: left, position: [0.0, 1.0]}"
+    system = System(
+        parse_system_file(
+            QUARTER_CAR.replace(
+                "road: {kind: displacement, displacement: {csv: z, noise: 1e-5}, velocity: {csv: vz, noise: 1e-3}}",
+                track,
+            )
+            .replace("mass: 300.0", "mass: 300.0, load: {min: -50, max: 100, pressure: {csv: p, unit: bar}}")
+            .replace("window: 200", "window: 200\nspeed: {csv: v, unit: km/h}")
+        )
+    )
+    assert system.inputs == ()
+    assert [(c.name, c.unit) for c in system.auxiliary] == [("speed", "m/s"), ("sprung.pressure", "Pa")]
+    assert system.auxiliary[0].gain == pytest.approx(1 / 3.6)
+    parse_system_file(
+        "{name: dyno, sample_rate: 100, window: 64, bodies: {},"
+        " inputs: {rod: {kind: support, displacement: {csv: x}}},"
+        " elements: {damper: {upper: rod, lower: ground, damping: 100.0}},"
+        " sensors: {cell: {kind: force, element: damper, csv: F}}, estimate: [damping]}"
+    )
+
+
+BROKEN = """
+name: rig
+sample_rate: fast
+window: 4
+colour: red
+time: {unit: fortnight}
+bodies:
+  sprung: {mass: -300.0}
+  unsprung: {mass: 40.0, load: {min: 5, max: 1}}
+inputs:
+  road: {kind: displacment, displacement: {csv: z, noise: 1e-5}}
+  push: {kind: force, body: sprng, csv: F, unit: kNN}
+  rod: {kind: support}
+elements:
+  tyre: {upper: unsprung, lower: rod, stiffness: soft, damping: 100.0}
+  strut: {upper: sprung, lower: unsprugn, stiffness: 2.0e4, damping: 1500.0}
+  strut: {upper: sprung, lower: unsprung, stiffness: 0.0, damping: 1500.0}
+sensors:
+  body: {kind: acceleration, body: sprung, csv: a1, unit: V, nois: 1}
+  wheel: {kind: velocity, body: unsprung, mcap: foo, sign: 2}
+  cell: {kind: force, element: strutt}
+estimate: [stiffness, colour]
+"""
+
+
+def test_everything_that_is_wrong_is_told_at_once_in_plain_words(tmp_path, capfd):
+    lines = problems(BROKEN)
+    for part in (
+        "line 3: sample_rate: a number is expected, not 'fast'",
+        "line 4: window: must be greater than or equal to 8, not 4",
+        "line 5: colour: unknown key",
+        "line 6: time.unit: 'fortnight' is no unit of time; known are s, ms",
+        "line 8: bodies.sprung.mass: must be greater than or equal to 0, not -300.0",
+        "line 9: bodies.unsprung.load: min must be less than max",
+        "line 11: inputs.road: kind 'displacment' is unknown here; known are displacement, support, track, force; "
+        "did you mean 'displacement'?",
+        "line 12: inputs.push.body: 'sprng' is not a body; did you mean 'sprung'?",
+        "line 12: inputs.push.unit: 'kNN' is no unit of N; did you mean 'kN'?",
+        "line 13: inputs.rod: give at least one of displacement, velocity, acceleration",
+        "line 15: elements.tyre.stiffness: a number or a mapping is expected, not 'soft'",
+        "line 17: strut: this key occurs twice",
+        "line 17: elements.strut.stiffness: a nominal value of 0 cannot be estimated",
+        "line 19: sensors.body.nois: unknown key; did you mean 'noise'?",
+        "line 20: sensors.wheel.mcap: /topic.field is expected, not 'foo'",
+        "line 20: sensors.wheel.sign: one of 1, -1 is expected, not 2",
+        "line 21: sensors.cell.element: 'strutt' is not an element; did you mean 'strut'?",
+        "line 22: estimate.1: one of stiffness, damping, mass is expected, not 'colour'",
+    ):
+        assert any(part in line for line in lines), part
+    assert len(lines) == 18
+    path = tmp_path / "rig.yaml"
+    path.write_text(BROKEN)
+    assert main(["system", str(path)]) == 2
+    out, err = capfd.readouterr()
+    assert out == ""
+    assert len(err.splitlines()) == 18
+    assert all(line.startswith(f"sprung: {path}: line ") for line in err.splitlines())
+    assert main(["replay", str(path), "--system", str(path)]) == 2
+    assert len(capfd.readouterr().err.splitlines()) == 1
+
+
+def test_the_schema_for_editors_knows_short_forms_and_every_kind(capfd):
+    assert main(["system", "--schema"]) == 0
+    schema = json.loads(capfd.readouterr().out)
+    assert schema == json_schema()
+    assert set(schema["properties"]) >= {"name", "time", "speed", "bodies", "inputs", "elements", "sensors"}
+    mass = schema["$defs"]["Body"]["properties"]["mass"]
+    assert {"type": "number"} in mass["anyOf"]
+    (entry,) = schema["properties"]["inputs"]["patternProperties"].values()
+    assert set(entry["discriminator"]["mapping"]) == {"displacement", "support", "track", "force"}
