@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 
 from sprung.model.signals import Tally
 
+KEPT_PROBLEMS = 100  # lines; a file can be damaged in a million places
+
 
 class UnreadableRecording(ValueError):
     """The input cannot be read at all; the message is one line that says what, where and what to do."""
@@ -22,7 +24,8 @@ class Account:
 
     tally: Tally = field(default_factory=Tally)
     values: Counter[str] = field(default_factory=Counter)  # reason -> values treated as missing
-    problems: list[str] = field(default_factory=list)  # one line each, for the user
+    problems: list[str] = field(default_factory=list)  # one line each, for the user; the first ones
+    more_problems: int = 0  # that are not kept
     incomplete: bool = False  # something that was recorded could not be read
     vehicle: str | None = None
     contents: Counter[str] = field(default_factory=Counter)  # topic or CAN id -> messages in the input
@@ -48,5 +51,11 @@ class Account:
 
     def problem(self, line: str, *, incomplete: bool = True) -> None:
         """One line for the user; by default it also marks the recording as incomplete."""
-        self.problems.append(line)
         self.incomplete = self.incomplete or incomplete
+        if len(self.problems) < KEPT_PROBLEMS:
+            self.problems.append(line)
+            return
+        self.more_problems += 1
+        if self.more_problems == 1:
+            self.problems.append("")
+        self.problems[-1] = f"and {self.more_problems} more like these"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import datetime
 import struct
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from sprung.model.signals import IntArray
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import ByteArray, FrameBlock
+from sprung.replay.inflate import ERRORS, Inflater
 
 IndexArray = NDArray[np.intp]
 
@@ -30,8 +30,12 @@ CONTAINER_TYPE, ERROR_TYPES = 10, (2, 73, 104)
 CLASSIC_TYPES, FD_TYPE, FD64_TYPE = (1, 86), 100, 101
 HEADER_BYTES = {1: 32, 2: 40}  # base and rest, by header version
 TEN_MICROSECONDS = 1  # value of the object's flags: the time stamp counts 10 us, else 1 ns
-LARGEST_OBJECT = 1 << 28
-RESYNC_BYTES = 1 << 20
+LARGEST_OBJECT = 1 << 28  # bytes of an object in the file
+LARGEST_INSIDE = 1 << 22  # bytes of an object inside a container; one of a CAN bus has about a hundred
+FIRST_LOOK, LAST_LOOK = 1 << 8, 1 << 20  # bytes in which the next object is looked for, doubled from look to look
+FIXED = {"classic": 8, "fd": 20, "fd64": 40}  # bytes of a message before its data
+LATEST = np.iinfo(np.int64).max
+ODD_STOP = 86_400.0  # s between the last frame and the stop time in the header, beyond which one of them is wrong
 BATCH_BYTES = 1 << 19  # of inflated objects that are read together
 
 
@@ -44,9 +48,10 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         fields = FILE_HEADER.unpack(header)
         file.seek(fields[1])
         reader = _Objects(_system_time(fields[14:22], account), account)
-        for data in _containers(file, account):
+        for data in _containers(file, path.stat().st_size, account):
             yield from reader.read(data)
     yield from reader.flush()
+    _check_stop(reader, fields[22:30], account)
     if reader.tail.strip(b"\0"):
         account.problem(f"file ends inside an object after {reader.seconds:.1f} s; what came before was read")
     expected = fields[12]  # number of objects that the writer counted; 0 when it did not finish
@@ -54,34 +59,38 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         account.corrupt(expected - reader.objects, "in a part of the file that cannot be read")
 
 
-def _containers(file: BinaryIO, account: Account) -> Iterator[bytes | None]:
+def _containers(file: BinaryIO, file_size: int, account: Account) -> Iterator[bytes | None]:
     """Inflated containers in file order; None where something is missing between two of them."""
+    inflater = Inflater(file_size)
     while base := file.read(OBJECT_BASE.size):
         if len(base) < OBJECT_BASE.size:
             account.problem("file ends inside a container header; what came before was read")
             return
+        at = file.tell() - OBJECT_BASE.size
         signature, _, _, size, kind = OBJECT_BASE.unpack(base)
         if signature != b"LOBJ" or not OBJECT_BASE.size <= size <= LARGEST_OBJECT:
-            at = file.tell() - OBJECT_BASE.size
             account.problem(f"no object at byte {at}: damaged; reading goes on at the next one")
             yield None
             if not _seek_object(file, at + 1):
                 return
             continue
         body = file.read(size - OBJECT_BASE.size)
-        file.read(size % 4)
         cut = len(body) < size - OBJECT_BASE.size
+        if cut and (later := _next_container(body)) is not None:  # the size is wrong, not the file's end
+            account.problem(f"the object at byte {at} says that it is {size} bytes long: damaged")
+            yield None
+            file.seek(at + OBJECT_BASE.size + later)
+            continue
+        file.read(size % 4)
         if cut:
             account.problem("file ends inside a container; what came before the cut was read")
         if kind != CONTAINER_TYPE:
             yield base + body
-            continue
-        if len(body) < CONTAINER.size:
-            return
-        yield _inflate(body, cut, account)
+        elif len(body) >= CONTAINER.size:
+            yield _inflate(body, cut, inflater, account)
 
 
-def _inflate(body: bytes, cut: bool, account: Account) -> bytes | None:
+def _inflate(body: bytes, cut: bool, inflater: Inflater, account: Account) -> bytes | None:
     """The objects of a container, checksum verified unless the file is cut in it; None when it is damaged."""
     method, size = CONTAINER.unpack_from(body)
     packed = body[CONTAINER.size :]
@@ -90,31 +99,49 @@ def _inflate(body: bytes, cut: bool, account: Account) -> bytes | None:
     if method != 2:
         account.problem(f"a container with unknown compression {method} was passed over")
         return None
-    inflater = zlib.decompressobj()
     try:
-        data = inflater.decompress(packed, size + 1)
-        if cut or inflater.eof:
-            return data
-        reason = "its size is wrong"
-    except zlib.error as error:
-        reason = str(error)
-    account.problem(f"a damaged container of {size} bytes was passed over ({reason})")
+        return inflater.beginning(packed, size) if cut else inflater.inflate("zlib", packed, size)
+    except ERRORS as error:
+        account.problem(f"a damaged container of {size} bytes was passed over ({error})")
+    return None
+
+
+def _next_container(body: bytes) -> int | None:
+    """Where in `body` a container begins that ends in it, too."""
+    found = body.find(b"LOBJ")
+    while 0 <= found <= len(body) - OBJECT_BASE.size:
+        _, _, _, size, kind = OBJECT_BASE.unpack_from(body, found)
+        if kind == CONTAINER_TYPE and OBJECT_BASE.size <= size <= len(body) - found:
+            return found
+        found = body.find(b"LOBJ", found + 4)
     return None
 
 
 def _seek_object(file: BinaryIO, position: int) -> bool:
     """Place the file at the next object's signature."""
+    look = FIRST_LOOK
     file.seek(position)
-    while block := file.read(RESYNC_BYTES):
+    while block := file.read(look):
         found = block.find(b"LOBJ")
         if found >= 0:
             file.seek(position + found)
             return True
-        position += max(len(block) - 3, 1)
-        file.seek(position)
-        if len(block) < RESYNC_BYTES:
+        if len(block) < look:
             return False
+        position += len(block) - 3
+        look = min(2 * look, LAST_LOOK)
+        file.seek(position)
     return False
+
+
+def _check_stop(reader: _Objects, fields: tuple[int, ...], account: Account) -> None:
+    """The header has no checksum; start and stop in it and the frames' own times say whether they belong together."""
+    stop = _moment(fields)
+    if not stop or not reader.start or not reader.objects:
+        return
+    apart = (stop - reader.start) / 1e9 - reader.seconds
+    if not -1.0 <= apart <= ODD_STOP:
+        account.problem("start, stop and length of the recording disagree in the BLF header; its date may be wrong")
 
 
 class _Objects:
@@ -124,6 +151,8 @@ class _Objects:
         self.start = start  # ns since epoch
         self.account = account
         self.tail = b""
+        self._pieces: list[bytes] = []  # not yet joined to the tail
+        self._waiting = 0  # bytes in them
         self.objects = 0
         self.seconds = 0.0  # last time seen, since the start of the measurement
 
@@ -132,13 +161,15 @@ class _Objects:
             yield from self.flush()
             self.tail = b""
             return
-        self.tail += data
-        if len(self.tail) >= BATCH_BYTES:
+        self._pieces.append(data)
+        self._waiting += len(data)
+        if self._waiting >= BATCH_BYTES:
             yield from self.flush()
 
     def flush(self) -> Iterator[FrameBlock]:
         """The objects that are whole; an unfinished one stays in `tail`."""
-        data = self.tail
+        data = b"".join([self.tail, *self._pieces])
+        self._pieces, self._waiting = [], 0
         offsets, kinds, end = self._walk(data)
         self.tail = data[end:]
         if not len(offsets):
@@ -147,7 +178,7 @@ class _Objects:
         octets = np.frombuffer(data, dtype=np.uint8)
         block = _columns(octets, offsets, kinds, self.start, self.account)
         if block is not None:
-            self.seconds = (int(block.time[-1]) - self.start) / 1e9
+            self.seconds = max(self.seconds, (int(block.time.max()) - self.start) / 1e9)
             yield block
 
     def _walk(self, data: bytes) -> tuple[IndexArray, IntArray, int]:
@@ -167,7 +198,7 @@ class _Objects:
             if found + OBJECT_BASE.size > total:
                 break
             _, _, _, size, kind = OBJECT_BASE.unpack_from(data, found)
-            if not OBJECT_BASE.size <= size <= LARGEST_OBJECT:
+            if not OBJECT_BASE.size <= size <= LARGEST_INSIDE:
                 position = found + 4
                 continue
             if found + size > total:
@@ -204,25 +235,40 @@ def _columns(
     if not message.any():
         return None
     offsets, is_fd, is_fd64 = offsets[message], is_fd[message], is_fd64[message]
-    version = _field(octets, offsets + 6, "<u2")
-    body = offsets + np.where(version == 2, HEADER_BYTES[2], HEADER_BYTES[1])
-    ticks = _field(octets, offsets + 24, "<u8").astype(np.int64)
-    unit = np.where(_field(octets, offsets + 16, "<u4") == TEN_MICROSECONDS, 10_000, 1)
-    width = 64 if (is_fd | is_fd64).any() else 8
-    data = np.zeros((len(body), width), dtype=np.uint8)
-    length = np.minimum(np.where(is_fd64, octets[body + 2], octets[body + 3]), 8)
-    length = np.where(is_fd, _clipped(octets, body + 14), np.where(is_fd64, octets[body + 2], length))
-    length = np.minimum(length, width).astype(np.uint8)
-    payload = body + np.where(is_fd, 20, np.where(is_fd64, 40, 8))
+    version, size = _field(octets, offsets + 6, "<u2"), _field(octets, offsets + 8, "<u4")
+    header = np.where(version == 2, HEADER_BYTES[2], HEADER_BYTES[1])
+    fixed = np.where(is_fd, FIXED["fd"], np.where(is_fd64, FIXED["fd64"], FIXED["classic"]))
+    whole = size >= header + fixed
+    account.corrupt(int((~whole).sum()), "object shorter than its message")
+    offsets, is_fd, is_fd64 = offsets[whole], is_fd[whole], is_fd64[whole]
+    body, payload, end = (offsets + header[whole]), (offsets + (header + fixed)[whole]), (offsets + size[whole])
+    length = np.where(is_fd, octets[body + np.where(is_fd, 14, 0)], octets[body + np.where(is_fd64, 2, 3)])
+    length = np.minimum(length, np.where(is_fd | is_fd64, 64, 8)).astype(np.uint8)
+    ticks = _field(octets, offsets + 24, "<u8")
+    unit = np.where(_field(octets, offsets + 16, "<u4") == TEN_MICROSECONDS, np.uint64(10_000), np.uint64(1))
+    timely = ticks <= np.uint64(LATEST - start) // unit
+    inside = payload + length <= end
+    identifier = _field(octets, body + 4, "<u4") & np.uint32(0x9FFFFFFF)
+    remote = octets[body + np.where(is_fd64, 12, 2)] & np.where(is_fd64, 0x10, 0x80).astype(np.uint8) != 0
+    account.foreign(int(remote.sum()), "remote frame")
+    account.corrupt(int((~remote & ~inside).sum()), "object shorter than its message")
+    account.corrupt(int((~remote & inside & ~timely).sum()), "time stamp out of range")
+    keep = ~remote & inside & timely
+    if not keep.any():
+        return None
+    time = start + (ticks[keep] * unit[keep]).astype(np.int64)
+    data = _payloads(octets, payload[keep], length[keep], 64 if (is_fd | is_fd64).any() else 8)
+    return FrameBlock(time, identifier[keep], length[keep], data)
+
+
+def _payloads(octets: ByteArray, payload: IndexArray, length: ByteArray, width: int) -> ByteArray:
+    """Data of the messages, zero beyond their length, shape (n, width)."""
+    data = np.zeros((len(payload), width), dtype=np.uint8)
     columns = np.arange(width)
     inside = columns < length[:, None]
     index = np.minimum(payload[:, None] + columns, len(octets) - 1)
     data[inside] = octets[index][inside]
-    identifier = _field(octets, body + 4, "<u4") & np.uint32(0x9FFFFFFF)
-    remote = np.where(is_fd64, octets[body + 12] & 0x10, octets[body + 2] & 0x80) != 0
-    account.foreign(int(remote.sum()), "remote frame")
-    keep = ~remote
-    return FrameBlock(start + (ticks * unit)[keep], identifier[keep], length[keep], data[keep])
+    return data
 
 
 def _field(octets: ByteArray, offsets: IndexArray, dtype: str) -> NDArray[np.unsignedinteger]:
@@ -230,16 +276,20 @@ def _field(octets: ByteArray, offsets: IndexArray, dtype: str) -> NDArray[np.uns
     return np.ascontiguousarray(octets[offsets[:, None] + np.arange(size)]).view(dtype)[:, 0]
 
 
-def _clipped(octets: ByteArray, offsets: IndexArray) -> ByteArray:
-    return octets[np.minimum(offsets, len(octets) - 1)]
-
-
-def _system_time(fields: tuple[int, ...], account: Account) -> int:
-    """Windows SYSTEMTIME (UTC) as ns since epoch; 0 when the writer left it empty."""
+def _moment(fields: tuple[int, ...]) -> int:
+    """Windows SYSTEMTIME (UTC) as ns since epoch; 0 when it is empty or none."""
     year, month, _, day, hour, minute, second, milli = fields
     try:
         moment = datetime.datetime(year, month, day, hour, minute, second, tzinfo=datetime.UTC)
     except ValueError:
-        account.problem("no start time in the BLF header; times count from 1970", incomplete=False)
         return 0
-    return int(moment.timestamp()) * 1_000_000_000 + milli * 1_000_000
+    whole = int(moment.timestamp()) * 1_000_000_000 + milli * 1_000_000
+    return whole if 0 <= whole < LATEST // 2 else 0
+
+
+def _system_time(fields: tuple[int, ...], account: Account) -> int:
+    """Start of the measurement in ns since epoch; 0 when the writer left it empty."""
+    start = _moment(fields)
+    if not start:
+        account.problem("no start time in the BLF header; times count from 1970", incomplete=False)
+    return start

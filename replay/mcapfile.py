@@ -2,37 +2,42 @@
 
 The `mcap` package gives up at the first damaged record and builds one Python object per message.  This reader
 checks every chunk's CRC, passes over a chunk that fails, goes on at the next one, and hands out the messages of
-a chunk together.  A chunk that is cut short is not used: its CRC cannot be checked.  Layout:
-https://mcap.dev/spec
+a chunk together.  A chunk that is cut short is not used: its CRC cannot be checked.  The CRC of the whole data
+section, where the writer stated one, is checked at its end.  Layout: https://mcap.dev/spec
 """
 
 from __future__ import annotations
 
 import struct
 import zlib
+from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
-import zstandard
 from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, Metadata, Schema, Statistics
 
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.inflate import ERRORS, Inflater
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD_SIZE_LIMIT = 1 << 30  # bytes; a longer record is damage, not data
+RECORD_SIZE_LIMIT = 1 << 28  # bytes of a record that is read; attachments are passed over and may be longer
+PIECE = 1 << 20  # bytes read at once of what is only passed over
 BATCH_MESSAGES = 4096  # messages outside chunks that are handed out together
 DISORDER = 250_000_000  # ns that messages may lie back in time without being sorted; less than a window waits
 PREFIX = struct.Struct("<BQ")  # opcode, length
 MESSAGE = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQI")  # start, end, inflated size, CRC
 FOOTER = struct.Struct("<QQI")  # summary start, summary offsets start, summary CRC
+DATA_END = struct.Struct("<BQI")  # opcode, length, CRC of the data section
+READ = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE, Opcode.CHUNK, Opcode.MESSAGE_INDEX, Opcode.METADATA)
 DAMAGED = "a damaged chunk"
+UNREADABLE = (ValueError, struct.error, McapError)  # what the records of the `mcap` package raise
 
 
 @dataclass(slots=True)
@@ -54,6 +59,8 @@ class Summary:
 
     chunks: list[ChunkIndex] = field(default_factory=list)
     messages: int = 0
+    data_crc: int = 0  # of the whole data section; 0: not stated
+    starts: list[int] = field(default_factory=list)  # bytes at which chunks begin, in order
 
 
 class McapFile:
@@ -68,6 +75,8 @@ class McapFile:
         self._counted = 0
         self._first_time = self._last_time = 0  # log times, ns
         self._unindexed = False  # the last chunk was damaged and its message indexes have not come yet
+        self._inflater = Inflater(0)
+        self._crc: int | None = None  # of the data section so far; None: there is none to compare it with
 
     def batches(self) -> Iterator[Batch]:
         """Batches in file order; raises UnreadableRecording when the file is no MCAP file."""
@@ -76,6 +85,7 @@ class McapFile:
                 raise UnreadableRecording(f"{self.path}: not an MCAP file (its first bytes are not the MCAP magic)")
             summary = self._summary(file)
             self.time_ordered = summary is None or _ordered(summary.chunks)
+            self._inflater = Inflater(file.seek(0, 2))
             file.seek(len(MAGIC))
             yield from self._data_section(file, summary)
         if summary is not None and summary.messages > self._counted:
@@ -84,6 +94,7 @@ class McapFile:
     def _data_section(self, file: BinaryIO, summary: Summary | None) -> Iterator[Batch]:
         size = file.seek(0, 2)
         file.seek(len(MAGIC))
+        self._crc = zlib.crc32(MAGIC) if summary is not None and summary.data_crc else None
         loose = _Splitter(self)
         while True:
             at = file.tell()
@@ -91,33 +102,71 @@ class McapFile:
             opcode, length = PREFIX.unpack(prefix) if len(prefix) == PREFIX.size else (0, 0)
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):
                 break
-            if opcode == 0 or length > min(RECORD_SIZE_LIMIT, size - at - PREFIX.size):
+            longest = RECORD_SIZE_LIMIT if opcode in READ else size
+            if opcode == 0 or length > min(longest, size - at - PREFIX.size):
                 if not self._resume(file, at, summary, opcode):
                     break
                 continue
+            if opcode not in READ:
+                self._pass_over(file, prefix, length)
+                continue
             body = file.read(length)
+            if self._crc is not None:
+                self._crc = zlib.crc32(body, zlib.crc32(prefix, self._crc))
             if opcode == Opcode.CHUNK:
                 yield from self._chunk(body)
             elif opcode == Opcode.MESSAGE:
-                loose.read(prefix + body)
+                self._loose(loose, prefix + body)
                 if loose.count >= BATCH_MESSAGES:
                     yield loose.take()
             else:
                 self._record(opcode, body)
         if loose.count:
             yield loose.take()
+        if self._crc is not None and summary is not None and self._crc != summary.data_crc:
+            self.account.problem("the CRC of the data section is wrong: something outside the chunks is damaged")
+
+    def _pass_over(self, file: BinaryIO, prefix: bytes, length: int) -> None:
+        """A record that nobody needs (an attachment may be long)."""
+        if self._crc is None:
+            file.seek(length, 1)
+            return
+        self._crc = zlib.crc32(prefix, self._crc)
+        while length and (piece := file.read(min(length, PIECE))):
+            self._crc = zlib.crc32(piece, self._crc)
+            length -= len(piece)
+
+    def _loose(self, loose: _Splitter, record: bytes) -> None:
+        """A message outside the chunks."""
+        try:
+            loose.read(record)
+        except UNREADABLE:
+            self.count(1)
+            self.account.corrupt(1, "a damaged message")
 
     def _chunk(self, body: bytes) -> Iterator[Batch]:
         splitter = _Splitter(self)
         self._unindexed = False
         try:
-            splitter.read(_inflate(body))
-        except (ValueError, struct.error, RuntimeError, zstandard.ZstdError, MemoryError) as error:
+            splitter.read(self._inflate(body))
+        except (*UNREADABLE, *ERRORS) as error:
             self.account.problem(f"a damaged chunk of {len(body)} bytes was passed over ({error})")
             self._unindexed = True
             return
         if splitter.count:
             yield splitter.take()
+
+    def _inflate(self, body: bytes) -> bytes:
+        """The records of a chunk, CRC checked; raises when it is wrong."""
+        _, _, size, crc = CHUNK.unpack_from(body)
+        name_length = struct.unpack_from("<I", body, CHUNK.size)[0]
+        at = CHUNK.size + 4 + name_length
+        compression = body[CHUNK.size + 4 : at].decode("ascii")
+        packed = body[at + 8 :][: struct.unpack_from("<Q", body, at)[0]]
+        data = self._inflater.inflate(compression, packed, size)
+        if crc and zlib.crc32(data) != crc:
+            raise ValueError("its CRC is wrong")
+        return data
 
     def _record(self, opcode: int, body: bytes) -> None:
         """Records between chunks; a damaged one is passed over."""
@@ -136,7 +185,7 @@ class McapFile:
                 lost = (len(body) - 6) // 16  # channel id, byte length, then pairs of time and offset
                 self.count(lost)
                 self.account.corrupt(lost, f"in {DAMAGED}")
-        except (ValueError, struct.error, UnicodeDecodeError) as error:
+        except UNREADABLE as error:
             self.account.problem(f"a damaged record was passed over ({error})")
 
     def count(self, messages: int) -> None:
@@ -150,15 +199,16 @@ class McapFile:
 
     def _resume(self, file: BinaryIO, at: int, summary: Summary | None, opcode: int) -> bool:
         """After a record that cannot be right: place the file at the next chunk of the index, if there is one."""
+        self._crc = None  # the damage is found and told
         if summary is not None:
-            later = sorted(index.chunk_start_offset for index in summary.chunks if index.chunk_start_offset > at)
+            later = bisect_right(summary.starts, at)
+            found = later < len(summary.starts)
             self.account.problem(
-                f"damaged at byte {at}; {'went on at the next chunk' if later else 'nothing after it'}"
+                f"damaged at byte {at}; {'went on at the next chunk' if found else 'nothing after it'}"
             )
-            if later:
-                file.seek(later[0])
-                return True
-            return False
+            if found:
+                file.seek(summary.starts[later])
+            return found
         inside = "inside a chunk" if opcode == Opcode.CHUNK else "before its end record"
         seconds = (self._last_time - self._first_time) / 1e9
         line = f"file ends {inside} after {seconds:.1f} s; {self._counted} messages recovered"
@@ -181,6 +231,10 @@ class McapFile:
         if crc and zlib.crc32(section) != crc:
             return None
         summary = Summary()
+        file.seek(max(start - DATA_END.size, 0))
+        end = file.read(DATA_END.size)
+        if len(end) == DATA_END.size and end[0] == Opcode.DATA_END:
+            summary.data_crc = DATA_END.unpack(end)[2]
         try:
             for opcode, body in _records(section[: footer_at - start]):
                 if opcode == Opcode.CHUNK_INDEX:
@@ -189,8 +243,9 @@ class McapFile:
                     summary.messages = Statistics.read(_stream(body)).message_count
                 else:
                     self._record(opcode, body)
-        except (ValueError, struct.error):
+        except UNREADABLE:
             return None
+        summary.starts = sorted(index.chunk_start_offset for index in summary.chunks)
         return summary
 
 
@@ -210,6 +265,8 @@ class _Splitter:
         while position < total:
             if data[position] == Opcode.MESSAGE:
                 _, length, channel, _, log_time, publish_time = unpack(data, position)
+                if length < MESSAGE.size - PREFIX.size:
+                    raise ValueError("a message shorter than its header")
                 end = position + PREFIX.size + length
                 messages = batch.get(channel)
                 if messages is None:
@@ -221,6 +278,8 @@ class _Splitter:
                 self.count += 1
             else:
                 opcode, length = PREFIX.unpack_from(data, position)
+                if opcode == 0:
+                    raise ValueError("a record without a kind")
                 end = position + PREFIX.size + length
                 self.file._record(opcode, data[position + PREFIX.size : end])
             position = end
@@ -243,28 +302,6 @@ def _ordered(chunks: list[ChunkIndex]) -> bool:
             return False
         newest = max(newest, index.message_end_time)
     return True
-
-
-def _inflate(body: bytes) -> bytes:
-    """The records of a chunk, CRC checked; raises ValueError when it is wrong."""
-    _, _, size, crc = CHUNK.unpack_from(body)
-    name_length = struct.unpack_from("<I", body, CHUNK.size)[0]
-    at = CHUNK.size + 4 + name_length
-    compression = body[CHUNK.size + 4 : at].decode("ascii")
-    packed = body[at + 8 :][: struct.unpack_from("<Q", body, at)[0]]
-    if size > RECORD_SIZE_LIMIT:
-        raise ValueError(f"says it inflates to {size} bytes")
-    if compression == "zstd":
-        data = zstandard.ZstdDecompressor().decompress(packed, max_output_size=size)
-    elif compression == "lz4":
-        data = lz4.frame.decompress(packed)
-    elif compression == "":
-        data = packed
-    else:
-        raise ValueError(f"unknown compression {compression!r}")
-    if crc and zlib.crc32(data) != crc:
-        raise ValueError("its CRC is wrong")
-    return data
 
 
 def _records(section: bytes) -> Iterator[tuple[int, bytes]]:
