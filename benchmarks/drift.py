@@ -101,8 +101,7 @@ class Fleet:
         """Next window: values (vehicles, P), and the covariance (P, P) of each."""
         variance = np.broadcast_to(np.diag(covariance), value.shape)
         everything = np.ones(value.shape, dtype=bool)
-        if self.windows % PER_WINDOW == 0:
-            self.scatter = scatter.update(self.scatter, value, variance, everything)
+        self.scatter = scatter.update(self.scatter, value, variance, everything, time=self.windows, window=PER_WINDOW)
         share = 1.0 if self.windows == 0 else 1.0 / PER_WINDOW
         self.changes = changes.update(
             self.changes,

@@ -18,7 +18,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
-Outcome = Literal["used", "repaired", "dropped"]
+Outcome = Literal["used", "repaired", "dropped", "uninformative"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +86,7 @@ class Estimate:
     converged: bool
     iterations: int
     states: FloatArray | None = None  # simulated states, shape (T, N), only when asked for
+    informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not
 
 
 @dataclass(slots=True)

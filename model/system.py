@@ -19,7 +19,7 @@ BUNDLED = Path(__file__).parent / "systems"
 MANCHESTER = BUNDLED / "manchester.yaml"
 MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
-_USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
+USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
 _WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit")  # an address without its noise
 
 
@@ -151,7 +151,7 @@ class System:
     def sensor_noise(self) -> FloatArray:
         """Standard deviation of one sample of every sensor, shape (S,); a usual instrument's where none is stated."""
         sensors = self.channels[len(self.inputs) :]
-        return np.array([channel.noise or _USUAL_NOISE[channel.unit] for channel in sensors])
+        return np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in sensors])
 
     @cached_property
     def digest(self) -> str:

@@ -41,7 +41,8 @@ class Board:
         with self._lock:
             entry = self._entries.setdefault(batch.vehicle, Entry(view))
             entry.view = view
-            entry.windows.update(window.outcome for window in batch.fresh)
+            fresh = {window.start for window in batch.fresh}
+            entry.windows.update(record.outcome for record in batch.records if record.start in fresh)
             self._entries.move_to_end(batch.vehicle)
             while len(self._entries) > self._limit:
                 self._entries.popitem(last=False)

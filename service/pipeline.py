@@ -46,6 +46,16 @@ class Identified:
     seconds: dict[str, float]  # by stage
 
 
+NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
+
+
+def _outcome(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:
+    """A window's outcome with the reason for it, once it is known what it tells."""
+    if estimate is not None and not estimate.informative:
+        return "uninformative", NO_EXCITATION
+    return window.outcome, window.reason
+
+
 @dataclass(slots=True)
 class _Vehicle:
     """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
@@ -189,8 +199,7 @@ class Pipeline:
             records.append(
                 WindowRecord(
                     window.start,
-                    window.outcome,
-                    window.reason,
+                    *_outcome(window, estimate),
                     window.repaired_samples,
                     posterior is not None,
                     None if estimate is None else Solved.of(estimate),

@@ -139,7 +139,7 @@ def test_scatter_is_measured_through_a_drift() -> None:
     everything = np.ones((200, 1), dtype=bool)
     for k in range(300):
         value = 0.001 * k + 1.5 * 0.02 * rng.normal(size=(200, 1))
-        running = scatter.update(running, value, np.full((200, 1), 0.02**2), everything)
+        running = scatter.update(running, value, np.full((200, 1), 0.02**2), everything, time=k, window=1)
     assert running.square.mean() == pytest.approx(1.5**2, rel=0.1)
 
 
@@ -163,10 +163,10 @@ def test_surprise_fires_for_a_lasting_offset_and_hardly_ever_without() -> None:
 def test_one_bad_window_is_no_misfit() -> None:
     fit = misfit.Fit()
     for k in range(50):
-        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, learning=True, time=k)
-    fit = misfit.update(fit, 50.0, adequate=False, inflation=1.0, learning=False, time=50)
-    fit = misfit.update(fit, float("nan"), adequate=False, inflation=1.0, learning=False, time=51)
+        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, time=k)
+    fit = misfit.update(fit, 50.0, adequate=False, inflation=1.0, time=50)
+    fit = misfit.update(fit, float("nan"), adequate=False, inflation=1.0, time=51)
     assert fit.misfit_since is None
     for k in range(20):
-        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, learning=False, time=52 + k)
+        fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, time=52 + k)
     assert fit.statistic == 0.0

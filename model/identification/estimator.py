@@ -1,8 +1,8 @@
 """The trained estimator: Fourier features of a window to log-ratios with a covariance.
 
 The force balance of a window (`model.identification.features`) is solved by least squares over bins and degrees of
-freedom.  What is learned: the weight of every row; how much of the known noise power to take out of the normal equations
-(noise in the regressors pulls estimates towards zero); a small network that corrects what remains; and the scale
+freedom.  What is learned: the weight of every row; how much of the known noise power to take out of the normal
+equations (noise in the regressors pulls estimates towards zero); a small network that corrects what remains; and the scale
 of the covariance.  Everything else is mechanics, so the estimator extrapolates as the mechanics does.
 """
 

@@ -15,6 +15,7 @@ from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System
 
 _FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
+EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
 
 
 class UnusableWindow(ValueError):
@@ -115,6 +116,10 @@ def _estimates(refined: Refined, states: bool) -> list[Estimate]:
     with np.errstate(divide="ignore", invalid="ignore"):
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
     limit = 1 + _FIT_SIGMAS * np.sqrt(2 / np.maximum(refined.freedom, 1))
+    fits = refined.chi_square < limit
+    # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
+    told = np.where(fits, refined.identifiable.any(axis=1) & refined.converged, True)
+    informative = (refined.excitation > EXCITED) & told
     return [
         Estimate(
             log_ratio=refined.log_ratio[b],
@@ -123,10 +128,11 @@ def _estimates(refined: Refined, states: bool) -> list[Estimate]:
             nrmse=pooled_nrmse(per_sensor[b]),
             per_sensor=per_sensor[b],
             chi_square=float(refined.chi_square[b]),
-            adequate=bool(refined.chi_square[b] < limit[b] and refined.converged[b]),
+            adequate=bool(fits[b] and refined.converged[b]),
             converged=bool(refined.converged[b]),
             iterations=int(refined.iterations[b]),
             states=refined.states[b] if states else None,
+            informative=bool(informative[b]),
         )
         for b in range(len(refined.log_ratio))
     ]

@@ -15,8 +15,8 @@ from torch import Tensor
 from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
 from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, FORCE, VELOCITY
 from sprung.model.signals import BoolArray, FloatArray
-from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
-from sprung.model.system import System
+from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator, knot_columns
+from sprung.model.system import USUAL_NOISE, System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
@@ -80,6 +80,7 @@ class WindowModel:
         weight[0] = np.sqrt(1 / samples)
         self.weight = torch.as_tensor(weight)
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
+        self.usual_noise = torch.where(self.drive_noise > 0, self.drive_noise, torch.as_tensor(_usual_noise(system)))
         self.sensor_noise = system.sensor_noise
         self._compressions: dict[bytes, Tensor] = {}
 
@@ -177,6 +178,16 @@ class WindowModel:
         """Simulated states, (B, T, N)."""
         s = self.simulator
         return s.states(s.discretise(s.element_values(x)), data.w, x0)
+
+    def excitation(self, data: WindowBatch) -> Tensor:
+        """Mean power over bins of the strongest drive, over that of its noise, (B,); about 1 at standstill.
+
+        The mean is left out: an offset moves nothing.  Drives without a stated noise have that of a usual instrument.
+        """
+        if not self.simulator.W:
+            return torch.full((len(data.w),), torch.inf, dtype=data.w.dtype)
+        power = self._spectra(data.w[:, :, 0::2])[:, 1:].abs().square() / self.samples
+        return (power / self.usual_noise[1:] ** 2).mean(dim=1).amax(dim=1)
 
     def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
         """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
@@ -316,6 +327,11 @@ class WindowModel:
         per_load = -(whiten @ (self._sensing(values, data) @ compliance))
         masses = s.m_of[-s.estimated_masses :].T.to(kind)  # (n, masses)
         return (per_load * spectra[:, :, None]) @ masses
+
+
+def _usual_noise(system: System) -> FloatArray:
+    """Noise of usual instruments for the values of the drives, shape (W/2,)."""
+    return np.array([USUAL_NOISE[system.inputs[value].unit] for value in knot_columns(system)[0]])
 
 
 def _rows(spectra: Tensor) -> Tensor:

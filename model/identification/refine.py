@@ -51,6 +51,7 @@ class Refined:
     error: FloatArray  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
     rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
     states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
+    excitation: FloatArray  # power of the strongest input over that of its noise, shape (B,)
 
 
 class Refiner:
@@ -163,6 +164,7 @@ class Refiner:
             error=progress.error[rows].numpy(),
             rms=rms,
             states=path.numpy(),
+            excitation=self.model.excitation(data).numpy(),
         )
 
 

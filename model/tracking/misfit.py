@@ -15,6 +15,7 @@ MOST = 4.0  # one window adds at most this less REFERENCE
 THRESHOLD = 20.0  # so ten windows in a row at least; 2 h k = 80: Gaussian scatter alone never gets there
 CONTRADICTION = 2.5  # scatter over what windows state, as variances; by chance 1 + 6 standard deviations of 60 pairs
 AGREEMENT = 1.8  # once contradicting, windows agree again below this
+FLOOR_WINDOWS = 60  # that the floor is learned from, whatever they identify: a spread known to a tenth
 LEAST_SPREAD = 0.1  # of log chi-square; windows of one vehicle differ by that with speed and track
 
 
@@ -30,14 +31,15 @@ class Fit:
     misfit_since: int | None = None  # ns; None: windows fit
 
 
-def update(fit: Fit, chi_square: float, *, adequate: bool, inflation: float, learning: bool, time: int) -> Fit:
+def update(fit: Fit, chi_square: float, *, adequate: bool, inflation: float, time: int) -> Fit:
     """After one window; `time` in ns, `inflation` the largest scatter of a parameter over what windows state.
 
-    The floor is learned from adequate windows while `learning`.
+    The floor is learned from the first `FLOOR_WINDOWS` adequate windows of the vehicle and then stays: a floor that
+    went on learning would follow a slow rise.
     """
     usable = math.isfinite(chi_square) and chi_square > 0
     level = math.log(chi_square) if usable else math.inf
-    if adequate and usable and learning:
+    if adequate and usable and fit.windows < FLOOR_WINDOWS:
         count = fit.windows + 1
         mean = fit.mean + (level - fit.mean) / count
         fit = replace(fit, windows=count, mean=mean, moment=fit.moment + (level - fit.mean) * (level - mean))

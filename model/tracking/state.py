@@ -16,7 +16,8 @@ from sprung.model.tracking.misfit import Fit
 from sprung.model.tracking.scatter import Scatter
 from sprung.model.tracking.surprise import Surprise
 
-FORMAT = 1
+FORMAT = 2
+_READ = (1, FORMAT)
 
 Kind = Literal["change", "misfit"]
 Severity = Literal["warning", "alarm"]
@@ -54,9 +55,9 @@ class TrackerState:
     names: tuple[str, ...]
     time: int | None  # ns, start of the last window that was seen
     last: int | None  # ns, start of the last window that was used
-    anchored: int | None  # ns, start of the window that `scatter` compares with
     used: int  # windows fused
     rejected: int  # windows not fused: inadequate, not converged, or without a proper covariance
+    idle: int  # windows without excitation: nothing was learned from them, for or against
     outliers: int  # windows fused with bounded influence
     belief: Belief
     scatter: Scatter
@@ -82,9 +83,9 @@ class TrackerState:
             "names": list(self.names),
             "time": self.time,
             "last": self.last,
-            "anchored": self.anchored,
             "used": self.used,
             "rejected": self.rejected,
+            "idle": self.idle,
             "outliers": self.outliers,
             "belief": _pack_all({"mean": self.belief.mean, "covariance": self.belief.covariance[upper]}),
             "scatter": _pack_all(asdict(self.scatter)),
@@ -97,21 +98,21 @@ class TrackerState:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TrackerState:
         """Raises TrackerStateError with what is wrong."""
-        if data.get("format") != FORMAT:
+        if data.get("format") not in _READ:
             raise TrackerStateError(
-                f"stored tracker state has format {data.get('format')!r}; this version reads format {FORMAT}"
+                f"stored tracker state has format {data.get('format')!r}; this version reads formats 1 to {FORMAT}"
             )
         try:
             return cls(
                 names=tuple(data["names"]),
                 time=data["time"],
                 last=data["last"],
-                anchored=data["anchored"],
                 used=data["used"],
                 rejected=data["rejected"],
+                idle=data.get("idle", 0),
                 outliers=data["outliers"],
                 belief=_belief(**_unpack_all(data["belief"])),
-                scatter=Scatter(**_unpack_all(data["scatter"])),
+                scatter=_scatter(data),
                 surprise=Surprise(**_unpack_all(data["surprise"])),
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=Fit(**data["fit"]),
@@ -127,6 +128,14 @@ def _belief(mean: FloatArray, covariance: FloatArray) -> Belief:
     full[upper] = covariance
     full.T[upper] = covariance
     return Belief(mean, full)
+
+
+def _scatter(data: Mapping[str, Any]) -> Scatter:
+    """Format 1 timed its pairs for the vehicle as a whole."""
+    arrays = _unpack_all(data["scatter"])
+    if data["format"] == 1:
+        arrays["anchored"] = np.full(arrays["anchor"].shape, data["anchored"] or 0, dtype=np.int64)
+    return Scatter(**arrays)
 
 
 def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:

@@ -30,7 +30,6 @@ __all__ = [
     "TrackerStateError",
 ]
 
-STALE_PAIR = 5.0  # windows; a pair further apart than this does not measure scatter, for a drift may enter
 OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
@@ -82,9 +81,9 @@ class Tracker:
             names=self.names,
             time=None,
             last=None,
-            anchored=None,
             used=0,
             rejected=0,
+            idle=0,
             outliers=0,
             belief=kalman.prior(size, self.settings.prior, self.settings.process),
             scatter=scatter.start((size,)),
@@ -95,23 +94,26 @@ class Tracker:
         )
 
     def update(self, state: TrackerState, estimate: Estimate, time_ns: int) -> TrackerState:
-        """State after the window that starts at `time_ns`; a window not later than the last is ignored."""
+        """State after the window that starts at `time_ns`; a window not later than the last is ignored.
+
+        One without excitation speaks neither for nor against anything: it only passes the time.
+        """
         self._check(state, estimate)
         if state.time is not None and time_ns <= state.time:
             return state
+        if not estimate.informative:
+            return replace(state, time=time_ns, idle=state.idle + 1)
         centre = time_ns + _ns(self.settings.window / 2)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
         new = replace(state, rejected=state.rejected + 1)
         if usable and mask.any() and _proper(estimate.covariance[np.ix_(mask, mask)]):
             new = self._fuse(state, estimate, mask, time_ns, centre)
-        learning = bool(np.any(new.changes.learned < self.settings.learning))
         fit = misfit.update(
             state.fit,
             estimate.chi_square,
             adequate=estimate.adequate,
             inflation=float(new.scatter.inflation.max()),
-            learning=learning,
             time=centre,
         )
         new = replace(new, time=time_ns, fit=fit)
@@ -199,7 +201,7 @@ class Tracker:
         value = np.where(mask, estimate.log_ratio, 0.0)
         variance = np.where(mask, np.diag(estimate.covariance), 1.0)
 
-        measured, anchored = self._scatter(state, value, variance, mask, time_ns)
+        measured = scatter.update(state.scatter, value, variance, mask, time=time_ns, window=_ns(settings.window))
         wide = np.sqrt(measured.inflation)
         covariance = estimate.covariance * np.outer(wide, wide)
         fresh = variance * measured.inflation / share
@@ -229,7 +231,6 @@ class Tracker:
         return replace(
             state,
             last=time_ns,
-            anchored=anchored,
             used=state.used + 1,
             outliers=state.outliers + int(innovation.bounded),
             belief=belief,
@@ -237,20 +238,6 @@ class Tracker:
             surprise=watch,
             changes=tested,
         )
-
-    def _scatter(
-        self, state: TrackerState, value: FloatArray, variance: FloatArray, mask: BoolArray, time_ns: int
-    ) -> tuple[scatter.Scatter, int]:
-        """Scatter after this window, and the time of its anchor; unchanged while windows overlap the anchor."""
-        if state.anchored is None:
-            return scatter.update(state.scatter, value, variance, mask), time_ns
-        apart = (time_ns - state.anchored) / _ns(self.settings.window)
-        if apart < 1.0:
-            return state.scatter, state.anchored
-        previous = state.scatter
-        if apart > STALE_PAIR:
-            previous = replace(previous, anchor=np.full_like(previous.anchor, np.nan))
-        return scatter.update(previous, value, variance, mask), time_ns
 
     def _drift(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """value / baseline - 1 and its standard deviation, each of shape (P,); NaN before any window."""

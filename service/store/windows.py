@@ -60,7 +60,7 @@ class WindowRecord:
     """One window as the store keeps it."""
 
     start: int  # ns since epoch
-    outcome: str  # used, repaired, dropped
+    outcome: str  # used, repaired, dropped, uninformative
     reason: str | None
     repaired_samples: int
     tracked: bool  # False: dropped, or older than what the tracker had seen
