@@ -6,17 +6,20 @@ TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
-SOURCES := sprung/__init__.py model replay service benchmarks tests
+SOURCES := sprung noxfile.py model replay service benchmarks tests
 DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
+PYTEST ?=
 
-.PHONY: help install install-dev demo test test-slow lint format bench clean
+.PHONY: help install install-dev demo test test-slow matrix ci lint format bench clean
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
 	@echo "make test       install, run the tests"
 	@echo "make test-slow  the tests that take minutes"
+	@echo "make matrix     the fast tests on Python 3.11, 3.12 and 3.13, those that are installed"
 	@echo "make lint       ruff and mypy"
+	@echo "make ci         lint, then the tests with coverage, as CI does"
 	@echo "make bench      list the benchmarks; make bench NAME=replay runs one"
 
 install: $(VENV)/.installed
@@ -40,10 +43,17 @@ demo: install
 	$(BIN)/sprung serve --replay $(DEMO) --port $(PORT) --data-dir .demo
 
 test: install-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest $(PYTEST)
 
 test-slow: install-dev
 	$(BIN)/python -m pytest -m slow
+
+matrix: install-dev
+	$(BIN)/nox
+
+# what CI runs: lint, types, tests with the documented examples, coverage
+ci: lint
+	$(MAKE) test PYTEST="--cov --cov-report=term:skip-covered"
 
 lint: install-dev
 	$(BIN)/ruff check $(SOURCES)

@@ -80,7 +80,7 @@ def shared_bound(
     response = simulator.free_response(discrete, states.shape[1])[0].numpy()  # (T, S, N)
     noise = system.sensor_noise
     sizes = torch.cat([states, knots], dim=2).square().mean((0, 1)).sqrt().numpy()
-    information = 0.0
+    information = np.zeros(())
     for x, w in zip(states, knots, strict=True):
         outputs, paths = simulator.simulate(log_ratio + offsets, w.expand(2 * P, -1, -1), x[:1].expand(2 * P, -1))
         moved = paths @ discrete.C[0].mT if free else outputs

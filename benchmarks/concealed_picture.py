@@ -40,7 +40,9 @@ def confusion_panel(axes: Axes, scores: list[Score]) -> None:
     axes.imshow(shares, cmap="GnBu", vmin=0, vmax=1)
     for row, column in np.ndindex(counts.shape):
         dark = shares[row, column] > 0.6
-        axes.text(column, row, counts[row, column], ha="center", va="center", color="white" if dark else ink.MEASURED)
+        axes.text(
+            column, row, str(counts[row, column]), ha="center", va="center", color="white" if dark else ink.MEASURED
+        )
     words = [v.replace("_", "\n") for v in VERDICTS]
     axes.set_xticks(range(4), words, fontsize=8)
     axes.set_yticks(range(4), words, fontsize=8)

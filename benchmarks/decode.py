@@ -17,6 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import cantools
 import numpy as np
@@ -40,18 +41,25 @@ START = 1_790_000_000_000_000_000
 
 def run(
     can: str | None = None, dbc: str | None = None, mcap: str | None = None, seconds: float = 60.0
-) -> Iterator[dict]:
+) -> Iterator[dict[str, Any]]:
     """One dict per figure: name, value, unit, peer, ratio, target.  `can` with `dbc`, and `mcap`, are files to read
     instead of the made ones, which are `seconds` long."""
     with tempfile.TemporaryDirectory() as folder:
-        database = cantools.database.load_file(dbc, strict=False) if dbc else _database()
+        database = _load(dbc) if dbc else _database()
         frames = _read_frames(Path(can)) if can else _frames(database, seconds)
         yield _can_figure(database, frames)
         path = Path(mcap) if mcap else _write_mcap(Path(folder) / "made.mcap", seconds)
         yield _mcap_figure(path)
 
 
-def _can_figure(database: Database, blocks: Sequence[FrameBlock]) -> dict:
+def _load(dbc: str) -> Database:
+    database = cantools.database.load_file(dbc, strict=False)
+    if not isinstance(database, Database):
+        raise ValueError(f"{dbc}: not a CAN database")
+    return database
+
+
+def _can_figure(database: Database, blocks: Sequence[FrameBlock]) -> dict[str, Any]:
     known = {m.frame_id | (EXTENDED if m.is_extended_frame else 0): m for m in database.messages}
     present = {int(i) for block in blocks for i in np.unique(block.id)} & set(known)
     channels = [
@@ -78,7 +86,7 @@ def _can_figure(database: Database, blocks: Sequence[FrameBlock]) -> dict:
     return _figure("CAN decoding", total / ours, "frames/s", len(loop) / theirs, 20.0)
 
 
-def _mcap_figure(path: Path) -> dict:
+def _mcap_figure(path: Path) -> dict[str, Any]:
     with path.open("rb") as file:
         reader = make_reader(file)
         topics = {}
@@ -118,7 +126,7 @@ def _best(product: Callable[[], None], peer: Callable[[], None]) -> tuple[float,
     return min(times[0]), min(times[1])
 
 
-def _figure(name: str, value: float, unit: str, peer: float, target: float) -> dict:
+def _figure(name: str, value: float, unit: str, peer: float, target: float) -> dict[str, Any]:
     return {"name": name, "value": value, "unit": unit, "peer": peer, "ratio": value / peer, "target": target}
 
 

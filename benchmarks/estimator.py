@@ -8,6 +8,7 @@ of the rows suggests, and as trained (the network whose weights are learned, tha
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system
 
 
-def run(windows: int = 500, seed: int = 201) -> Iterator[dict]:
+def run(windows: int = 500, seed: int = 201) -> Iterator[dict[str, Any]]:
     """One dict per figure."""
     system = load_system()
     rng = np.random.default_rng(seed)
@@ -61,7 +62,7 @@ def _tracked(system: System, truth: FloatArray, rng: np.random.Generator) -> Flo
     return truth + 0.2 * (one.log_ratio - truth)
 
 
-def _designs(system: System, trained: EstimatorNet, values: FloatArray, truth: FloatArray) -> Iterator[dict]:
+def _designs(system: System, trained: EstimatorNet, values: FloatArray, truth: FloatArray) -> Iterator[dict[str, Any]]:
     features = ForceBalance(system, system.window)
     target, regressors = features(values)
     plain = EstimatorNet(trained.architecture).double()

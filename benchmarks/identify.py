@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,7 +28,7 @@ from sprung.model.system import System, load_system
 
 def run(
     part: str = "all", windows: int = 2000, paper_windows: int = 12000, bounds: int = 24, scipy_windows: int = 2
-) -> Iterator[dict]:
+) -> Iterator[dict[str, Any]]:
     """One dict per figure; `part` is accuracy, paper, sensing, speed or all."""
     system = load_system()
     torch.set_num_threads(1)
@@ -50,7 +51,7 @@ def _std(estimates: list[Estimate]) -> FloatArray:
     return np.sqrt([np.diag(e.covariance) for e in estimates])
 
 
-def _accuracy(system: System, windows: int, bounds: int) -> Iterator[dict]:
+def _accuracy(system: System, windows: int, bounds: int) -> Iterator[dict[str, Any]]:
     runs = _draw(system, windows, 101)
     identifier = load_identifier(system)
     estimates = identifier.identify(runs.values)
@@ -102,7 +103,7 @@ def _accuracy(system: System, windows: int, bounds: int) -> Iterator[dict]:
     }
 
 
-def _paper_feature(system: System, windows: int, steps: int = 3000) -> dict:
+def _paper_feature(system: System, windows: int, steps: int = 3000) -> dict[str, Any]:
     """The paper's |DFT| of all signals and a network of three layers, trained on windows drawn alike."""
     train, test = _draw(system, windows, 102), _draw(system, 1000, 103)
     scale = train.values.std(axis=(0, 1))
@@ -137,7 +138,7 @@ def _paper_feature(system: System, windows: int, steps: int = 3000) -> dict:
     }
 
 
-def _paper_sensing(windows: int) -> Iterator[dict]:
+def _paper_sensing(windows: int) -> Iterator[dict[str, Any]]:
     """All 18 states measured with noise of 1 % of their rms, inputs known, as the paper's train task has it."""
     system = full_state_system(_draw(load_system(), 64, 104), 0.01)
     runs = _draw(system, windows, 105)
@@ -154,7 +155,7 @@ def _paper_sensing(windows: int) -> Iterator[dict]:
     }
 
 
-def _speed(system: System, scipy_windows: int) -> Iterator[dict]:
+def _speed(system: System, scipy_windows: int) -> Iterator[dict[str, Any]]:
     identifier = load_identifier(system, workers=os.cpu_count() or 1)
     runs = _draw(system, 1024, 106)
     identifier.identify(runs.values)
@@ -208,7 +209,7 @@ def _speed(system: System, scipy_windows: int) -> Iterator[dict]:
     }
 
 
-def _arithmetic(identifier: Identifier, runs: Runs, rate: float) -> Iterator[dict]:
+def _arithmetic(identifier: Identifier, runs: Runs, rate: float) -> Iterator[dict[str, Any]]:
     """Multiplications of matrices that a window needs, counted, and the share of the cores' peak reached."""
     from torch.utils.flop_counter import FlopCounterMode
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +14,6 @@ from sprung.benchmarks import paper_pictures
 from sprung.benchmarks.paper_settings import Settings
 from sprung.model.alps import evaluate, mass_spring_damper, pendulum, two_body
 from sprung.model.alps.config import METHODS, NetworkConfig, training_config
-from sprung.model.alps.config import Method as MethodName
 from sprung.model.alps.evaluate import Predicted
 from sprung.model.alps.fit import Split, VisualModel, embedded, train_frames, train_method
 from sprung.model.alps.task import Task
@@ -78,7 +77,7 @@ def rows(settings: Settings) -> Iterator[dict[str, Any]]:
             continue
         begin, busy = time.perf_counter(), time.process_time()
         model = train_method(
-            task, cast(MethodName, method), splits["train"], frames, config, sizes, settings.folder,
+            task, method, splits["train"], frames, config, sizes, settings.folder,
             settings.clock, settings.device,
         )  # fmt: skip
         seconds, processor = time.perf_counter() - begin, time.process_time() - busy

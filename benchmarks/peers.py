@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,9 @@ from scipy.optimize import least_squares
 
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+
+Drive = Callable[[float], FloatArray]
+Matrices = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +44,7 @@ class ScipyPeer:
         ratio, converged = fit(window, u, P, begin + limit)
         return PeerFit(np.log(np.maximum(ratio, 1e-3)), time.perf_counter() - begin, converged)
 
-    def _drive(self, window: FloatArray):
+    def _drive(self, window: FloatArray) -> Drive:
         t = np.arange(len(window)) / self.system.sample_rate
         splines = [CubicHermiteSpline(t, window[:, i], window[:, i + 1]) for i in range(0, self.inputs, 2)]
         rates = [s.derivative() for s in splines]
@@ -50,17 +54,17 @@ class ScipyPeer:
 
         return u
 
-    def _matrices(self, ratio: FloatArray):
+    def _matrices(self, ratio: FloatArray) -> Matrices:
         value = self.system.nominal * ratio
         return self.system.mechanics.matrices(value[:12], value[12:])
 
-    def _simulate(self, ratio: FloatArray, x0: FloatArray, u, samples: int) -> FloatArray:
+    def _simulate(self, ratio: FloatArray, x0: FloatArray, u: Drive, samples: int) -> FloatArray:
         A, B, C, D = self._matrices(ratio)
         t = np.arange(samples) / self.system.sample_rate
         solution = solve_ivp(lambda s, x: A @ x + B @ u(s), (0, t[-1]), x0, t_eval=t, rtol=1e-6, atol=1e-9)
         return solution.y.T @ C.T + np.array([u(s) for s in t]) @ D.T
 
-    def _joint(self, window: FloatArray, u, P: int, deadline: float) -> tuple[FloatArray, bool]:
+    def _joint(self, window: FloatArray, u: Drive, P: int, deadline: float) -> tuple[FloatArray, bool]:
         measured = window[:, self.inputs :]
 
         def residual(z: FloatArray) -> FloatArray:
@@ -77,7 +81,7 @@ class ScipyPeer:
             return best[0][:P], False
         return found.x[:P], bool(found.success)
 
-    def _separated(self, window: FloatArray, u, P: int, deadline: float) -> tuple[FloatArray, bool]:
+    def _separated(self, window: FloatArray, u: Drive, P: int, deadline: float) -> tuple[FloatArray, bool]:
         """The help: free responses by the matrix exponential and projected out, and a step for the differences."""
         measured = window[:, self.inputs :]
 
@@ -111,7 +115,7 @@ def ukf_peer(system: System, window: FloatArray, truth: FloatArray) -> tuple[flo
     dt, P, inputs = 1 / system.sample_rate, len(system.parameters), len(system.inputs)
     scale = np.r_[np.full(9, 1e-2), np.full(9, 0.2), np.ones(P)]
 
-    def matrices(z: FloatArray):
+    def matrices(z: FloatArray) -> Matrices:
         value = system.nominal * np.exp(np.clip(z[18:], -2.5, 2.5))
         return system.mechanics.matrices(value[:12], value[12:])
 

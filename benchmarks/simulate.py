@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,12 +16,13 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.simulate.ode import LinearRate, solve
 from sprung.model.system import load_system
 
 
-def run(windows: int = 256, scipy_windows: int = 3) -> Iterator[dict]:
+def run(windows: int = 256, scipy_windows: int = 3) -> Iterator[dict[str, Any]]:
     """One dict per figure."""
     system = load_system()
     rng = np.random.default_rng(301)
@@ -41,13 +43,15 @@ def run(windows: int = 256, scipy_windows: int = 3) -> Iterator[dict]:
         for method, options in (("dopri5", {}), ("rk4", {"step_size": simulator.dt / 8})):
             yield _torchdiffeq(simulator, log_ratio, w, x0, method, options, error, ours)
     begin = time.perf_counter()
-    x = np.stack([_scipy(simulator, log_ratio[i : i + 1], w[i : i + 1], x0[i], 1e-10) for i in range(scipy_windows)])
+    checked = np.stack(
+        [_scipy(simulator, log_ratio[i : i + 1], w[i : i + 1], x0[i], 1e-10) for i in range(scipy_windows)]
+    )
     rate = scipy_windows / (time.perf_counter() - begin)
     yield {
         "name": "scipy DOP853, one window after the other",
         "value": round(rate, 2),
         "unit": "windows/s",
-        "error": error(torch.as_tensor(x)),
+        "error": error(torch.as_tensor(checked)),
         "ratio": round(ours / rate, 0),
     }
 
@@ -61,7 +65,7 @@ def _torchdiffeq(
     options: dict[str, float],
     error: Callable[[Tensor], float],
     ours: float,
-) -> dict:
+) -> dict[str, Any]:
     rate = LinearRate(simulator, log_ratio, w)
     grid = torch.arange(w.shape[1], dtype=torch.float64) * simulator.dt
     seconds, x = _timed(
@@ -97,7 +101,14 @@ def _scipy(simulator: LinearSimulator, log_ratio: Tensor, w: Tensor, x0: Tensor,
         p0, m0, p1, m1 = knots[k, 0::2], knots[k, 1::2] * dt, knots[k + 1, 0::2], knots[k + 1, 1::2] * dt
         a2, a3 = 3 * (p1 - p0) - 2 * m0 - m1, 2 * (p0 - p1) + m0 + m1
 
-        def rate(t: float, x: np.ndarray, p0=p0, m0=m0, a2=a2, a3=a3) -> np.ndarray:
+        def rate(
+            t: float,
+            x: FloatArray,
+            p0: FloatArray = p0,
+            m0: FloatArray = m0,
+            a2: FloatArray = a2,
+            a3: FloatArray = a3,
+        ) -> FloatArray:
             s = t / dt
             value = p0 + s * (m0 + s * (a2 + s * a3))
             return A @ x + b_value @ value + b_rate @ ((m0 + s * (2 * a2 + 3 * s * a3)) / dt)

@@ -73,7 +73,7 @@ class LiveBus:
         retry = FIRST_RETRY
         while not self.stop.is_set():
             try:
-                with self._open() as bus:
+                with self._open() as bus:  # type: ignore[no-untyped-call]
                     self.connected = True
                     for messages in self._receive(bus):
                         retry = FIRST_RETRY

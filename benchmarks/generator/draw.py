@@ -106,7 +106,7 @@ def _add_fault(case: Case, rng: np.random.Generator, kind: str, vehicle: Vehicle
     on_sensor = rng.random() < 0.75
     first = 2 * len(vehicle.inputs)
     index = int(rng.integers(first, len(channels)) if on_sensor else rng.integers(0, first))
-    value = {
+    value = {  # type: ignore[no-untyped-call]
         "sensor_gain": lambda: 1 + rng.choice([-1, 1]) * small * _log_uniform(rng, 0.01, 0.2),
         "sensor_lag": lambda: small * _log_uniform(rng, 5e-4, 0.012),
         "sensor_bias": lambda: rng.choice([-1, 1]) * noise[index] * small * _log_uniform(rng, 0.3, 30),

@@ -37,7 +37,7 @@ def _running_median(x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
     which = np.clip(np.searchsorted(edges, x, side="right") - 1, 0, len(edges) - 2)
     groups = [(x[which == b], y[which == b]) for b in range(len(edges) - 1)]
     rows = [(np.median(gx), *np.quantile(gy, [0.5, 0.25, 0.75])) for gx, gy in groups if gx.size > 3]
-    return tuple(np.array(rows).T) if rows else (np.array([]),) * 4  # type: ignore[return-value]
+    return tuple(np.array(rows).T) if rows else (np.array([]),) * 4
 
 
 def residual_figure(report: Report, finding: int) -> Figure | None:

@@ -1,0 +1,238 @@
+"""Sprung from Python: a system, its recordings, and what they tell about springs and dampers.
+
+Everything here is also reached as `sprung.NAME`.  Arrays are float64 in SI units; T samples, C channels, I measured
+inputs, S sensors, P parameters.  Input that cannot be used raises a ValueError of one line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from sprung.model.diagnosis.investigation.diagnose import diagnose
+from sprung.model.identification.identify import Identifier, UnusableWindow, load_identifier
+from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.model.simulate.linear import LinearSimulator, knots
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system, parse_system
+from sprung.model.tracking.tracker import Alarm, ParameterReport, Tracker, TrackerSettings
+from sprung.replay.record import Record
+from sprung.replay.record import load_record as load_channels
+from sprung.replay.recording import Recording
+from sprung.replay.recording import open_recording as open_channels
+from sprung.replay.windowing import Windower
+from sprung.service.report import write_report
+
+__all__ = [
+    "IdentifiedWindow",
+    "ParameterValue",
+    "Tracked",
+    "diagnose",
+    "identify",
+    "load_record",
+    "load_system",
+    "open_recording",
+    "parse_system",
+    "simulate",
+    "track",
+    "write_report",
+]
+
+AT_ONCE = 128  # windows that are identified together
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterValue:
+    """One identified parameter."""
+
+    name: str  # "secondary_2l.damping"
+    value: float  # `unit`
+    std: float  # standard deviation, `unit`
+    unit: str
+    nominal: float  # `unit`
+    identifiable: bool  # False: the window does not tell; value and std are those of the prior
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedWindow:
+    """What one window told."""
+
+    parameters: tuple[ParameterValue, ...]
+    estimate: Estimate  # the same as log-ratios with their covariance, and how well the window fits
+
+    def __getitem__(self, name: str) -> ParameterValue:
+        """A parameter by name."""
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(f"no parameter {name!r}; there are {', '.join(p.name for p in self.parameters)}")
+
+
+@dataclass(frozen=True, slots=True)
+class Tracked:
+    """What a recording came to."""
+
+    parameters: tuple[ParameterReport, ...]  # posterior, baseline and drift of every parameter
+    alarms: tuple[Alarm, ...]
+    health: str  # ok | maintenance_required | out_of_specification | check_function
+    windows: int  # that were tracked
+
+
+def open_recording(path: str | Path, system: System, dbc: str | Path | None = None) -> Recording:
+    """A recording as a stream of samples of the system's channels; `.blocks()` reads it, once.
+
+    dbc: the CAN database of a BLF, ASC, candump or MF4 file; the bundled one for the bundled system.
+    Errors: `UnreadableRecording`, one line, now or while reading.
+    """
+    return open_channels(path, system.channels, dbc=dbc or _bundled_dbc(system))
+
+
+def load_record(path: str | Path, system: System, dbc: str | Path | None = None) -> Record:
+    """A whole recording on one even grid, as `diagnose` wants it.  Errors: `UnreadableRecording`."""
+    return load_channels(path, system.channels, system.sample_rate, dbc=dbc or _bundled_dbc(system))
+
+
+def simulate(
+    system: System, inputs: FloatArray, parameters: Mapping[str, float] | None = None, start: FloatArray | None = None
+) -> FloatArray:
+    """What the sensors of a system would show, noise-free, shape (T, S).
+
+    inputs: measured inputs in the order of `system.inputs`, shape (T, I), sampled at `system.sample_rate`.
+    parameters: values that differ from nominal, by name, in SI units.
+    start: state at the first sample (displacements, then rates), shape (N,); at rest by default.
+
+    >>> import numpy as np, sprung
+    >>> system = sprung.load_system()
+    >>> time = np.arange(400) / system.sample_rate
+    >>> inputs = np.zeros((400, len(system.inputs)))
+    >>> inputs[:, 0::2] = (1e-3 * np.sin(2 * np.pi * 1.1 * time))[:, None]
+    >>> inputs[:, 1::2] = np.gradient(inputs[:, 0::2], 0.01, axis=0)
+    >>> sensors = sprung.simulate(system, inputs, {"secondary_1l.damping": 10e3})
+    >>> sensors.shape
+    (400, 12)
+    """
+    inputs = np.asarray(inputs, dtype=np.float64)
+    if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
+        raise ValueError(f"inputs: shape (T, {len(system.inputs)}) expected, {inputs.shape} came")
+    windows = np.concatenate([inputs, np.zeros((len(inputs), len(system.sensors)))], axis=1)[None]
+    simulator = LinearSimulator(system)
+    x0 = torch.zeros(1, 2 * system.mechanics.n, dtype=torch.float64)
+    if start is not None:
+        x0[0] = torch.as_tensor(np.asarray(start, dtype=np.float64))
+    log_ratio = torch.as_tensor(_log_ratio(system, parameters or {}))[None]
+    shown, _ = simulator.simulate(log_ratio, torch.as_tensor(knots(system, windows)), x0)
+    result: FloatArray = shown[0].numpy()
+    return result
+
+
+def identify(
+    system: System, values: FloatArray | Mapping[str, FloatArray], model: Identifier | None = None
+) -> IdentifiedWindow:
+    """Stiffness and damping of every element from one window.
+
+    values: shape (T, C) in the order of `system.channels`, or one array per channel name; an absent sensor is NaN or
+    left out, inputs have to be there.
+    model: `load_identifier(system, folder)` for weights of your own; the bundled ones, or the nominal start, otherwise.
+    Errors: `UnusableWindow`.
+
+    >>> import numpy as np, sprung
+    >>> system = sprung.load_system()
+    >>> rng = np.random.default_rng(1)
+    >>> speed = rng.normal(0, 0.02, (100, 8)).cumsum(axis=0) * 0.1
+    >>> inputs = np.empty((100, 16))
+    >>> inputs[:, 1::2] = speed
+    >>> inputs[:, 0::2] = speed.cumsum(axis=0) / system.sample_rate
+    >>> sensors = sprung.simulate(system, inputs, {"primary_11l.stiffness": 1.0e6})
+    >>> window = sprung.identify(system, np.concatenate([inputs, sensors], axis=1))
+    >>> abs(window["primary_11l.stiffness"].value - 1.0e6) < 3 * window["primary_11l.stiffness"].std
+    True
+    """
+    window = _window(system, values)
+    estimate = (model or load_identifier(system)).identify(window[None])[0]
+    return IdentifiedWindow(_values(system, estimate), estimate)
+
+
+def track(system: System, recording: Recording, model: Identifier | None = None) -> Tracked:
+    """Posterior, drift and alarms of every parameter over a whole recording.
+
+    >>> import sprung
+    >>> system = sprung.load_system()
+    >>> ride = sprung.open_recording("tests/data/drift-600s.blf", system)
+    >>> tracked = sprung.track(system, ride)
+    >>> [alarm.parameter for alarm in tracked.alarms]
+    ['secondary_2l.damping', 'primary_12r.stiffness']
+    """
+    model = model or load_identifier(system)
+    rate = system.sample_rate
+    tracker = Tracker(system.parameters, TrackerSettings(window=system.window / rate, hop=system.hop / rate))
+    state, count = tracker.initial_state(), 0
+    for windows in _usable(system, recording):
+        estimates = model.identify(np.stack([w.values for w in windows]))
+        middle = round(0.5e9 * system.window / rate)
+        for window, estimate in zip(windows, estimates, strict=True):
+            state = tracker.update(state, estimate, window.start + middle)
+        count += len(windows)
+    return Tracked(tracker.report(state), state.alarms, tracker.health(state), count)
+
+
+def _usable(system: System, recording: Recording) -> Iterator[list[Window]]:
+    """Windows that were not dropped, in batches."""
+    windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
+    held: list[Window] = []
+
+    def windows() -> Iterator[Window]:
+        for block in recording.blocks():
+            yield from windower.push(block)
+        yield from windower.flush()
+
+    for window in windows():
+        if window.outcome != "dropped":
+            held.append(window)
+        if len(held) == AT_ONCE:
+            yield held
+            held = []
+    if held:
+        yield held
+
+
+def _window(system: System, values: FloatArray | Mapping[str, FloatArray]) -> FloatArray:
+    if not isinstance(values, Mapping):
+        return np.asarray(values, dtype=np.float64)
+    names = [channel.name for channel in system.channels]
+    unknown = sorted(set(values) - set(names))
+    if unknown:
+        raise UnusableWindow(f"{unknown[0]}: no such channel; there are {', '.join(names)}")
+    lengths = {name: len(column) for name, column in values.items()}
+    if len(set(lengths.values())) != 1:
+        raise UnusableWindow(f"channels differ in length: {lengths}")
+    absent = np.full(next(iter(lengths.values())), np.nan)
+    return np.stack([np.asarray(values.get(name, absent), dtype=np.float64) for name in names], axis=1)
+
+
+def _values(system: System, estimate: Estimate) -> tuple[ParameterValue, ...]:
+    std = np.sqrt(np.diag(estimate.covariance))
+    return tuple(
+        ParameterValue(
+            p.name, p.nominal * float(np.exp(x)), p.nominal * float(np.exp(x) * s), p.unit, p.nominal, bool(i)
+        )
+        for p, x, s, i in zip(system.parameters, estimate.log_ratio, std, estimate.identifiable, strict=True)
+    )
+
+
+def _log_ratio(system: System, values: Mapping[str, float]) -> FloatArray:
+    index = {p.name: i for i, p in enumerate(system.parameters)}
+    result = np.zeros(len(index))
+    for name, value in values.items():
+        if name not in index:
+            raise ValueError(f"{name}: no such parameter; there are {', '.join(index)}")
+        if not value > 0:
+            raise ValueError(f"{name}: a positive value is needed, not {value}")
+        result[index[name]] = np.log(value / system.parameters[index[name]].nominal)
+    return result
+
+
+def _bundled_dbc(system: System) -> Path | None:
+    return MANCHESTER_DBC if system.digest == load_system(MANCHESTER).digest else None

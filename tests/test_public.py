@@ -1,0 +1,89 @@
+"""What `import sprung` gives: documented examples, and a wheel that gets on with a user's own folders."""
+
+from __future__ import annotations
+
+import doctest
+import os
+import subprocess
+import sys
+import zipfile
+from importlib import import_module
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import sprung
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("module", ["sprung", "sprung.api"])
+def test_examples_in_the_documentation_run(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    failed, tried = doctest.testmod(import_module(module))
+    assert tried and not failed
+
+
+def test_every_public_name_exists() -> None:
+    assert {"diagnose", "identify", "load_system", "simulate", "track"} <= set(sprung.__all__)
+    assert all(getattr(sprung, name) is not None for name in sprung.__all__)
+
+
+def test_a_window_may_be_given_by_channel_names() -> None:
+    system = sprung.load_system()
+    values = {channel.name: np.zeros(100) for channel in system.channels}
+    with pytest.raises(ValueError, match="no such channel"):
+        sprung.identify(system, {**values, "wheel": np.zeros(100)})
+    with pytest.raises(ValueError, match="differ in length"):
+        sprung.identify(system, {**values, "car_1l": np.zeros(99)})
+    assert len(sprung.identify(system, values).parameters) == 24
+
+
+def test_simulated_values_are_named_and_positive() -> None:
+    system = sprung.load_system()
+    inputs = np.zeros((100, len(system.inputs)))
+    with pytest.raises(ValueError, match="no such parameter"):
+        sprung.simulate(system, inputs, {"primary.stiffness": 1.0})
+    with pytest.raises(ValueError, match="positive"):
+        sprung.simulate(system, inputs, {"primary_11l.stiffness": -1.0})
+    with pytest.raises(ValueError, match="shape"):
+        sprung.simulate(system, inputs[:, :3])
+    assert np.all(sprung.simulate(system, inputs) == 0)
+
+
+def test_an_installed_wheel_leaves_a_users_own_names_alone(tmp_path: Path) -> None:
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    build = [*pip, "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", str(tmp_path), str(ROOT)]
+    subprocess.run(build, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("sprung-*.whl")
+    names = {name.split("/")[0] for name in zipfile.ZipFile(wheel).namelist()}
+    assert {name for name in names if not name.endswith(".dist-info")} == {"sprung"}
+    site = tmp_path / "site"
+    subprocess.run([*pip, "install", "-q", "--no-deps", "--target", str(site), str(wheel)], check=True)
+    user = tmp_path / "user"
+    (user / "model").mkdir(parents=True)
+    (user / "model" / "__init__.py").write_text("MINE = True\n")
+    (user / "own.py").write_text(
+        "import model, sprung\n"
+        "assert model.MINE\n"
+        f"assert sprung.__file__.startswith({str(site)!r}), sprung.__file__\n"
+        "system = sprung.load_system()\n"
+        "print(len(system.parameters), sprung.__version__)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(site)}
+    done = subprocess.run(
+        [sys.executable, "own.py"], cwd=user, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.stdout.split() == ["24", sprung.__version__], done.stderr
+    for name in ("model", "replay", "service", "benchmarks"):
+        code = f"import importlib.util as u; print(u.find_spec({name!r}))"
+        found = subprocess.run(
+            [sys.executable, "-P", "-c", code],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        assert found.stdout.strip() == "None"
