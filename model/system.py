@@ -10,8 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
+from sprung.model.address import Address
 from sprung.model.mechanics import Mechanics, assemble
-from sprung.model.schema import SI, Address, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
+from sprung.model.schema import SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
 from sprung.model.signals import Channel, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 

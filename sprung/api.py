@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from sprung.model.diagnosis.investigation.diagnose import diagnose
+from sprung.model.diagnosis.api import diagnose
 from sprung.model.identification.identify import Identifier, UnusableWindow, load_identifier
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.simulate.linear import LinearSimulator, knots

@@ -178,7 +178,7 @@ class Channel:
 
 
 def screen(
-    problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True, exclude: frozenset = frozenset()
+    problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True, exclude: frozenset[tuple[str, str, str]] = frozenset()
 ) -> Screening:
     """Screen all candidates on the residual of a fit."""
     from sprung.model.diagnosis.screening.bodies import body_hits
