@@ -20,6 +20,7 @@ from sprung.model.schema import Body, ElementSensor, ForceInput, SystemFile
 from sprung.model.signals import FloatArray, IntArray
 
 ACCELERATION, VELOCITY, DISPLACEMENT, DEFLECTION, FORCE = range(5)
+_HELD = 1e-9  # of the largest stiffness: less holds nothing
 SENSOR_KINDS = ("acceleration", "velocity", "displacement", "deflection", "force")
 RATES = ("roll_rate", "pitch_rate")  # velocities of the degrees of freedom roll and pitch
 
@@ -209,3 +210,9 @@ def assemble(file: SystemFile) -> Mechanics:
         support_drive=np.array(support_drive, dtype=np.int64),
         force_drive=np.array(force_drive, dtype=np.int64),
     )
+
+
+def rigid_body_modes(stiffness: FloatArray) -> FloatArray:
+    """Zero-stiffness modes: motions (n, m) that a stiffness matrix (n, n) does not hold."""
+    values, shapes = np.linalg.eigh(stiffness)
+    return np.asarray(shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)])

@@ -15,6 +15,12 @@ MAY_IMPORT = {
     "service": {"service", "model", "replay", "benchmarks"},
     "benchmarks": {"benchmarks", "model", "replay", "service"},
 }
+# Inside `model` every name imports only names to its left; the diagnosis and the paper stand beside identification
+ORDER = ("signals", "chunks", "schema", "mechanics", "system", "laws", "simulate", "identification", "tracking")
+BESIDE = {"diagnosis": ORDER[: ORDER.index("identification")], "alps": ORDER}
+STAGES = ("record", "response", "fit", "screening", "selection", "investigation", "report", "api")
+# Imports inside functions of `model`, each with its reason
+LATE: dict[str, str] = {}
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}
 STANDARD_BUT_NOT_FOR_THE_CORE = {"socket", "http", "sqlite3", "logging", "argparse", "asyncio"}
 
@@ -34,6 +40,99 @@ def imported(path: Path) -> set[str]:
             module = (node.module or "").removeprefix("sprung.")
             found |= {alias.name for alias in node.names} if module == "sprung" else {module}
     return found
+
+
+def edges() -> dict[str, set[str]]:
+    """Which file imports which, as dotted names below `sprung`; names imported from a package count for its files."""
+    files = {_dotted(path): path for folder in OURS for path in modules(folder)}
+    graph: dict[str, set[str]] = {}
+    for name, path in files.items():
+        targets = set()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                targets |= {alias.name.removeprefix("sprung.") for alias in node.names}
+            elif isinstance(node, ast.ImportFrom):
+                module = (node.module or "").removeprefix("sprung.")
+                inside = {f"{module}.{alias.name}" for alias in node.names}
+                targets |= {one for one in inside if one in files} or {module}
+        graph[name] = {target for target in targets if target in files and target != name}
+    return graph
+
+
+def _dotted(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def circle(graph: dict[str, set[str]]) -> list[str]:
+    """One import circle of a graph, as the names along it; empty when there is none."""
+    done: set[str] = set()
+
+    def walk(name: str, way: list[str]) -> list[str]:
+        if name in way:
+            return [*way[way.index(name) :], name]
+        if name in done:
+            return []
+        for target in sorted(graph[name]):
+            if found := walk(target, [*way, name]):
+                return found
+        done.add(name)
+        return []
+
+    return next((found for name in sorted(graph) if (found := walk(name, []))), [])
+
+
+def test_no_file_imports_itself_by_a_detour() -> None:
+    assert circle(edges()) == []
+
+
+def test_a_circle_would_be_seen() -> None:
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
+    assert circle({"a": {"b", "c"}, "b": {"c"}, "c": set()}) == []
+
+
+def test_the_core_is_built_in_one_order() -> None:
+    wrong = []
+    for name, targets in edges().items():
+        for target in targets:
+            if not (name.startswith("model.") and target.startswith("model.")):
+                continue
+            upper, lower = name.split(".")[1], target.split(".")[1]
+            allowed = BESIDE.get(upper) or ORDER[: ORDER.index(upper)]
+            if lower != upper and lower not in allowed:
+                wrong.append(f"{name} imports {target}")
+    assert wrong == []
+
+
+def test_the_diagnosis_is_built_in_one_order() -> None:
+    wrong = []
+    for name, targets in edges().items():
+        for target in targets:
+            if name.startswith("model.diagnosis.") and target.startswith("model.diagnosis."):
+                upper, lower = name.split(".")[2], target.split(".")[2]
+                if STAGES.index(lower) > STAGES.index(upper):
+                    wrong.append(f"{name} imports {target}")
+    assert wrong == []
+
+
+@pytest.mark.parametrize("folder", OURS)
+def test_no_import_is_hidden_from_those_who_run_the_code(folder: str) -> None:
+    users = [
+        path.relative_to(ROOT).as_posix()
+        for path in modules(folder)
+        if any(isinstance(n, ast.Name) and n.id == "TYPE_CHECKING" for n in ast.walk(ast.parse(path.read_text())))
+    ]
+    assert users == []
+
+
+def test_the_core_imports_at_the_top_of_its_files() -> None:
+    late = set()
+    for path in modules("model"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                inner = [n for n in ast.walk(node) if isinstance(n, (ast.Import, ast.ImportFrom))]
+                late |= {f"{path.relative_to(ROOT).as_posix()}:{node.name}" for _ in inner}
+    assert late == set(LATE)
 
 
 @pytest.mark.parametrize("folder", OURS)

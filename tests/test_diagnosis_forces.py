@@ -6,7 +6,8 @@ from diagnosis_cases import Recorded
 from scipy.signal import resample
 
 from sprung.model.diagnosis.fit.baseline import baseline, refreshed
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.optimise import Fit, optimise
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise, drifting, rate_of
 from sprung.model.diagnosis.record.spectra import Grid
@@ -64,7 +65,7 @@ def fitted() -> tuple[System, Problem, Fit]:
     problem, base = baseline(system, signals, declared_noise(system, signals), 2800)
     friction = Term(find_law("coulomb_friction"), "guide", (10.0, 0.005), scales=(10.0, 0.005))
     offset = Term(find_law("sensor_bias"), "motor", (0.0,), scales=(1.0,))
-    fit = problem.fit(Point(base.point.theta, (friction, offset), base.point.state))
+    fit = optimise(problem, Point(base.point.theta, (friction, offset), base.point.state))
     return system, *refreshed(problem, fit)
 
 

@@ -10,7 +10,9 @@ import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.system import parse_system
@@ -108,8 +110,7 @@ def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear):
     problem = Problem(system, transform(signals, noise), signals.sensor_index, noise)
 
     def linearised(theta: np.ndarray):
-        problem.smoothed = None
-        return problem.linearise(problem.smooth(Point(theta, (), np.zeros(2))))
+        return linearise(problem, *along_measured_motion(problem, Point(theta, (), np.zeros(2))))
 
     here = np.array([0.1, -0.1])
     slopes = linearised(here).log_det_slope

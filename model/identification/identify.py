@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
+from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.signals import Estimate, FloatArray
@@ -101,8 +102,6 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
 
     The median over 16 windows of running on an average track; `PRIOR_STD` where a window tells nothing.
     """
-    from sprung.model.identification.excitation import simulate_runs
-
     if not system.parameters:
         return np.zeros(0)
     truth = np.zeros((16, len(system.parameters)))

@@ -19,6 +19,7 @@ from typing import Protocol
 
 import numpy as np
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -200,8 +201,6 @@ class Run:
         path = self.path.with_suffix(".safetensors")
         if not path.is_file():
             return
-        from safetensors import safe_open
-
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
         if metadata.get("fingerprint") != self.fingerprint:

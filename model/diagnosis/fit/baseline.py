@@ -6,8 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.noise import force_noise, input_noise, sensor_noise
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import Working
+from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.system import System
@@ -25,10 +29,9 @@ def baseline(system: System, signals: Signals, declared: Noise, split: int) -> t
     start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
     if len(noise.force):
         # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
-        lin = problem.linearise(start)
-        noise = force_noise(lin.forward, lin.spectrum, noise)
-        problem = replace(problem, noise=noise, whitener=None)
-    fit = problem.fit(start, iterations=12)
+        lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
+        problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise))
+    fit = optimise(problem, start)
     return refreshed(problem, fit)
 
 
@@ -45,9 +48,9 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
         if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
             settled += 1
             noise = sensor_noise(fit.forward, fit.spectrum, noise)
-        renewed = replace(problem, noise=noise, whitener=None, smoothed=None)
+        renewed = replace(problem, noise=noise)
         enough = settled == (2 if problem.follows else 1)
-        again = renewed.try_fit(fit.point, iterations=6 if enough else 2)
+        again = try_optimise(renewed, fit.point, 6 if enough else 2)
         if again is None:
             break
         problem, fit = renewed, again

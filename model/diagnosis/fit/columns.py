@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from sprung.model.diagnosis.fit.tangent import line_load
+from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
-from sprung.model.diagnosis.response.terms import Term
-from sprung.model.laws import ElementLaw
 from sprung.model.signals import FloatArray
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.problem import Problem
 
 
 class Columns:
     """The jacobian, column by column in whitened real numbers, stored so that every column is contiguous."""
 
-    def __init__(self, problem: Problem, forward: Forward, count: int) -> None:
-        assert problem.whitener is not None
-        grid = problem.part.grid
+    def __init__(self, forward: Forward, whitener: Whitener, count: int) -> None:
+        grid = forward.part.grid
         band = grid.band
-        self.band, self.forward, self.problem = band, forward, problem
-        weighted = problem.whitener.factor * grid.weight[:, None, None]
+        self.band, self.forward = band, forward
+        weighted = whitener.factor * grid.weight[:, None, None]
         shown = forward.sensor_factor[band, :, None]
         self.of_shown = weighted
         along = weighted @ (forward.plant.sensor_of_force[band] * shown)
@@ -42,7 +35,7 @@ class Columns:
     @property
     def whitened(self) -> ComplexArray:
         """All columns as whitened spectra, (F, S, columns)."""
-        weight = self.problem.part.grid.weight[:, None, None]
+        weight = self.forward.part.grid.weight[:, None, None]
         shape = (self.band.stop, -1, len(self.store))
         spectra = (self.store[:, : self.half] + 1j * self.store[:, self.half :]).T.reshape(shape) / weight
         return np.asarray(spectra, dtype=complex)
@@ -91,17 +84,3 @@ class Columns:
         whitened = np.ascontiguousarray((self.of_shown @ free[self.band]).transpose(2, 0, 1))
         for i, column in enumerate(whitened):
             self._add(first + i, column)
-
-
-def loads_of(forward: Forward, term: Term) -> ComplexArray | float:
-    """Sensor signals of a body's unmeasured force."""
-    load = getattr(term.law, "load", None)
-    if load is None or isinstance(term.law, ElementLaw):
-        return 0.0
-    grid = forward.part.grid
-    from sprung.model.laws import CLOCK_LEAD
-
-    series = load(grid.start + grid.time + CLOCK_LEAD, term.parameters)
-    dof = forward.system.mechanics.dofs.index(f"{term.location}.{term.variant}")
-    spectrum = grid.forward(series)
-    return forward.plant.sensor_of_load[:, :, dof] * spectrum[:, None] * forward.sensor_factor

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.columns import Columns
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.tangent import Taken, law_change, port_motions, step_of, tangent
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
@@ -17,9 +18,6 @@ from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import is_waveform
 from sprung.model.signals import FloatArray
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.problem import Problem
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class Linearised:
     """Residual and sensitivities at a point, whitened."""
 
     residual: FloatArray  # (R,)
@@ -45,77 +43,114 @@ class Linearisation:
     motions: Motions
 
 
-def linearise(problem: Problem, point: Point) -> Linearisation:
+@dataclass
+class _Sensitivities:
+    """Sensitivities to theta and the terms' parameters, column by column, while they are put together."""
+
+    packed: Columns
+    theta_forces: ComplexArray  # along the parameters' elements, (F, P)
+    loads: dict[int, ComplexArray]  # on the degrees of freedom, (F, n), of the columns that push bodies
+    law_forces: ComplexArray  # of the laws by their own parameters, (F, p, m)
+    log_det: FloatArray  # (P + p,)
+    shifts: dict[int, FloatArray] = field(default_factory=dict)  # motion along ports, of what moves it by itself
+
+
+def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
     """Residual and sensitivities at a point."""
-    shown, forward, forces = problem.predict(point)
-    grid = problem.part.grid
-    if problem.whitener is None:
-        problem.whitener = Whitener.of(forward, problem.noise)
+    shown, forward, forces = problem.predict(point, working.inputs)
+    whitener = working.whitener
     free = problem.free_columns(forward)
     spectrum = problem.part.sensors - shown - free @ point.state
     motions = motions_of(forward, forces, point.state)
-    P = len(point.theta)
-    count = P + sum(len(t.parameters) for t in point.terms)
-    theta_forces, theta_loads = _theta_forces(problem, forward, motions)
-    law_forces = np.zeros((len(grid.omega), count - P, 0 if forces is None else len(forces.terms)), dtype=complex)
-    packed = Columns(problem, forward, count + free.shape[2])
+    known = _of_theta(problem, forward, forces, whitener, motions, point)
+    _add_terms(known, problem, point, working, forward, forces, shown)
+    states = free.shape[2]
+    known.packed.add_free(len(known.log_det), free)
+    if forces is not None:
+        _add_laws_answers(known, problem, whitener, forward, forces, states)
+    residual = whitener(spectrum, problem.part)
+    jacobian = known.packed.jacobian
+    return Linearised(residual, jacobian, whitener.log_det, known.log_det, spectrum, forward, forces, motions)
+
+
+def _of_theta(
+    problem: Problem, forward: Forward, forces: LawForces | None, whitener: Whitener, motions: Motions, point: Point
+) -> _Sensitivities:
+    """Room for all columns, those of theta filled in."""
+    P, p = len(point.theta), sum(len(t.parameters) for t in point.terms)
+    theta_forces, loads = _theta_forces(forward, motions)
+    packed = Columns(forward, whitener, P + p + len(point.state))
     for i, parameter in enumerate(problem.system.parameters):
         if parameter.quantity == "mass":
-            packed.add_load(i, theta_loads[i])
+            packed.add_load(i, loads[i])
         else:
             packed.add_force(i, problem.system.elements.index(parameter.element), theta_forces[:, i])
-    at, loads = P, dict(theta_loads)
-    slopes = np.zeros(count)
-    shifts: dict[int, FloatArray] = {}
+    slopes = np.zeros(P + p)
     if problem.follows:
-        slopes[:P] = _log_det_slopes(problem, forward)
+        slopes[:P] = _log_det_slopes(forward, whitener)
+    laws = 0 if forces is None else len(forces.terms)
+    law_forces = np.zeros((len(forward.part.grid.omega), p, laws), dtype=complex)
+    return _Sensitivities(packed, theta_forces, loads, law_forces, slopes)
+
+
+def _add_terms(
+    known: _Sensitivities,
+    problem: Problem,
+    point: Point,
+    working: Working,
+    forward: Forward,
+    forces: LawForces | None,
+    shown: ComplexArray,
+) -> None:
+    """Columns of the terms' parameters, laws' answers left out."""
+    at = P = len(point.theta)
+    measured = forward.driven_by(problem.part)
     for index, term in enumerate(point.terms):
         for j in range(len(term.parameters)):
             if forward.faulty_force(term) is not None:
-                loads[at] = forward.driven_by(problem.part).fault_load(term)
-                packed.add_load(at, loads[at])
-            elif is_waveform(term):
-                assert forces is not None
+                known.loads[at] = measured.fault_load(term)
+                known.packed.add_load(at, known.loads[at])
+            elif forces is not None and is_waveform(term):
                 port, change = law_change(forward, forces, term, j)
-                law_forces[:, at - P, port] = change
-                packed.add_port(at, forces.ports[port], change)
+                known.law_forces[:, at - P, port] = change
+                known.packed.add_port(at, forces.ports[port], change)
             else:
-                effect = _difference(problem, point, index, j, forward, forces, shown)
-                packed.add_shown(at, effect.shown)
-                slopes[at] = effect.log_det
+                effect = _difference(problem, point, working, (index, j), forward, forces, shown)
+                known.packed.add_shown(at, effect.shown)
+                known.log_det[at] = effect.log_det
                 if effect.motion is not None:
-                    shifts[at] = effect.motion
+                    known.shifts[at] = effect.motion
             at += 1
-    packed.add_free(count, free)
-    if forces is not None:
-        along = port_motions(forward, forces, theta_forces, loads, law_forces, free.shape[2])
-        for column, motion in shifts.items():
-            along[..., column] = motion
-        taken = Taken(problem, forward, forces) if problem.follows else None
-        if taken is not None:
-            along = along - taken.motion(packed.whitened)
-        extra = tangent(forward, forces, along, taken)
-        for k, port in enumerate(forces.ports):
-            for column in range(extra.shape[2]):
-                packed.add_port(column, port, extra[:, k, column])
-    residual = problem.whitener(spectrum, problem.part)
-    return Linearisation(
-        residual, packed.jacobian, problem.whitener.log_det, slopes, spectrum, forward, forces, motions
-    )
 
 
-def _theta_forces(problem: Problem, forward: Forward, motions: Motions) -> tuple[ComplexArray, dict[int, ComplexArray]]:
+def _add_laws_answers(
+    known: _Sensitivities, problem: Problem, whitener: Whitener, forward: Forward, forces: LawForces, states: int
+) -> None:
+    """What the laws along the trajectory answer to the motion that every column is."""
+    along = port_motions(forward, forces, known.theta_forces, known.loads, known.law_forces, states)
+    for column, motion in known.shifts.items():
+        along[..., column] = motion
+    taken = Taken(whitener, forward, forces) if problem.follows else None
+    if taken is not None:
+        along = along - taken.motion(known.packed.whitened)
+    extra = tangent(forward, forces, along, taken)
+    for k, port in enumerate(forces.ports):
+        for column in range(extra.shape[2]):
+            known.packed.add_port(column, port, extra[:, k, column])
+
+
+def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dict[int, ComplexArray]]:
     """Forces along the own element that act like a rise of log k (log c): (F, P); loads (F, n) of log masses."""
     omega, structure = forward.plant.grid.omega, forward.plant.structure
-    forces = np.zeros((len(omega), len(problem.system.parameters)), dtype=complex)
+    forces = np.zeros((len(omega), len(forward.system.parameters)), dtype=complex)
     loads = {}
-    for i, parameter in enumerate(problem.system.parameters):
+    for i, parameter in enumerate(forward.system.parameters):
         if parameter.quantity == "mass":
-            dofs = structure.body_of_dof == problem.system.bodies.index(parameter.element)
+            dofs = structure.body_of_dof == forward.system.bodies.index(parameter.element)
             loads[i] = np.where(dofs, -structure.mass * motions.acceleration, 0.0)
             continue
         value = parameter.nominal * np.exp(forward.theta[i])
-        element = problem.system.elements.index(parameter.element)
+        element = forward.system.elements.index(parameter.element)
         along = motions.rate if parameter.quantity == "damping" else motions.deflection
         forces[:, i] = value * along[:, element]
         for branch in structure.branches if parameter.quantity == "damping" else ():
@@ -127,27 +162,29 @@ def _theta_forces(problem: Problem, forward: Forward, motions: Motions) -> tuple
 def _difference(
     problem: Problem,
     point: Point,
-    index: int,
-    parameter: int,
+    working: Working,
+    which: tuple[int, int],
     forward: Forward,
     forces: LawForces | None,
     shown: ComplexArray,
 ) -> Change:
-    """What one more of a term's parameter does, by a finite difference of the model.
+    """What one more of a term's parameter (`which`: term, parameter) does, by a finite difference of the model.
 
     Forces along a smoothed motion are held: how they answer is the tangent's matter.
     """
+    index, parameter = which
     term = point.terms[index]
     step = step_of(term, parameter)
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
-    other, other_forward, other_forces = problem.predict(replace(point, terms=terms, near=near_of(forces)))
+    other, other_forward, other_forces = problem.predict(
+        replace(point, terms=terms, near=near_of(forces)), working.inputs
+    )
     free = other_forward.free_rows() - forward.free_rows()
     change = (other - shown + problem.part.grid.forward(free @ point.state)) / step
     if not problem.follows:
         return Change(change)
-    assert problem.whitener is not None
-    log_det = (Whitener.of(other_forward, problem.noise).log_det - problem.whitener.log_det) / step
+    log_det = (Whitener.of(other_forward, problem.noise).log_det - working.whitener.log_det) / step
     if forces is None or other_forces is None:
         return Change(change, log_det)
     thin = slice(None, None, OVERSAMPLING)
@@ -155,23 +192,22 @@ def _difference(
     return Change(change, log_det, np.stack(motion)[:, thin] / step)
 
 
-def _log_det_slopes(problem: Problem, forward: Forward) -> FloatArray:
+def _log_det_slopes(forward: Forward, whitener: Whitener) -> FloatArray:
     """Rise of the residual's log determinant with every log-ratio, (P,): inputs' noise goes through the plant."""
-    assert problem.whitener is not None
-    plant, band = forward.plant, problem.part.grid.band
+    plant, band = forward.plant, forward.part.grid.band
     jw = 1j * plant.grid.omega[band, None]
     shown = forward.sensor_factor[band, :, None]
     deflection = plant.deflection_of_inputs[band]
-    slopes = np.zeros(len(problem.system.parameters))
-    for i, parameter in enumerate(problem.system.parameters):
+    slopes = np.zeros(len(forward.system.parameters))
+    for i, parameter in enumerate(forward.system.parameters):
         value = parameter.nominal * np.exp(forward.theta[i])
         if parameter.quantity == "mass":
-            dofs = plant.structure.body_of_dof == problem.system.bodies.index(parameter.element)
+            dofs = plant.structure.body_of_dof == forward.system.bodies.index(parameter.element)
             change = forward.inputs_by_mass(dofs)[band]
         else:
-            element = problem.system.elements.index(parameter.element)
+            element = forward.system.elements.index(parameter.element)
             factor = value * (jw if parameter.quantity == "damping" else 1.0)
             along = plant.sensor_of_force[band][:, :, element, None] * (factor * deflection[:, element])[:, None]
             change = along * shown
-        slopes[i] = problem.whitener.log_det_slope(change)
+        slopes[i] = whitener.log_det_slope(change)
     return slopes

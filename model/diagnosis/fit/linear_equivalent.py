@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs, law_forces
 from sprung.model.diagnosis.fit.tangent import law_force
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.forward import Forward
@@ -14,55 +14,62 @@ from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.motion import particular_start
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.signals import FloatArray
 
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.problem import Problem
+_ROUNDS = 4  # of equivalent law and motion
+_SETTLED = 1e-3  # largest change of an equivalent stiffness or damping, as a share of it and the element's
+_NEAR = 0.2  # the same where the loop converges anyway
 
-_PRELOADS = 4  # rounds of equivalent law and motion
 
-
-def preloaded(problem: Problem, point: Point) -> Point:
+def preloaded(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> Point:
     """The point with the laws' equivalent stiffness and damping moved into the plant.
 
     The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges; a
     motion that follows the sensors stays as it is.
     """
-    for _ in range(_PRELOADS):
-        if not any(is_waveform(t) and "|" not in t.location for t in point.terms):
+    if not any(_carried(term) for term in point.terms):
+        return point
+    for _ in range(_ROUNDS):
+        forward = problem.forward(point, inputs)
+        forces = law_forces(forward, point, inputs)
+        if forces is None:
             return point
-        forward = problem.forward(point)
-        forces = problem.law_forces(forward, point)
-        assert forces is not None
         start = particular_start(forward, forces)
-        terms, change, near = [], 0.0, forces.force.copy()
-        for term in point.terms:
-            if is_waveform(term) and "|" not in term.location:
-                k, c = _equivalent(forward, forces, term)
-                i = forces.index(term)
-                near[:, i] -= (k - term.preload[0]) * forces.deflection[:, i] + (c - term.preload[1]) * forces.rate[
-                    :, i
-                ]
-                element = forward.element_of(term)
-                size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
-                change = max(
-                    change,
-                    abs(k - term.preload[0]) / (size[0] + abs(k)),
-                    abs(c - term.preload[1]) / (size[1] + abs(c)),
-                )
-                terms.append(replace(term, preload=(k, c)))
-            else:
-                terms.append(term)
-        point = replace(point, terms=tuple(terms), near=tuple(near.T))
-        if change < 1e-3 or problem.follows:
+        terms, near, change = _moved(forward, forces, point)
+        point = replace(point, terms=terms, near=tuple(near.T))
+        if change < _SETTLED or problem.follows:
             break
         # the free state counts from the plant's particular solution, which has changed: keep motion and true state
-        moved = problem.forward(point)
+        moved = problem.forward(point, inputs)
         loop = moved.loop(point.state)
-        assert loop is not None
-        point = replace(point, state=start + point.state - particular_start(moved, loop.answer(near)))
-        if forces.converged and change < 0.2:
+        if loop is not None:
+            point = replace(point, state=start + point.state - particular_start(moved, loop.answer(near)))
+        if forces.converged and change < _NEAR:
             break
     return point
+
+
+def _carried(term: Term) -> bool:
+    """Whether the plant can carry a law's equivalent: that of a pair couples two elements, which no element does."""
+    return is_waveform(term) and "|" not in term.location
+
+
+def _moved(forward: Forward, forces: LawForces, point: Point) -> tuple[tuple[Term, ...], FloatArray, float]:
+    """Terms with their present equivalents, the laws' forces without them (4N, m), and the largest relative change."""
+    terms, change, near = [], 0.0, forces.force.copy()
+    for term in point.terms:
+        if _carried(term):
+            k, c = _equivalent(forward, forces, term)
+            more_k, more_c = k - term.preload[0], c - term.preload[1]
+            i = forces.index(term)
+            near[:, i] -= more_k * forces.deflection[:, i] + more_c * forces.rate[:, i]
+            element = forward.element_of(term)
+            size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
+            change = max(change, abs(more_k) / (size[0] + abs(k)), abs(more_c) / (size[1] + abs(c)))
+            terms.append(replace(term, preload=(k, c)))
+        else:
+            terms.append(term)
+    return tuple(terms), near, change
 
 
 def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float, float]:

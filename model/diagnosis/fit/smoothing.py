@@ -1,49 +1,55 @@
-"""Inputs as the sensors ask for them within their noise, and laws along the motion that results."""
+"""Inputs as the sensors ask for them within their noise, and laws along the motion that results.
+
+What a step of the optimiser needs besides the point is one value, `Working`: it is made here, passed on and replaced.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
-from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.signals import FloatArray
 
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.jacobian import Linearisation
-    from sprung.model.diagnosis.fit.problem import Problem
-
 _FOLLOWED = 1e-4  # of the laws' forces along a smoothed motion, which is no better known
 _UNSEEN = 1e-26  # of the largest squared sensitivity to a state: rounding
+_WIDTH = 21  # bins over which the residual's level is averaged
 
 
 @dataclass(frozen=True)
-class Smoothed:
-    """Inputs as the sensors ask for them within their noise."""
+class Working:
+    """How residuals are weighed at a point, and the inputs that its model is driven by; None: as measured."""
 
-    part: Part
-    force: FloatArray | None = None  # of the laws along the motion that results, (4N, m)
+    whitener: Whitener
+    inputs: SmoothedInputs | None = None
 
 
-def smooth(problem: Problem, point: Point, last: Linearisation | None = None) -> Point:
-    """Smooth the inputs at a point near the last one: what of the residual their noise explains is taken for it.
+def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> tuple[Point, Working]:
+    """A point and what its residual is weighed by, before any residual is known."""
+    if problem.follows:
+        return along_measured_motion(problem, point)
+    return point, Working(whitener or Whitener.of(problem.forward(point), problem.noise))
 
-    Returns the point, where the system has measured forces with its starting state fitted anew.
+
+def smoothed(problem: Problem, point: Point, working: Working, spectrum: ComplexArray) -> tuple[Point, Working]:
+    """Smooth the inputs at a point near the last one, whose residual was `spectrum` (F, S).
+
+    What of the residual the inputs' noise explains is taken for it.  Returns the point, where the system has measured
+    forces with its starting state fitted anew.
     """
     if problem.follows:
-        return _along_measured_motion(problem, point)
-    if last is not None:  # the noise of supports is small: the last residual tells it well enough
-        problem.smoothed = Smoothed(_smoothed(problem, last.spectrum))
-    return point
+        return along_measured_motion(problem, point)
+    # the noise of supports is small: the last residual tells it well enough
+    return point, replace(working, inputs=SmoothedInputs(_smoothed(problem.part, working.whitener, spectrum)))
 
 
-def _along_measured_motion(problem: Problem, point: Point) -> Point:
+def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Working]:
     """Smooth measured forces, with laws along the motion that results.
 
     A measured force takes the blame for whatever else pushes the body, so its noise is large and the smoothed
@@ -51,45 +57,41 @@ def _along_measured_motion(problem: Problem, point: Point) -> Point:
     other; they are iterated like the forces of a free run.
     """
     part = problem.part
-    forward = Forward(problem.system, part, problem.sensors, point.theta, point.terms)
-    problem.whitener = whitener = Whitener.of(forward, problem.noise)  # noise goes through the plant as it is now
+    forward = problem.forward(replace(point, near=()))
+    whitener = Whitener.of(forward, problem.noise)  # noise goes through the plant as it is now
     free = problem.free_columns(forward)
     columns = whitener(free, part)
     scale = scale_of(columns.T @ columns, columns.shape[1])
     of_residual = scale[:, None] * np.linalg.pinv(columns * scale, rcond=1e-9)
 
-    def smoothed(forces: LawForces | None) -> tuple[FloatArray, Part]:
+    def explained(forces: LawForces | None) -> tuple[FloatArray, Part]:
         spectrum = part.sensors - problem.shown(forward, forces)
         state = of_residual @ whitener(spectrum, part)
-        return state, _smoothed(problem, spectrum - free @ state)
+        return state, _smoothed(part, whitener, spectrum - free @ state)
 
     loop = forward.loop(point.state)
     if loop is None:
-        state, inputs = smoothed(None)
-        problem.smoothed = Smoothed(inputs)
-        return replace(point, state=state)
+        state, inputs = explained(None)
+        return replace(point, state=state), Working(whitener, SmoothedInputs(inputs))
 
     def along(force: FloatArray, loop: Loop = loop) -> FloatArray:
-        state, inputs = smoothed(loop.answer(force))
-        driven = loop.driven(forward.driven_by(inputs), state)
+        state, inputs = explained(loop.answer(force))
+        driven = loop.driven(forward.driven_by(inputs).fine_motion(loop.ports, state))
         return driven.law(*driven.motion(force))
 
     start = np.column_stack(point.near) if point.near else along(np.zeros((len(loop.d0), len(loop.terms))))
     force, _ = fixed_point(along, start, _FOLLOWED)
-    state, inputs = smoothed(loop.answer(force))
-    problem.smoothed = Smoothed(inputs, force)
-    return replace(point, state=state, near=tuple(force.T))
+    state, inputs = explained(loop.answer(force))
+    return replace(point, state=state, near=tuple(force.T)), Working(whitener, SmoothedInputs(inputs, force))
 
 
-def _smoothed(problem: Problem, spectrum: ComplexArray) -> Part:
+def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
     """The part with its inputs as a residual (F, S) asks for."""
-    assert problem.whitener is not None
-    part, band = problem.part, problem.part.grid.band
-    whitened = (problem.whitener.factor @ spectrum[band, :, None])[:, :, 0]
+    band = part.grid.band
+    whitened = (whitener.factor @ spectrum[band, :, None])[:, :, 0]
     size = np.mean(np.abs(whitened) ** 2, axis=1)
-    width = 21
-    local = np.convolve(np.pad(size, width // 2, mode="edge"), np.ones(width) / width, mode="valid")
-    shift = np.einsum("fis,fs->fi", problem.whitener.blame, whitened)
+    local = np.convolve(np.pad(size, _WIDTH // 2, mode="edge"), np.ones(_WIDTH) / _WIDTH, mode="valid")
+    shift = np.einsum("fis,fs->fi", whitener.blame, whitened)
     support, force = part.support.copy(), part.force.copy()
     count = support.shape[1]
     support[band] += shift[:, :count] / np.maximum(1.0, local)[:, None]

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.laws import ElementLaw
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import StaticLaw
 from sprung.model.signals import FloatArray
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.fit.problem import Problem
 
 _KRYLOV, _KRYLOV_TOLERANCE = 16, 3e-3
 _RELATIVE_STEP = 1e-4  # of finite differences
@@ -41,11 +37,6 @@ def law_change(forward: Forward, forces: LawForces, term: Term, parameter: int) 
     return port, forward.part.grid.coarse_spectrum(change)
 
 
-def wide_port(forward: Forward, port: FloatArray) -> FloatArray:
-    """A port's weights over the plant's elements, which may be more than the system's."""
-    return np.pad(port, (0, len(forward.plant.structure.H) - len(port)))
-
-
 def port_motions(
     forward: Forward,
     forces: LawForces,
@@ -60,7 +51,7 @@ def port_motions(
     """
     plant, grid = forward.plant, forward.part.grid
     structure = plant.structure
-    ports = np.array([wide_port(forward, w) for w in forces.ports])
+    ports = forward.plant.structure.widened(forces.ports)
     P, p = theta_forces.shape[1], law_forces.shape[1]
     spectra = np.zeros((len(grid.omega), len(ports), P + p), dtype=complex)
     of_force = plant.compliance(ports, np.eye(len(structure.H)))  # (F, m, E)
@@ -129,7 +120,7 @@ def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Tak
     """
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
-    ports = np.array([wide_port(forward, w) for w in forces.ports])
+    ports = forward.plant.structure.widened(forces.ports)
     compliance = plant.compliance(ports, ports)
     if taken is not None:
         compliance[grid.band] -= taken.deflection @ taken.seen
@@ -187,8 +178,7 @@ def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
     """Derivatives of a law's force by deflection and rate along the trajectory, less the preload, (2, N)."""
     term = forces.terms[i]
     grid = forward.part.grid
-    law = term.law
-    assert isinstance(law, ElementLaw)
+    law = term.element_law
     if law.memory:
         return np.zeros((2, grid.samples))
     d, v = forces.deflection[:, i], forces.rate[:, i]
@@ -208,7 +198,7 @@ def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
     i = forces.index(term)
     grid = forward.part.grid
     return force_along(
-        term.law,  # type: ignore[arg-type]
+        term.element_law,
         term.parameters,
         forces.deflection[:, i],
         forces.rate[:, i],
@@ -224,19 +214,18 @@ class Taken:
     a force's noise is large, not at all.
     """
 
-    def __init__(self, problem: Problem, forward: Forward, forces: LawForces) -> None:
-        assert problem.whitener is not None
+    def __init__(self, whitener: Whitener, forward: Forward, forces: LawForces) -> None:
         plant, self.grid = forward.plant, forward.part.grid
         band = self.grid.band
-        ports = np.array([wide_port(forward, w) for w in forces.ports])
+        ports = forward.plant.structure.widened(forces.ports)
         inputs = plant.deflection_of_inputs[band]
-        self.deflection = ports @ inputs @ problem.whitener.blame  # of whitened sensor signals, (F, m, S)
+        self.deflection = ports @ inputs @ whitener.blame  # of whitened sensor signals, (F, m, S)
         self.rate = 1j * self.grid.omega[band, None, None] * self.deflection
         if plant.floats:
             steady = ports @ plant.structure.H @ plant.steady_rate @ plant.structure.F
-            self.rate[0] = steady @ problem.whitener.blame[0, plant.structure.G.shape[1] :]
+            self.rate[0] = steady @ whitener.blame[0, plant.structure.G.shape[1] :]
         shown = plant.sensor_of_force[band] * forward.sensor_factor[band, :, None]
-        self.seen = problem.whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
+        self.seen = whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
 
     def motion(self, whitened: ComplexArray) -> FloatArray:
         """Deflection and rate along the ports taken back of whitened sensor signals (F, S, c), (2, N, m, c)."""

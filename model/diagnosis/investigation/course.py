@@ -6,11 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.screen import Screening
+from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.holdout import FreeRun, HeldOut
 from sprung.model.laws import CATALOGUE, Law

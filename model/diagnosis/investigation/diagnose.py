@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.problem import Fit
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.course import (
     Found,
     InputFault,
@@ -25,7 +25,8 @@ from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
-from sprung.model.diagnosis.screening.screen import Hit, screen
+from sprung.model.diagnosis.screening.score import Hit
+from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.laws import ElementLaw
@@ -106,8 +107,8 @@ def _on_everything(state: Investigation) -> Fit:
     """The model fitted to the whole recording, once it has been judged; the first part's where that goes astray."""
     rated = drifting(state.system, state.signals.sensor_index)
     part = transform(state.signals, state.problem.noise, rated=rated)
-    problem = replace(state.problem, part=part, whitener=None, smoothed=None)
-    fit = problem.try_fit(state.held.run(state.fit.point).point, 4)
+    problem = replace(state.problem, part=part)
+    fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
     return fit if fit is not None and fit.reduced < _ASTRAY * state.fit.reduced else state.fit
 
 
@@ -138,11 +139,11 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
-    state.held.weigh(problem.noise)
     tell(share + 0.12, "screening what is left")
     return replace(
         state,
         fit=fit,
+        held=replace(state.held, noise=problem.noise),
         found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value)),
         last=screen(problem, fit, options.catalogue, options.project),
     )
@@ -153,7 +154,7 @@ def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[
     best = chosen, state.fit
     for rival in trials:
         if rival is not chosen and rival.term.key[:2] == chosen.term.key[:2] and rival.named:
-            fit = replace(state.problem, smoothed=None).try_fit(rival.fit.point, 6)
+            fit = try_optimise(state.problem, rival.fit.point, 6, state.fit.whitener)
             dearer = (rival.gain - rival.evidence) - (best[0].gain - best[0].evidence)
             if fit is not None and best[1].deviance - fit.deviance > dearer:
                 best = rival, fit

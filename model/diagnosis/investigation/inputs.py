@@ -12,7 +12,8 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.course import InputFault, Nominal
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.screen import Hit, Screening, screen
+from sprung.model.diagnosis.screening.score import Hit, Screening
+from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.system import System
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.screen import Projector
+from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.laws.spline import LatentForce, Surface, estimate_force
 from sprung.model.signals import FloatArray
 
@@ -24,7 +25,7 @@ def with_surface(problem: Problem, fit: Fit) -> Fit | None:
         latent = _estimate(problem, current)
         term = Term(latent.law(), current.point.terms[-1].location, (1.0,), scales=(1.0,))
         point = replace(current.point, terms=(*current.point.terms[:-1], term))
-        current = replace(problem, smoothed=None).try_fit(point, 6)
+        current = try_optimise(problem, point, 6, fit.whitener)
     return current
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.schema import SupportInput
@@ -114,8 +115,6 @@ def _usable_stretch(system: System, values: FloatArray, sample_rate: float) -> t
 
 def _close_gaps(values: FloatArray) -> FloatArray:
     """Short gaps by cubic interpolation through their neighbours."""
-    from scipy.interpolate import CubicSpline
-
     for column in range(values.shape[1]):
         missing = ~np.isfinite(values[:, column])
         if missing.any() and not missing.all():
@@ -197,8 +196,6 @@ def _integrated(system: System, values: FloatArray) -> list[bool]:
 
 def _integral(series: FloatArray) -> FloatArray:
     """Of unit-spaced samples, by the antiderivative of their cubic spline."""
-    from scipy.interpolate import CubicSpline
-
     at = np.arange(len(series))
     return np.asarray(CubicSpline(at, series).antiderivative()(at))
 

@@ -16,8 +16,7 @@ from math import comb
 import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
-from sprung.model.diagnosis.response.plant import loose_shapes
-from sprung.model.mechanics import DISPLACEMENT
+from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -151,7 +150,7 @@ def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
     """
     mechanics = system.mechanics
     stiffness = (mechanics.H.T * mechanics.stiffness) @ mechanics.H
-    seen = np.any(np.abs(mechanics.S[sensors] @ loose_shapes(stiffness)) > _SEEN, axis=1)
+    seen = np.any(np.abs(mechanics.S[sensors] @ rigid_body_modes(stiffness)) > _SEEN, axis=1)
     return seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
 
 

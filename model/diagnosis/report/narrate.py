@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.problem import Fit
+from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import (
     Found,
     InputFault,

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sprung.model.diagnosis.fit.problem import Fit
+from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.response.terms import Term, is_waveform
-from sprung.model.diagnosis.screening.screen import Projector
+from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.along import force_along
@@ -54,7 +54,7 @@ def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArra
     thin = slice(None, None, max(1, len(d) // _MOST))
     time = grid.start + grid.time
     if is_waveform(term):
-        law = force_along(term.law, term.parameters, d, v, time, fit.forward.element_of(term))  # type: ignore[arg-type]
+        law = force_along(term.element_law, term.parameters, d, v, time, fit.forward.element_of(term))
     else:
         law = np.zeros_like(d)
     after, deviation = latent_force(course, fit, port)

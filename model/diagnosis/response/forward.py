@@ -14,8 +14,9 @@ from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
+from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
-from sprung.model.diagnosis.response.plant import Plant, Structure
+from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SpringDamper, SupportLaw
 from sprung.model.mechanics import VELOCITY
@@ -74,8 +75,12 @@ class Forward:
 
     def element_of(self, term: Term) -> SpringDamper:
         """Spring and damper that a law belongs to, at the present parameters."""
+        return self.element_at(term.location)
+
+    def element_at(self, location: str) -> SpringDamper:
+        """Spring and damper of an element, or of the first of a pair, at the present parameters."""
         structure = structure_of(self.system, self.sensors, self.theta)
-        e = self.system.elements.index(term.location.split("|")[0])
+        e = self.system.elements.index(location.partition("|")[0])
         return SpringDamper(structure.stiffness[e], structure.damping[e])
 
     @property
@@ -217,6 +222,18 @@ class Forward:
         s = 1j * self.part.grid.omega[:, None]
         return gain * np.exp(-s * delay) / (1 + s * lag)
 
+    def of_body_loads(self) -> ComplexArray | float:
+        """Sensor signals of the forces on bodies that nobody measured, (F, S)."""
+        return sum((self.of_body_load(term) for term in self.terms if _loads(term)), 0.0)
+
+    def of_body_load(self, term: Term) -> ComplexArray:
+        """Sensor signals of one of them, (F, S)."""
+        grid, law = self.part.grid, term.law
+        assert isinstance(law, BodyLaw) and law.load is not None
+        spectrum = grid.forward(law.load(grid.start + grid.time + CLOCK_LEAD, term.parameters))
+        dof = self.system.mechanics.dofs.index(f"{term.location}.{term.variant}")
+        return self.plant.sensor_of_load[:, :, dof] * spectrum[:, None] * self.sensor_factor
+
     @cached_property
     def linear_motion(self) -> ComplexArray:
         """Periodic part of the degrees of freedom without laws' forces and free motion, (F, n)."""
@@ -246,8 +263,7 @@ class Forward:
     def fine_motion(self, ports: FloatArray, state: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate along ports (m, E) on the oversampled axis, laws' forces left out: 2 x (4N, m)."""
         plant, grid = self.plant, self.part.grid
-        H = plant.structure.H
-        ports = np.pad(ports, ((0, 0), (0, len(H) - ports.shape[1])))
+        ports = plant.structure.widened(ports)
         spectrum = self.linear_deflection @ ports.T
         d = grid.fine(spectrum)
         v = grid.fine(1j * grid.omega[:, None] * spectrum)
@@ -270,13 +286,21 @@ class Forward:
     def loop(self, state: FloatArray) -> Loop | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""
         waveform, *_ = split(self.terms)
-        return Loop(self, waveform, state) if waveform else None
+        if not waveform:
+            return None
+        ports = np.array([term.port(self.system) for term in waveform])
+        elements = [self.element_of(term) for term in waveform]
+        return Loop(self.plant, waveform, ports, elements, self.fine_motion(ports, state))
 
     def driven_by(self, part: Part) -> Forward:
         """The same model under other inputs."""
         other = replace(self, part=part)
         other.__dict__["plant"] = self.plant
         return other
+
+
+def _loads(term: Term) -> bool:
+    return isinstance(term.law, BodyLaw) and term.law.load is not None
 
 
 def _later(polynomial: FloatArray, delay: FloatArray) -> FloatArray:

@@ -11,18 +11,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.fft import irfft, rfft
 
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray
+from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
-
-if TYPE_CHECKING:
-    from sprung.model.diagnosis.response.forward import Forward
 
 _TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
@@ -57,29 +55,39 @@ def near_of(forces: LawForces | None) -> tuple[FloatArray, ...]:
 
 
 class Loop:
-    """Laws and the motion along their ports under the laws' forces, on the oversampled axis."""
+    """Laws and the motion along their ports under the laws' forces, on the oversampled axis.
 
-    def __init__(self, forward: Forward, terms: list[Term], state: FloatArray) -> None:
-        self.plant, self.grid = forward.plant, forward.part.grid
-        H = self.plant.structure.H
-        self.terms, self.ports = terms, np.array([t.port(forward.system) for t in terms])
-        self.wide = np.pad(self.ports, ((0, 0), (0, len(H) - self.ports.shape[1])))
-        self.elements = [forward.element_of(term) for term in terms]
-        self._drive(forward, state)
+    terms (m,) at elements with the springs and dampers `elements`, along ports (m, E) of the plant; d0 and v0 (4N, m)
+    are deflection and rate along them without the laws' forces.
+    """
+
+    def __init__(
+        self,
+        plant: Plant,
+        terms: list[Term],
+        ports: FloatArray,
+        elements: list[SpringDamper],
+        motion: tuple[FloatArray, FloatArray],
+    ) -> None:
+        self.plant, self.grid = plant, plant.grid
+        H = plant.structure.H
+        self.terms, self.ports, self.elements = terms, ports, elements
+        self.wide = plant.structure.widened(ports)
+        self._drive(*motion)
         self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
         self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
-        self.lines = np.array([self.plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
+        self.lines = np.array([plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
         self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
 
-    def _drive(self, forward: Forward, state: FloatArray) -> None:
-        self.d0, self.v0 = forward.fine_motion(self.ports, state)
-        self.reach = _REACH * np.abs(self.d0).max(axis=0), _REACH * np.abs(self.v0).max(axis=0)
+    def _drive(self, d0: FloatArray, v0: FloatArray) -> None:
+        self.d0, self.v0 = d0, v0
+        self.reach = _REACH * np.abs(d0).max(axis=0), _REACH * np.abs(v0).max(axis=0)
 
-    def driven(self, forward: Forward, state: FloatArray) -> Loop:
-        """The same loop under other inputs and from another state."""
+    def driven(self, motion: tuple[FloatArray, FloatArray]) -> Loop:
+        """The same loop under other inputs or from another state: deflection and rate without the laws' forces."""
         other = copy(self)
-        other._drive(forward, state)
+        other._drive(*motion)
         return other
 
     def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
@@ -87,7 +95,7 @@ class Loop:
         time = self.grid.start + self.grid.fine_time
         d, v = np.clip(d, -self.reach[0], self.reach[0]), np.clip(v, -self.reach[1], self.reach[1])
         columns = [
-            force_along(t.law, t.parameters, d[:, i], v[:, i], time, self.elements[i])  # type: ignore[arg-type]
+            force_along(t.element_law, t.parameters, d[:, i], v[:, i], time, self.elements[i])
             - t.preload[0] * d[:, i]
             - t.preload[1] * v[:, i]
             for i, t in enumerate(self.terms)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.response.plant import Branch
+from sprung.model.diagnosis.response.structure import Branch
 from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -24,10 +24,17 @@ class Term:
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
     preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
 
+    scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
+
     def at(self, parameters: FloatArray) -> Term:
         return replace(self, parameters=tuple(float(v) for v in parameters))
 
-    scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
+    @property
+    def element_law(self) -> ElementLaw:
+        """The law, of a term that acts along an element."""
+        if not isinstance(self.law, ElementLaw):
+            raise TypeError(f"{self.law.name} at {self.location} is no law of an element")
+        return self.law
 
     def moved(self, index: int, step: float) -> Term:
         """One internal parameter moved: the logarithm of those of unknown order, else the value."""

@@ -14,8 +14,8 @@ from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.forward import Forward, propagate
+from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop
-from sprung.model.diagnosis.response.plant import Plant
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from sprung.model.laws.base import Values
@@ -35,7 +35,8 @@ def march_forces(forward: Forward, state: FloatArray, first: int | None = None) 
     up to there being known: those that `forward` starts from.  By default over the whole trajectory, which is periodic.
     """
     loop = forward.loop(state)
-    assert loop is not None
+    if loop is None:
+        raise ValueError("no law of this model acts along a trajectory")
     if first is None:
         return _periodic(loop)
     force = np.column_stack(forward.start_force)
@@ -82,8 +83,7 @@ def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, floa
 
 def _preloaded(term: Term, reach: FloatArray) -> ElementLaw:
     """The law less the linear part that the plant carries, flat beyond its reach (deflection, rate)."""
-    assert isinstance(term.law, ElementLaw)
-    law, (stiffness, damping) = term.law, term.preload
+    law, (stiffness, damping) = term.element_law, term.preload
 
     def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
         d, v = np.clip(motion.deflection, -reach[0], reach[0]), np.clip(motion.rate, -reach[1], reach[1])

@@ -10,10 +10,11 @@ from collections.abc import Iterator
 
 import numpy as np
 from scipy import stats
+from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.screen import Channel, Hit, Projector
+from sprung.model.diagnosis.screening.score import Hit, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
@@ -78,7 +79,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
         answer = (projector.factor @ direct)[:, :, 0]
         impedance = plant.impedance[band, : fit.forward.elements] * shape_e
         answer = answer + np.einsum("fse,fe->fs", projector.of_force[:, :, : fit.forward.elements], impedance)
-        score, amplitudes = Channel(projector, answer * g[:, None]).scores(h)
+        score, amplitudes = ScalarResponse(projector, answer * g[:, None]).scores(h)
         score = np.where(amplitudes > 0, score, 0.0)
         i = int(np.argmax(score))
         amplitude = amplitudes[i]
@@ -130,8 +131,6 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Hi
 
 
 def _local_median(scores: FloatArray, reach: int = 24) -> FloatArray:
-    from scipy.ndimage import median_filter
-
     return median_filter(scores, size=2 * reach + 1, mode="nearest")
 
 
@@ -141,7 +140,7 @@ def _refined_line(projector: Projector, law: BodyLaw, name: str, variant: str, b
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
     time = grid.start + grid.time + CLOCK_LEAD
     best: tuple[float, float, FloatArray] = (-1.0, 0.0, np.zeros(2))
-    channel = Channel(projector, projector.of_load[:, :, dof])
+    channel = ScalarResponse(projector, projector.of_load[:, :, dof])
     for offset in np.linspace(-0.6, 0.6, 13):
         frequency = (bin_number + offset) / grid.length
         if frequency <= 0:

@@ -16,7 +16,8 @@ from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term, supports
-from sprung.model.diagnosis.screening.screen import Channel, Hit, Projector, wheelsets
+from sprung.model.diagnosis.screening.places import wheelsets
+from sprung.model.diagnosis.screening.score import Hit, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, Law, SupportLaw
 from sprung.model.signals import FloatArray
 
@@ -29,7 +30,7 @@ _MEDIAN = 1.386  # of chi-square with two degrees of freedom
 _COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
 
 
-def comb_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+def harmonic_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
     """The best movement of every such law at every support or axle, and how many were tried."""
     system = projector.problem.system
     for law in laws:
@@ -42,7 +43,7 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, in
     absent = Hit(Term(law, location, law.absent), 0.0, 1, "comb", 1.0)
     names = supports(projector.problem.system)
     at = [names.index(name) for name in location.split("|")]
-    channel = Channel(projector, projector.of_support[:, :, at].sum(axis=2))
+    channel = ScalarResponse(projector, projector.of_support[:, :, at].sum(axis=2))
     fundamentals, products, sizes = _products(projector.grid, law, channel)
     tests = len(fundamentals) * len(law.harmonics)
     best = np.argmax(products, axis=1)
@@ -57,7 +58,7 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, in
     return Hit(term, score, 1, "comb", float(stats.chi2.sf(score, 1))), tests
 
 
-def _products(grid: Grid, law: SupportLaw, channel: Channel) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _products(grid: Grid, law: SupportLaw, channel: ScalarResponse) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fundamentals (m,) in Hz, products with the residual (m, phases) and squares (m,) of movements of unit depth.
 
     Both are divided by how much stronger than noise the residual is around every bin.
@@ -81,7 +82,7 @@ def _products(grid: Grid, law: SupportLaw, channel: Channel) -> tuple[FloatArray
 
 
 def _refined(
-    grid: Grid, law: SupportLaw, channel: Channel, frequency: float, phase: float
+    grid: Grid, law: SupportLaw, channel: ScalarResponse, frequency: float, phase: float
 ) -> tuple[tuple[float, float, float], float]:
     """Depth, frequency and phase, and the statistic, by exact columns around a rough find."""
     time = grid.start + grid.time + CLOCK_LEAD

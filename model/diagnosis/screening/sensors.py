@@ -17,7 +17,8 @@ from scipy import stats
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import BOTH, DELAY
 from sprung.model.diagnosis.response.terms import Term, supports
-from sprung.model.diagnosis.screening.screen import Hit, Projector, wheelsets
+from sprung.model.diagnosis.screening.places import wheelsets
+from sprung.model.diagnosis.screening.score import Hit, Projector
 from sprung.model.laws import Law, ParameterSpec, SensorLaw
 from sprung.model.signals import FloatArray
 
@@ -32,7 +33,7 @@ def measurement_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tu
 def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
     problem, fit, grid = projector.problem, projector.fit, projector.grid
     band = grid.band
-    truth = problem.shown_by_motion(fit)[band]
+    truth = problem.shown_of_smoothed(fit.forward, fit.spectrum)[band]
     constant = np.zeros(len(truth), dtype=complex)
     constant[0] = np.sqrt(grid.samples)
     jw = 1j * grid.omega[band]
@@ -73,7 +74,6 @@ def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
     part, noise = problem.part, problem.noise
     band = grid.band
     omega = grid.omega[band]
-    assert problem.whitener is not None
     G = projector.of_support
     names = supports(problem.system)
     for at, support in enumerate(part.pairs):

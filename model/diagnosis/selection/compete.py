@@ -21,11 +21,14 @@ from scipy import stats
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.jacobian import linearise
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.forward import BOTH
 from sprung.model.diagnosis.response.point import Point, advance
 from sprung.model.diagnosis.response.terms import WIDER, Term, is_waveform
-from sprung.model.diagnosis.screening.screen import Hit, Screening
+from sprung.model.diagnosis.screening.score import Hit, Screening
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.basis import SMALL, UNKNOWN
 from sprung.model.signals import FloatArray
@@ -266,9 +269,8 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
     hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
     faint = start_of(base, replace(hit, term=hint))
     with np.errstate(all="ignore"):
-        own = replace(problem, smoothed=None)
-        faint = own.smooth(faint)
-        lin = own.linearise(faint)
+        faint, working = opened(problem, faint, base.whitener)
+        lin = linearise(problem, faint, working)
     count = len(hit.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
@@ -284,7 +286,7 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
 
 
 def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
-    fit = replace(problem, smoothed=None).try_fit(start, iterations)
+    fit = try_optimise(problem, start, iterations, base.whitener)
     return None if fit is None else _judged(problem, base, hit, fit)
 
 
@@ -295,7 +297,7 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
     if not problem.follows or finished.fit.deviance > base.deviance:
         return finished
-    _, fit = refreshed(replace(problem, smoothed=None), finished.fit)
+    _, fit = refreshed(problem, finished.fit)
     return _judged(problem, base, trial.hit, fit)
 
 

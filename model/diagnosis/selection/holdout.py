@@ -8,16 +8,18 @@ from functools import cached_property
 import numpy as np
 
 from sprung.model.chunks import WORKERS, share
-from sprung.model.diagnosis.fit.problem import Fit, Problem
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise, Part, Signals, drifting, rate_of, transform
-from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.record.spectra import ComplexArray, Grid
 from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_forces
 from sprung.model.diagnosis.selection.compete import profile_gain
-from sprung.model.signals import FloatArray
+from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
 _STILL = 0.05  # of the motion in the fitted part
@@ -31,7 +33,6 @@ class FreeRun:
 
     simulated: FloatArray  # (T, S), held-out samples
     measured: FloatArray  # (T, S)
-    residual: FloatArray  # whitened
     per_sensor: FloatArray  # rms(error) / rms(measured), (S,)
     point: Point  # the model, with its starting state over the whole recording
 
@@ -57,16 +58,33 @@ class Comparison:
         return self.gain < min(0.0, self.apart**2 - _CHANCE * 2 * self.apart * np.sqrt(self.scatter))
 
 
+@dataclass(frozen=True)
 class HeldOut:
     """The whole recording, of which the first `split` samples were fitted."""
 
-    def __init__(self, system: System, signals: Signals, noise: Noise, split: int) -> None:
-        self.system, self.signals, self.noise, self.split = system, signals, noise, split
-        self.whole = transform(signals, noise)
-        self.whitener: Whitener | None = None
-        self.rated = drifting(system, signals.sensor_index)
-        self.later = transform(signals.part(split, signals.samples), noise, rated=self.rated)
-        self.grid = self.later.grid
+    system: System
+    signals: Signals
+    noise: Noise  # by which runs are judged
+    split: int
+
+    @cached_property
+    def rated(self) -> BoolArray:
+        """Sensors that are compared by their rates."""
+        return drifting(self.system, self.signals.sensor_index)
+
+    @cached_property
+    def whole(self) -> Part:
+        """The whole recording as it is simulated."""
+        return transform(self.signals, self.noise)
+
+    @cached_property
+    def later(self) -> Part:
+        """The held-out part as it is compared: positions that drift by their rates."""
+        return transform(self.signals.part(self.split, self.signals.samples), self.noise, rated=self.rated)
+
+    @property
+    def grid(self) -> Grid:
+        return self.later.grid
 
     @cached_property
     def tracked(self) -> Part:
@@ -79,17 +97,13 @@ class HeldOut:
         first, later = (np.std(part, axis=0) for part in np.split(self.signals.sensors, [self.split]))
         return bool(np.all(later < _STILL * first))
 
-    def weigh(self, noise: Noise) -> None:
-        """Noise levels by which later runs are judged."""
-        self.noise, self.whitener = noise, None
-
     def run(self, point: Point) -> FreeRun:
         """Simulate with the measured inputs from the state that the fitted part ends in."""
-        return self._judge(*self._simulated(point))
+        return self._judged(*self._simulated(point))
 
     def runs(self, *points: Point) -> list[FreeRun]:
         """The same for several models, simulated beside each other."""
-        return [self._judge(*simulated) for simulated in share(self._simulated, points, WORKERS)]
+        return [self._judged(*simulated) for simulated in share(self._simulated, points, WORKERS)]
 
     def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
         """Held-out samples (T, S), and the point with its starting state.
@@ -129,7 +143,7 @@ class HeldOut:
         good the model.
         """
         if not before.noise.follows:
-            first, second = (run.residual for run in self.runs(before.point, after.point))
+            first, second = self._residuals(*self.runs(before.point, after.point))
             gain = float(first @ first - second @ second)
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
@@ -140,11 +154,10 @@ class HeldOut:
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
         problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
-        point = problem.smooth(replace(fit.point, near=()))
-        shown, forward, _ = problem.predict(point)
-        assert problem.whitener is not None
+        point, working = along_measured_motion(problem, replace(fit.point, near=()))
+        shown, forward, _ = problem.predict(point, working.inputs)
         free = self.later.grid.forward(forward.free_rows() @ point.state)
-        return problem.whitener(self.later.sensors - shown - free, self.later), problem.whitener.log_det
+        return working.whitener(self.later.sensors - shown - free, self.later), working.whitener.log_det
 
     def _up_to_split(self, point: Point) -> tuple[Point, Part]:
         """The inputs as measured, but where laws follow the sensors' motion up to the split: smoothed until there.
@@ -155,9 +168,8 @@ class HeldOut:
         follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
         if not follower.follows:
             return point, self.whole
-        point = follower.smooth(replace(point, near=()))
-        assert follower.smoothed is not None
-        followed = follower.smoothed.part
+        point, working = along_measured_motion(follower, replace(point, near=()))
+        followed = follower.forward(point, working.inputs).part
         force = followed.grid.inverse(followed.force) + followed.grid.monomials @ followed.force_polynomial
         force[self.split :] = signals.force[self.split :]
         return point, transform(replace(signals, force=force), self.noise)
@@ -184,17 +196,22 @@ class HeldOut:
                 forces = led.law_forces(state)
         return problem.shown(forward, forces), forces
 
-    def _judge(self, simulated: FloatArray, point: Point) -> FreeRun:
+    def _judged(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
-        error = measured - simulated
-        if self.whitener is None or self.noise.follows:
-            problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
-            self.whitener = Whitener.of(problem.forward(point), self.noise)
-        compared = np.where(self.later.rated, rate_of(error, self.grid), error)
-        residual = self.whitener(self.grid.forward(compared), self.later)
         size = np.sqrt(np.mean(measured**2, axis=0))
-        per_sensor = np.sqrt(np.mean(error**2, axis=0)) / np.where(size > 0, size, 1.0)
-        return FreeRun(simulated, measured, residual, per_sensor, point)
+        per_sensor = np.sqrt(np.mean((measured - simulated) ** 2, axis=0)) / np.where(size > 0, size, 1.0)
+        return FreeRun(simulated, measured, per_sensor, point)
+
+    def _residuals(self, *runs: FreeRun) -> list[FloatArray]:
+        """Errors of free runs, weighed by the noise as the model of the first one passes it on, each (2 F S,)."""
+        problem = Problem(self.system, self.later, self.signals.sensor_index, self.noise)
+        whitener = Whitener.of(problem.forward(runs[0].point), self.noise)
+        residuals = []
+        for run in runs:
+            error = run.measured - run.simulated
+            compared = np.where(self.later.rated, rate_of(error, self.grid), error)
+            residuals.append(whitener(self.grid.forward(compared), self.later))
+        return residuals
 
     def noise_rms(self, fit: Fit, noise: Noise) -> FloatArray:
         """Error that noise alone causes at each sensor: its own and that of the inputs through the model, (S,)."""

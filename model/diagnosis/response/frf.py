@@ -12,140 +12,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.spectra import DEGREE, ComplexArray, Grid, derivative
-from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, Mechanics
+from sprung.model.diagnosis.response.structure import Structure
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, rigid_body_modes
 from sprung.model.signals import FloatArray
-
-_HELD = 1e-9  # of the largest stiffness: less holds nothing
-
-
-def loose_shapes(stiffness: FloatArray) -> FloatArray:
-    """Motions (n, m) that a stiffness matrix (n, n) does not hold."""
-    values, shapes = np.linalg.eigh(stiffness)
-    return np.asarray(shapes[:, np.abs(values) <= _HELD * max(float(np.abs(values).max()), 1e-300)])
-
-
-@dataclass(frozen=True)
-class Branch:
-    """A spring and a damper in series beside an element, force s' = stiffness v - s / time (Maxwell)."""
-
-    element: int
-    stiffness: float  # N/m
-    time: float  # s, damper over spring
-    replaces: float  # N s/m, what of the element's damper is in the branch
-
-    def impedance(self, omega: FloatArray) -> ComplexArray:
-        """What the branch adds to k + j w c, N/m, (F,)."""
-        jw = 1j * omega
-        return np.asarray(self.stiffness * jw * self.time / (1 + jw * self.time) - jw * self.replaces)
-
-
-@dataclass(frozen=True)
-class Structure:
-    """Matrices and values of a system, possibly with elastic modes appended as further degrees of freedom.
-
-    State of the free motion: [q, q', forces of the branches], 2n + b.
-    """
-
-    mass: FloatArray  # (n,)
-    stiffness: FloatArray  # (E,)
-    damping: FloatArray  # (E,)
-    own_stiffness: FloatArray  # of elastic modes against their body, (n,)
-    own_damping: FloatArray  # (n,)
-    H: FloatArray  # (E, n)
-    G: FloatArray  # (E, supports)
-    F: FloatArray  # (n, forces)
-    S: FloatArray  # (S, n)
-    L: FloatArray  # (S, E)
-    sensor_kind: np.ndarray  # (S,)
-    body_of_dof: np.ndarray  # (n,), -1 for an elastic mode
-    branches: tuple[Branch, ...] = ()  # b of them
-
-    @classmethod
-    def nominal(cls, mechanics: Mechanics, sensors: np.ndarray) -> Structure:
-        """The structure of the system file, seen by the sensors of the given indices."""
-        n = mechanics.n
-        return cls(
-            mass=mechanics.mass,
-            stiffness=mechanics.stiffness,
-            damping=mechanics.damping,
-            own_stiffness=np.zeros(n),
-            own_damping=np.zeros(n),
-            H=mechanics.H,
-            G=mechanics.G,
-            F=mechanics.F,
-            S=mechanics.S[sensors],
-            L=mechanics.L[sensors],
-            sensor_kind=mechanics.sensor_kind[sensors],
-            body_of_dof=mechanics.body_of_dof,
-        )
-
-    @property
-    def K(self) -> FloatArray:
-        return (self.H.T * self.stiffness) @ self.H + np.diag(self.own_stiffness)
-
-    @property
-    def C(self) -> FloatArray:
-        return (self.H.T * self.damping) @ self.H + np.diag(self.own_damping)
-
-    @property
-    def states(self) -> int:
-        return 2 * len(self.mass) + len(self.branches)
-
-    def state_matrix(self) -> FloatArray:
-        """A of the free motion, shape (2n + b, 2n + b)."""
-        n = len(self.mass)
-        A = np.zeros((self.states, self.states))
-        A[:n, n : 2 * n] = np.eye(n)
-        A[n : 2 * n, :n] = -self.K / self.mass[:, None]
-        A[n : 2 * n, n : 2 * n] = -self.C / self.mass[:, None]
-        for i, branch in enumerate(self.branches, 2 * n):
-            h = self.H[branch.element]
-            A[n : 2 * n, n : 2 * n] += branch.replaces * np.outer(h, h) / self.mass[:, None]
-            A[n : 2 * n, i] = -h / self.mass
-            A[i, n : 2 * n] = branch.stiffness * h
-            A[i, i] = -1 / branch.time
-        return A
-
-    def motion_rows(self, ports: FloatArray) -> FloatArray:
-        """Deflections along ports (m, E), then their rates, over the state, (2m, 2n + b)."""
-        along = ports @ self.H
-        m, n = along.shape
-        rows = np.zeros((2 * m, self.states))
-        rows[:m, :n], rows[m:, n : 2 * n] = along, along
-        return rows
-
-    def force_columns(self, ports: FloatArray) -> FloatArray:
-        """What forces along ports (m, E) do to the state's rate, (2n + b, m)."""
-        n = len(self.mass)
-        columns = np.zeros((self.states, len(ports)))
-        columns[n : 2 * n] = -(ports @ self.H).T / self.mass[:, None]
-        return columns
-
-    def sensor_rows(self) -> FloatArray:
-        """Sensors over the state of free motion, shape (S, 2n + b)."""
-        n = len(self.mass)
-        kind = self.sensor_kind[:, None]
-        A = self.state_matrix()
-        rows = np.where(kind == ACCELERATION, self.S @ A[n : 2 * n], 0.0)
-        rows[:, n : 2 * n] += np.where(kind == VELOCITY, self.S, 0.0)
-        rows[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0.0)
-        of_d = np.where(kind == FORCE, self.L * self.stiffness, np.where(kind == DEFLECTION, self.L, 0.0))
-        of_v = np.where(kind == FORCE, self.L * self.damping, 0.0)
-        rows[:, :n] += of_d @ self.H
-        rows[:, n : 2 * n] += of_v @ self.H
-        for i, branch in enumerate(self.branches, 2 * n):
-            at = np.where(self.sensor_kind == FORCE, self.L[:, branch.element], 0.0)
-            rows[:, n : 2 * n] -= np.outer(at * branch.replaces, self.H[branch.element])
-            rows[:, i] += at
-        return rows
-
-    def branch_forces(self, deflections: ComplexArray, omega: FloatArray) -> ComplexArray:
-        """Forces of the branches along periodic deflections (F, E), (F, b)."""
-        jw = 1j * omega
-        columns = [b.stiffness * b.time * jw / (1 + jw * b.time) * deflections[:, b.element] for b in self.branches]
-        return np.stack(columns, axis=1) if columns else np.zeros((len(omega), 0), dtype=complex)
 
 
 @dataclass(frozen=True)
@@ -233,7 +105,7 @@ class Plant:
     def steady_rate(self) -> FloatArray:
         """Velocity under a steady unit load, of what no stiffness holds and a damper brakes, (n, n)."""
         s = self.structure
-        loose = loose_shapes(s.K)
+        loose = rigid_body_modes(s.K)
         return loose @ np.linalg.pinv(loose.T @ s.C @ loose, rcond=1e-9) @ loose.T
 
     @cached_property
@@ -332,8 +204,6 @@ class Plant:
 
     def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
         """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""
-        from scipy.linalg import expm
-
         power = expm(self.structure.state_matrix() * step)
         result = np.empty((count, *rows.shape))
         result[0] = rows

@@ -1,0 +1,225 @@
+"""Maximum likelihood of parameters, terms and starting state on one part of a recording.
+
+Minimising r^H R^-1 r (`problem`) over the parameters is the functional maximum likelihood of an errors-in-variables
+model, the true inputs being profiled out: u = u_m + S_u G^H R^-1 r.  Gauss-Newton with the sensitivities taken at that
+smoothed input is free of the attenuation bias that noisy regressors cause (Soderstrom 2007).
+
+A measured force is another matter: between it and the body lies what nobody measured, so its "noise" really pushes
+the body.  Then the likelihood is that of a system with process noise, r^H R^-1 r + log det R (Astrom 1980), and laws
+act along the motion that the sensors saw.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
+from sprung.model.diagnosis.fit.linear_equivalent import preloaded
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened, scale_of, smoothed
+from sprung.model.diagnosis.fit.whitening import Whitener
+from sprung.model.diagnosis.record.signals import Noise
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
+from sprung.model.diagnosis.response.motion import Motions
+from sprung.model.diagnosis.response.point import Point, advance, held_back
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws.along import force_along
+from sprung.model.signals import FloatArray
+
+PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
+_SLACK = 5e-4  # of the objective: inputs are smoothed again and loops solved again in every round
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A maximum-likelihood fit."""
+
+    point: Point
+    chi_square: float  # r^T r
+    log_det: float  # of the residual's covariance
+    log_det_slope: FloatArray  # by theta and term parameters (internal scale), (P + p,)
+    noise: Noise
+    whitener: Whitener  # that weighs the residual
+    count: int  # real residuals
+    covariance: FloatArray  # of theta and the term parameters, (P + p, P + p)
+    residual: FloatArray  # whitened, (R,)
+    jacobian: FloatArray  # (R, P + p + 2n)
+    spectrum: ComplexArray  # unwhitened residual, (F, S)
+    forward: Forward
+    forces: LawForces | None
+    motions: Motions
+    converged: bool
+    iterations: int
+    bounded: bool = False  # a law's parameter stopped at its bound
+
+    def place(self, index: int) -> slice:
+        """Where the parameters of a term stand in the covariance."""
+        counts = [len(term.parameters) for term in self.point.terms]
+        first = len(self.point.theta) + sum(counts[:index])
+        return slice(first, first + counts[index])
+
+    @property
+    def deviance(self) -> float:
+        """Twice the negative log-likelihood, up to a constant."""
+        return self.chi_square + self.log_det
+
+    @cached_property
+    def element_motion(self) -> tuple[FloatArray, FloatArray]:
+        """Deflection and rate of every element, oversampled, 2 x (4N, E)."""
+        forward, forces = self.forward, self.forces
+        d, v = forward.fine_motion(np.eye(forward.elements), self.point.state)
+        if forces is not None:
+            grid, plant = forward.part.grid, forward.plant
+            spectrum = forces.deflections[:, : forward.elements]
+            polynomial = forces.motion @ plant.structure.H[: forward.elements].T
+            powers = np.vander(grid.fine_time / grid.length, len(polynomial), increasing=True)
+            d = d + grid.fine(spectrum) + powers @ polynomial
+            v = v + grid.fine(1j * grid.omega[:, None] * spectrum) + powers @ plant.derivative(polynomial)
+        return d, v
+
+    def force_along(self, term: Term) -> FloatArray:
+        """Force of a law along this fit's motion, (4N,)."""
+        grid, port = self.forward.part.grid, term.port(self.forward.system)
+        d, v = (motion @ port for motion in self.element_motion)
+        time = grid.start + grid.fine_time
+        element = self.forward.element_of(term)
+        return force_along(term.element_law, term.parameters, d, v, time, element)
+
+    @property
+    def reduced(self) -> float:
+        """Chi-square per degree of freedom."""
+        return self.chi_square / max(1, self.count - self.jacobian.shape[1])
+
+
+@dataclass(frozen=True)
+class _State:
+    """Where the optimiser stands."""
+
+    point: Point
+    working: Working
+    lin: Linearised
+    value: float  # of the objective
+
+
+def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whitener | None = None) -> Fit | None:
+    """A fit that may go astray: None where the numbers do."""
+    try:
+        with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
+            fit = optimise(problem, start, iterations=iterations, whitener=whitener)
+    except (np.linalg.LinAlgError, FloatingPointError):
+        return None
+    return fit if np.isfinite(fit.chi_square) else None
+
+
+def optimise(
+    problem: Problem,
+    start: Point,
+    iterations: int = 12,
+    tolerance: float = 1e-3,
+    whitener: Whitener | None = None,
+) -> Fit:
+    """Gauss-Newton with Levenberg damping from `start`; stops when no parameter moves by `tolerance` std.
+
+    `whitener`: that of a fit whose chi-square this one is compared with; by default, of the model at the start.
+    """
+    point, working = _begun(problem, start, whitener)
+    lin = linearise(problem, point, working)
+    state = _State(point, working, lin, _objective(lin, point))
+    damping, converged, count = 1e-6, False, 0
+    for count in range(1, iterations + 1):
+        step, sigma = _step(state.lin, state.point, damping)
+        trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
+        size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
+        lin = linearise(problem, trial, working)
+        value = _objective(lin, trial)
+        if value <= state.value + _SLACK * float(state.lin.residual @ state.lin.residual) + 0.5:
+            gained = state.value - value
+            state = _State(replace(trial, near=near_of(lin.forces)), working, lin, value)
+            damping = max(damping / 10, 1e-9)
+            if size < tolerance or gained < 0.02 * max(1.0, size):
+                converged = True
+                break
+            if count in (2, 4):
+                state = replace(state, point=preloaded(problem, state.point, state.working.inputs))
+        else:
+            damping = max(damping * 30, 1e-4)
+            if damping > 1e3:
+                break
+    return _finish(problem, state, converged, count)
+
+
+def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
+    """The start with its laws' equivalents in the plant, and what its residual is weighed by."""
+    if problem.follows:
+        point, working = along_measured_motion(problem, start)
+        return along_measured_motion(problem, preloaded(problem, point, working.inputs))
+    return opened(problem, preloaded(problem, start, None), whitener)
+
+
+def _objective(lin: Linearised, point: Point) -> float:
+    return float(lin.residual @ lin.residual + lin.log_det + np.sum((point.theta / PRIOR) ** 2))
+
+
+def _normal(lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
+    """Matrix of the normal equations with the prior of theta, columns scaled, and the scales."""
+    P = len(point.theta)
+    normal = lin.jacobian.T @ lin.jacobian
+    normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
+    scale = scale_of(normal, len(point.state))
+    return normal * scale * scale[:, None], scale
+
+
+def _step(lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray]:
+    """Gauss-Newton step and the standard deviations of theta and term parameters."""
+    P = len(point.theta)
+    scaled, scale = _normal(lin, point)
+    gradient = lin.jacobian.T @ lin.residual
+    gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
+    gradient[:P] -= point.theta / PRIOR**2
+    scaled[np.diag_indices_from(scaled)] += damping + 1e-13
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+    step = scale * (inverse @ (gradient * scale))
+    held = held_back(point, step)
+    if held.any():  # the others go on as if it were given
+        scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
+        inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+        step = scale * (inverse @ (gradient * scale))
+    free = len(scaled) - len(point.state)
+    sigma = (scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300)))[:free]
+    return step, sigma
+
+
+def _finish(problem: Problem, state: _State, converged: bool, count: int) -> Fit:
+    """The fit at a state, with its uncertainty."""
+    point, lin = state.point, state.lin
+    P = len(point.theta)
+    free = lin.jacobian.shape[1] - len(point.state)
+    scaled, scale = _normal(lin, point)
+    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
+    covariance = (inverse * scale * scale[:, None])[:free, :free]
+    slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)
+    covariance = covariance * slopes * slopes[:, None]
+    return Fit(
+        point=replace(point, near=near_of(lin.forces)),
+        chi_square=float(lin.residual @ lin.residual),
+        log_det=lin.log_det,
+        log_det_slope=lin.log_det_slope,
+        noise=problem.noise,
+        whitener=state.working.whitener,
+        count=len(lin.residual),
+        covariance=covariance,
+        residual=lin.residual,
+        jacobian=lin.jacobian,
+        spectrum=lin.spectrum,
+        forward=lin.forward,
+        forces=lin.forces,
+        motions=lin.motions,
+        converged=converged,
+        iterations=count,
+        bounded=any(t.bounded for t in point.terms),
+    )

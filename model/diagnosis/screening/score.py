@@ -1,0 +1,167 @@
+"""Every law at every place with every shape, as a score test on the residual of a fit.
+
+A candidate's force along the fitted motion, taken through the fitted system to the sensors and whitened, is a column
+c of unit-noise numbers, like the residual r and the fit's own sensitivities J.  With everything that J can imitate
+projected out, c' = c - Q Q^T c, the statistic (c'^T r)^2 / |c'|^2 is chi-square with one degree of freedom when the
+candidate is absent (Rao's score test), whatever the parameters have absorbed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Hit:
+    """One candidate as screened."""
+
+    term: Term  # with the amplitude that the screening found
+    score: float  # chi-square
+    freedom: int
+    family: str  # which group of tests it belongs to: "law", "comb", "mode", "line", "mass", "sensor", "input"
+    p_single: float
+    beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
+    step: FloatArray | None = None  # what the fit's parameters and state would move by, (P + p + 2n,)
+
+    @property
+    def location(self) -> str:
+        return self.term.location
+
+    @property
+    def effect(self) -> str:
+        return self.term.law.name
+
+
+@dataclass(frozen=True)
+class Screening:
+    """All candidates, best first, with p-values corrected for everything that was tried."""
+
+    hits: tuple[Hit, ...]  # the best shape of every law at every place
+    tests: dict[str, int]  # how many were tried per family
+
+    def p_value(self, hit: Hit) -> float:
+        """Bonferroni over the family, then over the families."""
+        return float(min(1.0, hit.p_single * self.tests[hit.family] * len(self.tests)))
+
+    def localization(self) -> dict[str, float]:
+        best: dict[str, float] = {}
+        for hit in self.hits:
+            best[hit.location] = max(best.get(hit.location, 0.0), hit.score)
+        return dict(sorted(best.items(), key=lambda item: -item[1]))
+
+
+class Projector:
+    """Residual and candidates with the fit's sensitivities projected out."""
+
+    def __init__(self, problem: Problem, fit: Fit, project: bool = True) -> None:
+        jacobian = fit.jacobian if project else fit.jacobian[:, -len(fit.point.state) :]
+        scale = np.linalg.norm(jacobian, axis=0)
+        self.kept = scale > 1e-9 * max(scale.max(initial=0.0), 1e-300)
+        q, r = np.linalg.qr(jacobian[:, self.kept] / scale[self.kept])
+        strong = np.abs(np.diag(r)) > 1e-9
+        self.q, self.r, self.scale = q[:, strong], r, scale
+        self.strong = strong
+        self.residual = fit.residual - self.q @ (self.q.T @ fit.residual)
+        self.problem, self.fit = problem, fit
+        grid = problem.part.grid
+        self.grid = grid
+        factor = fit.whitener.factor
+        shown = fit.forward.sensor_factor[grid.band, :, None]
+        plant = fit.forward.plant
+        self.of_force = factor @ (plant.sensor_of_force[grid.band] * shown)  # whitened, (F, S, E)
+        self.of_support = factor @ (plant.sensor_of_support[grid.band] * shown)  # (F, S, supports)
+        self.of_load = factor @ (plant.sensor_of_load[grid.band] * shown)  # (F, S, n)
+        self.factor = factor
+
+    @cached_property
+    def lean(self) -> FloatArray:
+        """What the residual leans on J at the end of a fit whose residual's covariance depends on the parameters.
+
+        Such a fit ends at J^T r = d log det R / 2, not at zero.
+        """
+        slope = np.concatenate([self.fit.log_det_slope, np.zeros(len(self.fit.point.state))])[-len(self.kept) :]
+        lean = np.linalg.lstsq(self.r.T, slope[self.kept] / self.scale[self.kept], rcond=1e-9)[0]
+        return np.asarray(self.q @ lean[self.strong] / 2)
+
+    def spread(self, column: FloatArray, change: ComplexArray) -> float:
+        """What the residual's determinant adds to the product of a column and the residual.
+
+        change (F, S, inputs): of what the sensors show of the inputs.  Forces along elements need none of it: what
+        the determinant makes of them is what it makes of the spring and damper that they resemble.
+        """
+        if not self.problem.follows:
+            return 0.0
+        return float(column @ self.lean) - self.fit.whitener.log_det_slope(change) / 2
+
+    @cached_property
+    def complex_q(self) -> ComplexArray:
+        """The projection's basis as band spectra, (F, S, q)."""
+        return self.unpack(self.q)
+
+    @cached_property
+    def complex_residual(self) -> ComplexArray:
+        return self.unpack(self.residual)
+
+    def unpack(self, packed: FloatArray) -> ComplexArray:
+        """Real vectors (2 F S, ...) as weighted band spectra (F, S, ...)."""
+        half = len(packed) // 2
+        shape = (self.grid.band.stop, -1, *packed.shape[1:])
+        return (packed[:half] + 1j * packed[half:]).reshape(shape)
+
+    def pack(self, whitened: ComplexArray) -> FloatArray:
+        """Already whitened band spectra (F, S) as a real vector."""
+        weighted = whitened * self.grid.weight[:, None]
+        return np.concatenate([weighted.real.ravel(), weighted.imag.ravel()])
+
+    def score(self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
+        """Statistic and amplitude of a column; `more`: product with, and square of, residuals outside the sensors."""
+        inside = self.q.T @ column
+        size = float(column @ column)
+        left = size - float(inside @ inside)
+        if left <= 1e-7 * size and more[1] <= 0:
+            return 0.0, 0.0
+        left = max(left, 1e-7 * size) + more[1]
+        product = float(column @ self.residual) + more[0]
+        return product**2 / left, product / left
+
+
+class ScalarResponse:
+    """Scores of columns that are one response (F, S) times a scalar spectrum h (F,): all trials at once."""
+
+    def __init__(self, projector: Projector, response: ComplexArray) -> None:
+        weighted = (response * projector.grid.weight[:, None]).conj()
+        self.product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
+        self.size = np.sum(np.abs(weighted) ** 2, axis=1)
+        self.inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+
+    def scores(self, h: ComplexArray) -> tuple[FloatArray, FloatArray]:
+        """Statistics and amplitudes of trials h (trials, F)."""
+        conj = h.conj()
+        product = np.real(conj @ self.product)
+        size = np.abs(h) ** 2 @ self.size
+        inside = np.real(conj @ self.inside)
+        left = size - np.sum(inside**2, axis=1)
+        visible = left > 1e-7 * size
+        left = np.where(visible, left, 1.0)
+        return np.where(visible, product**2 / left, 0.0), np.where(visible, product / left, 0.0)
+
+    def joint(self, h: ComplexArray) -> tuple[float, FloatArray]:
+        """Statistic and amplitudes of several columns h (m, F) together."""
+        conj = h.conj()
+        inside = np.real(conj @ self.inside)
+        gram = np.real((conj * self.size) @ h.T) - inside @ inside.T
+        product = np.real(conj @ self.product)
+        scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
+        good = values > 1e-6
+        turned = vectors[:, good].T @ (product * scale)
+        return float(np.sum(turned**2 / values[good])), scale * (vectors[:, good] @ (turned / values[good]))
