@@ -1,7 +1,7 @@
 """Training of the visual tasks: first the frame autoencoder, then each method on its embeddings.
 
 Checkpoints, learning-rate schedule and seeding are those of `model.identification.training`: every update draws from
-(seed, step), so that an interrupted run ends in the same weights as one that was not.
+(seed, step), so that an interrupted run ends in the same weights as one that was not, up to rounding.
 """
 
 from __future__ import annotations
