@@ -16,9 +16,20 @@ MAY_IMPORT = {
     "benchmarks": {"benchmarks", "model", "replay", "service"},
 }
 # Inside `model` every name imports only names to its left; the diagnosis and the paper stand beside identification
-ORDER = (
-    "signals chunks units address schema mechanics systemfile system laws simulate identification tracking"
-).split()
+ORDER = [
+    "signals",
+    "chunks",
+    "units",
+    "address",
+    "schema",
+    "mechanics",
+    "systemfile",
+    "system",
+    "laws",
+    "simulate",
+    "identification",
+    "tracking",
+]
 BESIDE = {"diagnosis": ORDER[: ORDER.index("identification")], "alps": ORDER}
 STAGES = ("record", "response", "fit", "screening", "selection", "investigation", "report", "api")
 # Imports inside functions of `model`, each with its reason

@@ -17,7 +17,7 @@ import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
-from sprung.model.schema import SupportInput
+from sprung.model.schema import ForceInput, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -111,7 +111,8 @@ def declared_noise(system: System, signals: Signals) -> Noise:
     at_support = at_force = 0
     for source in system.file.inputs.values():
         if isinstance(source, SupportInput):
-            level = source.displacement.noise or 1e-3 * _size(signals.displacement[:, at_support])
+            stated = source.displacement.noise if source.displacement is not None else 0.0
+            level = stated or 1e-3 * _size(signals.displacement[:, at_support])
             displacement.append(level)
             if signals.integrated[at_support]:
                 displacement[-1] = _INTEGRATED * max(level, _size(signals.displacement[:, at_support]))
@@ -120,7 +121,7 @@ def declared_noise(system: System, signals: Signals) -> Noise:
             level = stated or 1e-3 * _size(signals.velocity[:, at_support])
             velocity.append(level if measured else np.inf)
             at_support += 1
-        else:
+        elif isinstance(source, ForceInput):
             force.append(source.noise or 1e-3 * _size(signals.force[:, at_force]))
             at_force += 1
     listed = list(system.file.sensors.values())
