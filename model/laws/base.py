@@ -146,6 +146,8 @@ class ElementLaw(Parametrised):
     odd: bool = True  # force(-d, -v) = -force(d, v)
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
+    formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
+    memory_formula: str = ""  # the rate of its one state `z`, likewise
 
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""

@@ -75,6 +75,7 @@ ANTI_ROLL_BAR = ElementLaw(
             "stiffness", "N/m", 0.0, 1e12, "force per difference of the two deflections", lambda s: 0.1 * s.stiffness
         ),
     ),
+    formula="stiffness * d",
     force=_bar,  # deflection: left minus right; the force acts on the left element, its negative on the right one
     shapes=lambda seen: grid([0.1 * seen.stiffness]),
     absent=(0.0,),

@@ -23,6 +23,7 @@ CUBIC_STIFFNESS = ElementLaw(
     parameters=(ParameterSpec("k3", "N/m^3", -1e15, 1e15, "cubic coefficient; negative: softening", _typical_cubic),),
     force=_cubic,
     shapes=lambda seen: grid([_typical_cubic(seen)]),
+    formula="k3 * d**3",
     absent=(0.0,),
     looks_like="stiffness grows smoothly with amplitude; odd harmonics; no hysteresis",
     confused_with=("bump_stop", "clearance"),
@@ -49,6 +50,7 @@ BUMP_STOP = ElementLaw(
         seen.deflection_quantile([0.35, 0.5, 0.65, 0.75, 0.83, 0.9, 0.95, 0.98, 0.995]), [seen.stiffness]
     ),
     absent=(1.0, 0.0),
+    formula="stiffness * (d - min(max(d, -gap), gap))",
     looks_like="the error appears only in the largest deflections, to both sides, and is elastic",
     confused_with=("cubic_stiffness", "clearance"),
     sentence="a stop of {stiffness} is touched beyond {gap} of travel",
@@ -70,6 +72,7 @@ CLEARANCE = ElementLaw(
     force=_clearance,
     shapes=lambda seen: grid(seen.deflection_quantile([0.03, 0.08, 0.15, 0.25, 0.35, 0.5, 0.65, 0.8])),
     absent=(0.0,),
+    formula="-k * min(max(d, -gap), gap)",
     looks_like="no spring force around the middle, full stiffness beyond: the error is largest at small deflections",
     confused_with=("coulomb_friction", "bump_stop", "cubic_stiffness"),
     sentence="the spring has a clearance of {gap} to each side before it acts",

@@ -1,0 +1,150 @@
+"""Formulas of laws as text: checked, evaluated on arrays, and written in other languages.
+
+A law's formula names its parameters, the element's `k` (N/m) and `c` (N s/m), deflection `d` (m), rate `v` (m/s), time
+`t` (s on the laws' clock) and, with memory, `z`.  It is arithmetic with the functions of `FUNCTIONS`; nothing else of
+Python is admitted, so that a formula from a file cannot do anything but calculate.
+
+>>> law = parse("force * tanh(v / smoothing)", {"force", "smoothing", "v"})
+>>> float(law(force=300.0, smoothing=0.01, v=1.0))
+300.0
+>>> law.c()
+'(force * tanh((v / smoothing)))'
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+MOTION = ("d", "v", "t", "z", "k", "c")  # what a formula may name besides the law's parameters
+
+
+class FormulaError(ValueError):
+    """A formula that cannot be read; one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Function:
+    """One function of the language and its names elsewhere."""
+
+    arity: int
+    numpy: Callable[..., Any]
+    c: str
+    modelica: str
+
+
+FUNCTIONS: dict[str, Function] = {
+    "abs": Function(1, np.abs, "fabs({0})", "abs({0})"),
+    "sign": Function(1, np.sign, "(double)(({0} > 0) - ({0} < 0))", "sign({0})"),
+    "tanh": Function(1, np.tanh, "tanh({0})", "tanh({0})"),
+    "exp": Function(1, np.exp, "exp({0})", "exp({0})"),
+    "log": Function(1, np.log, "log({0})", "log({0})"),
+    "sqrt": Function(1, np.sqrt, "sqrt({0})", "sqrt({0})"),
+    "sin": Function(1, np.sin, "sin({0})", "sin({0})"),
+    "cos": Function(1, np.cos, "cos({0})", "cos({0})"),
+    "min": Function(2, np.minimum, "fmin({0}, {1})", "min({0}, {1})"),
+    "max": Function(2, np.maximum, "fmax({0}, {1})", "max({0}, {1})"),
+}
+_BINARY: dict[type[ast.operator], tuple[Callable[[Any, Any], Any], str]] = {
+    ast.Add: (np.add, "+"),
+    ast.Sub: (np.subtract, "-"),
+    ast.Mult: (np.multiply, "*"),
+    ast.Div: (np.divide, "/"),
+    ast.Pow: (np.power, "^"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Expression:
+    """A checked formula."""
+
+    text: str
+    names: frozenset[str]  # that it uses
+    tree: ast.expr
+
+    def __call__(self, **values: Any) -> Any:
+        """Its value; arrays broadcast."""
+        return _evaluate(self.tree, values)
+
+    def c(self, rename: Mapping[str, str] | None = None) -> str:
+        """The same in C (math.h); `rename` gives the names there."""
+        return _written(self.tree, "c", rename or {})
+
+    def modelica(self, rename: Mapping[str, str] | None = None) -> str:
+        """The same in Modelica."""
+        return _written(self.tree, "modelica", rename or {})
+
+
+def parse(text: str, known: Collection[str]) -> Expression:
+    """Check a formula; `known` are the names that it may use.  Errors: `FormulaError`."""
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+        names = frozenset(_names(tree, text))
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as problem:
+        if isinstance(problem, FormulaError):
+            raise
+        raise FormulaError(f"formula {text!r}: not arithmetic") from None
+    unknown = sorted(names - set(known))
+    if unknown:
+        raise FormulaError(f"formula {text!r}: {unknown[0]!r} is none of {', '.join(sorted(known))}")
+    return Expression(text.strip(), names, tree)
+
+
+def _names(node: ast.expr, text: str) -> set[str]:
+    """Names used below a node; raises for anything that is no arithmetic."""
+    match node:
+        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool) and np.isfinite(value):
+            return set()
+        case ast.Name(id=name):
+            return {name}
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
+            return _names(operand, text)
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in _BINARY:
+            return _names(left, text) | _names(right, text)
+        case ast.Call(func=ast.Name(id=name), args=arguments, keywords=[]) if name in FUNCTIONS:
+            if len(arguments) != FUNCTIONS[name].arity:
+                raise FormulaError(f"formula {text!r}: {name} takes {FUNCTIONS[name].arity} arguments")
+            return set().union(*(_names(argument, text) for argument in arguments))
+    raise FormulaError(
+        f"formula {text!r}: {ast.unparse(node)!r} is no arithmetic; functions are {', '.join(FUNCTIONS)}"
+    )
+
+
+def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> Any:
+    match node:
+        case ast.Constant(value=value):
+            return float(value)  # type: ignore[arg-type]
+        case ast.Name(id=name):
+            return values[name]
+        case ast.UnaryOp(op=op, operand=operand):
+            value = _evaluate(operand, values)
+            return -value if isinstance(op, ast.USub) else value
+        case ast.BinOp(left=left, op=op, right=right):
+            return _BINARY[type(op)][0](_evaluate(left, values), _evaluate(right, values))
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            return FUNCTIONS[name].numpy(*(_evaluate(argument, values) for argument in arguments))
+    raise AssertionError(ast.dump(node))  # `parse` admits nothing else
+
+
+def _written(node: ast.expr, language: str, rename: Mapping[str, str]) -> str:
+    match node:
+        case ast.Constant(value=value):
+            return repr(float(value))  # type: ignore[arg-type]
+        case ast.Name(id=name):
+            return rename.get(name, name)
+        case ast.UnaryOp(op=op, operand=operand):
+            inner = _written(operand, language, rename)
+            return f"(-{inner})" if isinstance(op, ast.USub) else inner
+        case ast.BinOp(left=left, op=op, right=right):
+            a, b = _written(left, language, rename), _written(right, language, rename)
+            if isinstance(op, ast.Pow) and language == "c":
+                return f"pow({a}, {b})"
+            return f"({a} {_BINARY[type(op)][1]} {b})"
+        case ast.Call(func=ast.Name(id=name), args=arguments):
+            template = FUNCTIONS[name].c if language == "c" else FUNCTIONS[name].modelica
+            return template.format(*(_written(argument, language, rename) for argument in arguments))
+    raise AssertionError(ast.dump(node))

@@ -1,0 +1,75 @@
+"""Formulas of laws: what they admit, and that every law's text is its force."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sprung.model.laws import CATALOGUE, ElementLaw
+from sprung.model.laws.base import Motion, SpringDamper
+from sprung.model.laws.expression import MOTION, FormulaError, parse
+
+WRITTEN = [law for law in CATALOGUE if isinstance(law, ElementLaw)]
+WRITTEN += [law.wider for law in WRITTEN if law.wider is not None]
+
+
+@pytest.mark.parametrize("law", WRITTEN, ids=lambda law: f"{law.name}-{len(law.parameters)}")
+def test_a_laws_formula_is_its_force(law: ElementLaw) -> None:
+    rng = np.random.default_rng(1)
+    d, v, t, z = rng.normal(0, 0.01, 200), rng.normal(0, 0.1, 200), rng.uniform(5, 60, 200), rng.normal(0, 0.02, 200)
+    p = [min(max(low, 0.7 + 0.1 * i), 2.0) for i, low in enumerate(q.low for q in law.parameters)]
+    element = SpringDamper(3e4, 2e3)
+    motion = Motion(d, v, t, z[None] if law.memory else ())
+    values = dict(zip(law.names, p, strict=True)) | {"d": d, "v": v, "t": t, "z": z, "k": 3e4, "c": 2e3}
+    known = {*law.names, *MOTION}
+    np.testing.assert_allclose(parse(law.formula, known)(**values), law.force(motion, p, element), rtol=1e-12)
+    if law.memory:
+        rate = parse(law.memory_formula, known)(**values)
+        np.testing.assert_allclose(rate, law.memory_rate(motion, p, element)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os')",
+        "d.real",
+        "d[0]",
+        "lambda: d",
+        "d if v else 1",
+        "tanh(d, v)",
+        "f(d)",
+        "d <",
+        "'d'",
+        "True",
+        "1e999",
+        "[d]",
+        "min(d, default=1)",
+        "(" * 500 + "d" + ")" * 500,
+        "d // 2",
+    ],
+)
+def test_only_arithmetic_is_admitted(text: str) -> None:
+    with pytest.raises(FormulaError, match="formula"):
+        parse(text, {"d", "v"})
+
+
+def test_an_unknown_name_is_told_with_those_that_exist() -> None:
+    with pytest.raises(FormulaError, match="'stiffnes' is none of d, stiffness"):
+        parse("stiffnes * d", {"stiffness", "d"})
+
+
+def test_a_formula_says_the_same_in_c(tmp_path: Path) -> None:
+    text = "-a * min(max(d, -gap), gap) + tanh(v / s) * abs(d)**1.5 - sign(v) * sqrt(a) + exp(-d) * 2 ** -v"
+    values = {"a": 3.0, "gap": 0.1, "d": 0.4, "v": -0.3, "s": 0.2}
+    formula = parse(text, set(values))
+    source = tmp_path / "f.c"
+    declared = "".join(f"double {name} = {value!r};" for name, value in values.items())
+    source.write_text(
+        f'#include <math.h>\n#include <stdio.h>\nint main(void){{{declared}printf("%.17g", {formula.c()});}}'
+    )
+    subprocess.run(["cc", "-o", str(tmp_path / "f"), str(source), "-lm"], check=True)
+    shown = subprocess.run([str(tmp_path / "f")], check=True, capture_output=True, text=True).stdout
+    assert float(shown) == pytest.approx(float(formula(**values)), rel=1e-14)
