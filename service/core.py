@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from sprung.model.signals import Tally
 from sprung.service.board import Board
 from sprung.service.compute import Compute
-from sprung.service.diagnoses import Diagnoses
+from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
 from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
 from sprung.service.housekeeping import Housekeeping
-from sprung.service.jobs import Handler, Jobs
+from sprung.service.jobs import Jobs, Kind
 from sprung.service.metrics import Metrics
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
@@ -41,22 +41,17 @@ class Core:
     metrics: Metrics
     jobs: Jobs
     diagnoses: Diagnoses
+    diagnosis_jobs: DiagnosisJobs
     housekeeping: Housekeeping
     stopping: threading.Event
 
     def tally_counter(self, source: str) -> OnTally:
         """A callback that adds to `sprung_frames_total` what a source has read since the last call."""
-        before = Tally()
-
-        def count(now: Tally) -> None:
-            nonlocal before
-            self.metrics.count_frames(source, before, now)
-            before = replace(now, reasons=now.reasons.copy())
-
-        return count
+        return tally_counter(self.metrics, source)
 
     def start(self) -> None:
         """Take up what was left, begin housekeeping."""
+        self.housekeeping.clear_leftovers()
         self.board.restore(stored_views(self))
         self.jobs.start()
         self.housekeeping.start()
@@ -86,16 +81,42 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     stopping = threading.Event()
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory)
-    diagnoses = Diagnoses(settings, engine, store, rings, pipeline.model_id)
-    recordings = RecordingJobs(settings, pipeline)
-    handlers: dict[str, Handler] = {"recording": recordings.run, "diagnosis": diagnoses.run}
-    jobs = Jobs(store, handlers, settings.job_queue)
-    diagnoses.jobs = jobs
+    recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
+    diagnosis_jobs = DiagnosisJobs(settings, engine, store, pipeline.model_id)
+    kinds = {
+        "recording": Kind(recordings.run, settings.recording_seconds),
+        "diagnosis": Kind(diagnosis_jobs.run, settings.diagnosis_seconds),
+    }
+    jobs = Jobs(store, kinds, settings.job_queue)
+    diagnoses = Diagnoses(settings, store, rings, jobs)
     listeners.append(diagnoses.on_batch)
     housekeeping = Housekeeping(settings, store)
-    core = Core(settings, engine, store, compute, pipeline, board, metrics, jobs, diagnoses, housekeeping, stopping)
-    recordings.tally_counter = core.tally_counter
-    return core
+    return Core(
+        settings,
+        engine,
+        store,
+        compute,
+        pipeline,
+        board,
+        metrics,
+        jobs,
+        diagnoses,
+        diagnosis_jobs,
+        housekeeping,
+        stopping,
+    )
+
+
+def tally_counter(metrics: Metrics, source: str) -> OnTally:
+    """A callback that adds to `sprung_frames_total` what a source has read since the last call."""
+    before = Tally()
+
+    def count(now: Tally) -> None:
+        nonlocal before
+        metrics.count_frames(source, before, now)
+        before = replace(now, reasons=now.reasons.copy())
+
+    return count
 
 
 def stored_views(core: Core) -> list[VehicleView]:

@@ -10,6 +10,15 @@ class UserError(ValueError):
 class Busy(RuntimeError):
     """A bounded queue is full; the caller may try again later."""
 
+    def __init__(self, message: str, retry_after: int = 1) -> None:
+        """retry_after: seconds."""
+        super().__init__(message)
+        self.retry_after = retry_after
+
+
+class NoSpace(RuntimeError):
+    """What was sent cannot be kept: the quota or the disk is full."""
+
 
 class NotFound(LookupError):
     """The store holds no such thing."""

@@ -2,29 +2,25 @@
 
 from __future__ import annotations
 
-import queue
 import re
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.tracking.tracker import TrackerState
-from sprung.replay import open_recording
-from sprung.replay.pacing import paced
-from sprung.replay.windowing import Windower
 from sprung.service.compute import Priority
 from sprung.service.errors import Busy
 from sprung.service.pipeline import Batch, Identified, Pipeline
+from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched, windower_of
 from sprung.service.times import NANOSECONDS
+from sprung.service.worker import Limits
 
-T = TypeVar("T")
 NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
-READ_AHEAD = 2  # batches; with them memory stays flat however long the file is
 
 OnBatch = Callable[[Batch], None]
 OnTally = Callable[[Tally], None]
@@ -95,41 +91,52 @@ def feed_file(
     recording_id: str | None = None,
     batch_windows: int = 128,
     speed: float = 0.0,
+    limits: Limits | None = None,
     on_batch: OnBatch = lambda batch: None,
     on_tally: OnTally = lambda tally: None,
+    check: Callable[[], None] = lambda: None,
 ) -> Fed:
     """Read a recording to its end, through the pipeline.
 
     file_name: what the user calls the file, where `path` is a name of the service's own.
-    speed: times real time; 0: as fast as possible.
-    Stops with whatever `on_batch` raises; batches before are stored.  Raises UnreadableRecording.
+    speed: times real time; 0: as fast as possible.  limits: read in a process of its own, within these.
+    check: called while waiting; this stops with whatever it or `on_batch` raises, batches before are stored.
+    Raises UnreadableRecording, or UserError where the limits are exceeded.
     """
+    system = pipeline.engine.system
+    request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed)
+    reading: Reading = Here(request) if limits is None else Apart(request, limits)
     started = time.perf_counter()
-    recording = open_recording(path, pipeline.engine.system.channels, dbc=pipeline.engine.dbc)
     fed = Fed("")
-    windows = _windows(pipeline, paced(recording.blocks(), speed), fed)
-    batches = prefetched(_batched(windows, 1 if speed else batch_windows), READ_AHEAD)
     priority = Priority.LIVE if speed else Priority.BATCH
 
-    def identified() -> Iterator[Identified]:
-        for batch in batches:
-            fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
-            yield pipeline.identify(fed.vehicle, batch, priority)
+    def name(recorded: str | None) -> str:
+        return fed.vehicle or vehicle_of(vehicle, recorded, file_name or path.name)
 
-    found = prefetched(identified(), 1)
+    def identified() -> Iterator[tuple[Identified | None, Tally]]:
+        for piece in reading.pieces(check):
+            found = None
+            if piece.windows:
+                fed.vehicle = name(piece.vehicle)
+                found = pipeline.identify(fed.vehicle, piece.windows, priority)
+            yield found, piece.tally
+
+    found = prefetched(identified(), 1, check)
     try:
-        for one in found:
-            on_tally(recording.tally)
-            on_batch(_count(fed, pipeline.keep(one, recording_id)))
+        for one, tally in found:
+            on_tally(tally)
+            if one is not None:
+                on_batch(_count(fed, pipeline.keep(one, recording_id)))
     finally:
+        reading.close()
         found.close()
-        batches.close()
-    on_tally(recording.tally)
-    fed.vehicle = fed.vehicle or vehicle_of(vehicle, recording.vehicle, file_name or path.name)
+    ending = reading.ending
+    on_tally(ending.tally)
+    fed.vehicle = name(ending.vehicle)
     fed.state = fed.state or pipeline.state(fed.vehicle)
-    fed.tally = recording.tally
-    fed.problems = list(recording.problems)
-    fed.incomplete = recording.incomplete
+    fed.tally, fed.problems, fed.incomplete = ending.tally, ending.problems, ending.incomplete
+    fed.expected, fed.lost = ending.expected, ending.lost
+    fed.first_ns, fed.last_ns = ending.first_ns, ending.last_ns
     fed.wall_seconds = time.perf_counter() - started
     return fed
 
@@ -138,52 +145,13 @@ def feed_live(pipeline: Pipeline, source: Source, vehicle: str, stopping: thread
     """Feed a live source until it ends or `stopping` is set; every window as soon as it is whole."""
     fed = Fed(vehicle)
     try:
-        for window in _windows(pipeline, _until(source.blocks(), stopping), fed):
+        for window in _windows(pipeline, _until(source.blocks(), stopping)):
             _count(fed, pipeline.process(fed.vehicle, [window], None, Priority.LIVE))
             on_tally(source.tally)
     except Busy:  # a service that stops accepts nothing more; what it had accepted is stored
         if not stopping.is_set():
             raise
     on_tally(source.tally)
-
-
-def prefetched(items: Iterator[T], ahead: int) -> Generator[T, None, None]:
-    """The same items, produced in a thread of their own, at most `ahead` of them waiting."""
-    waiting: queue.Queue[tuple[bool, Any]] = queue.Queue(ahead)
-    abandoned = threading.Event()
-
-    def offer(entry: tuple[bool, Any]) -> bool:
-        while not abandoned.is_set():
-            try:
-                waiting.put(entry, timeout=0.1)
-                return True
-            except queue.Full:
-                continue
-        return False
-
-    def produce() -> None:
-        try:
-            for item in items:
-                if not offer((True, item)):
-                    return
-            offer((False, None))
-        except BaseException as error:  # raised where the items are used
-            offer((False, error))
-
-    thread = threading.Thread(target=produce, name="sprung-read", daemon=True)
-    thread.start()
-    try:
-        while True:
-            more, item = waiting.get()
-            if more:
-                yield item
-            elif item is None:
-                return
-            else:
-                raise item
-    finally:
-        abandoned.set()
-        thread.join()
 
 
 def _count(fed: Fed, batch: Batch) -> Batch:
@@ -194,28 +162,11 @@ def _count(fed: Fed, batch: Batch) -> Batch:
     return batch
 
 
-def _windows(pipeline: Pipeline, blocks: Iterable[SampleBlock], fed: Fed) -> Iterator[Window]:
-    system = pipeline.engine.system
-    windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
+def _windows(pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[Window]:
+    windower = windower_of(pipeline.engine.system)
     for block in blocks:
-        if len(block.time):
-            first, last = int(block.time.min()), int(block.time.max())
-            fed.first_ns = first if fed.first_ns is None else min(fed.first_ns, first)
-            fed.last_ns = last if fed.last_ns is None else max(fed.last_ns, last)
         yield from windower.push(block)
     yield from windower.flush()
-    fed.expected, fed.lost = windower.expected, windower.lost
-
-
-def _batched(windows: Iterable[Window], size: int) -> Iterator[list[Window]]:
-    held: list[Window] = []
-    for window in windows:
-        held.append(window)
-        if len(held) >= size:
-            yield held
-            held = []
-    if held:
-        yield held
 
 
 def _until(blocks: Iterable[SampleBlock], stopping: threading.Event) -> Iterator[SampleBlock]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import threading
+from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.settings import Settings
-from sprung.service.store import Store, retention
+from sprung.service.store import Store, retention, work
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.housekeeping")
@@ -35,6 +37,21 @@ class Housekeeping:
         if self._thread.is_alive():
             self._thread.join()
 
+    def clear_leftovers(self) -> list[str]:
+        """Delete what a process that died left half written; call it before anything is accepted.  The names."""
+        with self._store.read() as connection:
+            kept = work.stored_files(connection)
+        left = [path for path in _entries(self._settings.uploads) if path.name not in kept]
+        left += [path for path in _entries(self._settings.reports) if path.name.endswith(".part")]
+        for path in left:
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        if left:
+            log.warning("%d files that were left half written are deleted", len(left))
+        return [path.name for path in left]
+
     def once(self, now: int) -> retention.Forgotten:
         """One round, as if it were `now`, ns since epoch."""
         settings = self._settings
@@ -57,3 +74,7 @@ class Housekeeping:
                 log.exception("housekeeping failed; it tries again in an hour")
             if self._stopping.wait(PERIOD_SECONDS):
                 return
+
+
+def _entries(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.is_dir() else []

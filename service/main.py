@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from types import FrameType
 from typing import NoReturn
@@ -22,10 +23,10 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
-from sprung.service.pipeline import Batch
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
 from sprung.service.store.work import add_recording
+from sprung.service.worker import Limits
 
 log = logging.getLogger("sprung")
 
@@ -119,14 +120,12 @@ def _feed_bus(core: Core, bus: LiveBus, vehicle: str | None) -> None:
 
 
 def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
+    def check() -> None:
+        if core.stopping.is_set():
+            raise Interrupted
+
     for path in feeds.files:
         on_batch, on_end = watch(path, core)
-
-        def watched(batch: Batch, on_batch: OnBatch = on_batch) -> None:
-            on_batch(batch)
-            if core.stopping.is_set():
-                raise Interrupted
-
         try:
             row = file_row(path)
             with core.store.write() as connection:
@@ -138,8 +137,10 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 recording_id=row.id,
                 batch_windows=core.settings.batch_windows,
                 speed=feeds.speed,
-                on_batch=watched,
+                limits=Limits(inf, inf, core.settings.worker_memory_bytes),
+                on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
+                check=check,
             )
             finish_row(core.store, row, fed)
             on_end(fed)

@@ -15,19 +15,17 @@ from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow
 from sprung.service.times import now_ns
-
-
-def _uncounted(_source: str) -> OnTally:
-    return lambda tally: None
+from sprung.service.worker import Limits
 
 
 class RecordingJobs:
-    """Runs jobs of kind `recording`: a file from the upload folder, through the pipeline."""
+    """Runs jobs of kind `recording`: a file from the upload folder, read in a process of its own, into the pipeline."""
 
-    def __init__(self, settings: Settings, pipeline: Pipeline) -> None:
+    def __init__(self, settings: Settings, pipeline: Pipeline, counter: Callable[[], OnTally]) -> None:
+        """counter: makes a callback that counts the messages of one recording."""
         self._settings = settings
         self._pipeline = pipeline
-        self.tally_counter: Callable[[str], OnTally] = _uncounted
+        self._counter = counter
 
     def run(self, job: JobRow, progress: Progress) -> dict[str, Any]:
         """Returns the summary of what was read."""
@@ -44,13 +42,20 @@ class RecordingJobs:
                 file_name=row.name,
                 recording_id=row.id,
                 batch_windows=self._settings.batch_windows,
+                limits=reading_limits(self._settings),
                 on_batch=on_batch,
-                on_tally=self.tally_counter("upload"),
+                on_tally=self._counter(),
+                check=progress.check,
             )
-        except UnreadableRecording as error:
+        except (UnreadableRecording, UserError) as error:
             raise UserError(str(error).replace(str(path), row.name)) from error
         finish_row(self._pipeline.store, row, fed)
         return {"recording": row.id} | fed.summary()
+
+
+def reading_limits(settings: Settings) -> Limits:
+    """What reading a recording of a stranger may use."""
+    return Limits(settings.reading_silence_seconds, settings.recording_seconds, settings.worker_memory_bytes)
 
 
 def stored_file(settings: Settings, store: Store, job: JobRow) -> tuple[Path, work.RecordingRow]:

@@ -47,6 +47,10 @@ class Settings(BaseSettings):
 
     compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503
     job_queue: int = Field(default=16, gt=0)  # uploads and diagnoses waiting before 503
+    recording_seconds: float = Field(default=7200.0, gt=0)  # that reading an upload may take in all
+    reading_silence_seconds: float = Field(default=60.0, gt=0)  # that it may go on without any sample
+    diagnosis_seconds: float = Field(default=600.0, gt=0)
+    worker_memory_bytes: int = Field(default=4_000_000_000, gt=0)  # of a process that reads an upload or diagnoses
     batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction
 
     parameter_series_vehicles: int = Field(default=20, ge=0)  # vehicles with per-parameter metrics

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.system import System
+from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.worker import Emit
 
 START = 1_790_000_000_000_000_000  # ns
 HOP = 500_000_000  # ns
@@ -63,3 +69,27 @@ def make_window(system: System, number: int, level: float = 0.0, outcome: str = 
     values = np.full((system.window, len(system.channels)), level)
     reason = "gap" if outcome == "dropped" else None
     return Window(START + number * HOP, system.sample_rate, values, outcome, reason)  # type: ignore[arg-type]
+
+
+REPORT: dict[str, Any] = {
+    "system": "x",
+    "recording": {"file": "x", "seconds": 5.0, "samples": 500, "lost": 0},
+    "verdict": "missing_physics",
+    "findings": [{"location": "secondary_1r", "effect": "coulomb_friction", "sentence": "secondary_1r: dry friction"}],
+}
+
+
+def diagnose(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """A diagnosis that takes no time: does what the recording's name asks for, else answers REPORT."""
+    emit(Stage(0.5, "half way"))
+    if "short" in request.name:
+        raise ValueError(f"{request.name}: too short to tell")
+    if "wrong" in request.name:
+        raise KeyError("a mistake of ours")
+    if "deadly" in request.name:
+        os.kill(os.getpid(), signal.SIGKILL)
+    if "endless" in request.name:
+        time.sleep(600)
+    request.out.mkdir(parents=True)
+    (request.out / "report.html").write_text("<p>the page</p>")
+    return DiagnosisResult("missing_physics", REPORT)

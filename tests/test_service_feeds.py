@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -23,7 +21,7 @@ from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
 from sprung.service.compute import Compute
 from sprung.service.core import Core, build_core
-from sprung.service.diagnoses import load_excerpt, save_excerpt
+from sprung.service.diagnosing import load_excerpt, save_excerpt
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
 from sprung.service.feed import feed_file, feed_live, prefetched, vehicle_of
@@ -33,7 +31,7 @@ from sprung.service.ring import Excerpt, Ring, Rings
 from sprung.service.settings import Settings
 from sprung.service.store import open_store, work
 from sprung.service.store.work import JobRow
-from tests.service_fakes import HOP, START, FakeIdentifier, make_window
+from tests.service_fakes import HOP, START, FakeIdentifier, diagnose, make_window
 
 SECONDS = 5
 
@@ -69,7 +67,9 @@ def recording(tmp_path: Path, csv_engine: Engine) -> Path:
 
 @pytest.fixture
 def core(csv_engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path / "data", misfit_seconds=5, job_queue=2), csv_engine)
+    core = build_core(Settings(data_dir=tmp_path / "data", misfit_seconds=5, job_queue=2), csv_engine)
+    core.diagnosis_jobs.task = diagnose
+    return core
 
 
 @pytest.fixture
@@ -350,35 +350,7 @@ def test_an_excerpt_comes_back_as_it_was_saved(tmp_path: Path) -> None:
     assert (record.start, record.sample_rate, record.lost) == (START, 100.0, 2)
 
 
-REPORT = {
-    "system": "x",
-    "recording": {"file": "x", "seconds": 5.0, "samples": 500, "lost": 0},
-    "verdict": "missing_physics",
-    "findings": [{"location": "secondary_1r", "effect": "coulomb_friction", "sentence": "secondary_1r: dry friction"}],
-}
-
-
-@pytest.fixture
-def tool(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A stand-in for the program that diagnoses: writes what it was asked, answers REPORT or fails when told so."""
-    path = tmp_path / "tool"
-    path.write_text(
-        f"#!{sys.executable}\n"
-        "import json, pathlib, sys\n"
-        "here = pathlib.Path(__file__).parent\n"
-        "(here / 'asked').write_text(json.dumps(sys.argv[1:]))\n"
-        "out = pathlib.Path(sys.argv[sys.argv.index('--out') + 1]); out.mkdir(parents=True)\n"
-        "(out / 'report.html').write_text('<p>the page</p>')\n"
-        "if (here / 'fail').exists():\n"
-        "    print('sprung: ' + sys.argv[4] + ': too short to tell', file=sys.stderr); sys.exit(2)\n"
-        f"print({json.dumps(json.dumps(REPORT))}); sys.exit(1)\n"
-    )
-    path.chmod(0o755)
-    monkeypatch.setattr("sprung.service.diagnoses.sys.executable", str(path))
-    return path
-
-
-def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recording: Path, tool: Path) -> None:
+def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recording: Path) -> None:
     with open(recording, "rb") as stream:
         response = client.post("/diagnose", files={"file": ("ride.csv", stream)})
     assert response.status_code == 202, response.text
@@ -388,22 +360,19 @@ def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recordin
     assert report["findings"][0]["effect"] == "coulomb_friction"
     page = client.get(f"/reports/{done['result']['report']}", headers={"accept": "text/html"})
     assert page.text == "<p>the page</p>"
-    asked = json.loads((tool.parent / "asked").read_text())
-    assert asked[:3] == ["-m", "sprung", "diagnose"] and {"--json", "--name=ride.csv"} <= set(asked)
 
 
-def test_a_stored_recording_is_diagnosed_by_id(client: TestClient, recording: Path, tool: Path) -> None:
+def test_a_stored_recording_is_diagnosed_by_id(client: TestClient, recording: Path) -> None:
     job = finished(client, upload(client, recording).json())
     response = client.post("/diagnose", json={"recording": job["recording"]})
     assert finished(client, response.json())["state"] == "done"
     assert client.post("/diagnose", json={"recording": "none"}).status_code == 404
 
 
-def test_a_diagnosis_that_cannot_be_made_fails_with_its_line(client: TestClient, recording: Path, tool: Path) -> None:
-    (tool.parent / "fail").touch()
+def test_a_diagnosis_that_cannot_be_made_fails_with_its_line(client: TestClient, recording: Path) -> None:
     with open(recording, "rb") as stream:
-        job = finished(client, client.post("/diagnose", files={"file": ("ride.csv", stream)}).json())
-    assert (job["state"], job["error"]) == ("failed", "ride.csv: too short to tell")
+        job = finished(client, client.post("/diagnose", files={"file": ("short.csv", stream)}).json())
+    assert (job["state"], job["error"]) == ("failed", "short.csv: too short to tell")
 
 
 @pytest.mark.parametrize("content", [b"{}", b'{"recording": "a", "vehicle": "b"}', b'{"file": 1}', b"["])
@@ -414,7 +383,7 @@ def test_wrong_bodies_of_diagnose_are_refused(client: TestClient, content: bytes
 
 
 def test_windows_that_stop_fitting_start_one_diagnosis_that_joins_the_alarm(
-    client: TestClient, core: Core, csv_engine: Engine, tool: Path
+    client: TestClient, core: Core, csv_engine: Engine
 ) -> None:
     identifier = csv_engine.identifier
     assert isinstance(identifier, FakeIdentifier)
@@ -434,9 +403,7 @@ def test_windows_that_stop_fitting_start_one_diagnosis_that_joins_the_alarm(
     assert "dry friction" in page and "mismatch report" in page
 
 
-def test_a_vehicles_last_minute_is_diagnosed_on_request(
-    client: TestClient, core: Core, csv_engine: Engine, tool: Path
-) -> None:
+def test_a_vehicles_last_minute_is_diagnosed_on_request(client: TestClient, core: Core, csv_engine: Engine) -> None:
     core.pipeline.process("a", [make_window(csv_engine.system, i) for i in range(8)])
     response = client.post("/diagnose", json={"vehicle": "a"})
     assert finished(client, response.json())["state"] == "done"

@@ -88,7 +88,7 @@ def _as_problem(error: Exception) -> Problem:
             ]
             return Problem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
         case Busy():
-            return Problem(503, str(error), headers={"Retry-After": "1"})
+            return Problem(503, str(error), headers={"Retry-After": str(error.retry_after)})
         case NotFound():
             return Problem(404, str(error))
         case UserError():

@@ -53,6 +53,13 @@ async def job(core: CoreOf, id: str) -> Response:
     return json_response(job_dict(await read(core, query)))
 
 
+@router.delete("/jobs/{id}", summary="Cancel a job")
+async def cancel(core: CoreOf, id: str) -> Response:
+    """A job that waits or runs is given up; it is then `failed`, and its error says that it was cancelled.  What it
+    stored before stays."""
+    return json_response(job_dict(await run_in_threadpool(core.jobs.cancel, id, "a user")))
+
+
 def keep_upload(settings: Settings, name: str, stream: BinaryIO) -> RecordingRow:
     """Copy an upload into the folder, under a name that the client has no part in but its known extension.
 
@@ -67,9 +74,11 @@ def keep_upload(settings: Settings, name: str, stream: BinaryIO) -> RecordingRow
     stored = f"{recording_id}{extension}"
     settings.uploads.mkdir(parents=True, exist_ok=True)
     size = 0
-    with open(settings.uploads / stored, "xb") as target:
+    part = settings.uploads / f"{stored}.part"
+    with open(part, "xb") as target:
         while chunk := stream.read(CHUNK):
             size += target.write(chunk)
+    part.replace(settings.uploads / stored)
     return RecordingRow(recording_id, None, label, "upload", stored, size, None, now_ns(), None)
 
 

@@ -11,7 +11,7 @@ from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.replay.record import Record, load_record
 from sprung.service.cli.console import errors, silent_stage, stages
-from sprung.service.diagnoses import load_excerpt
+from sprung.service.diagnosing import load_excerpt
 
 
 def run(

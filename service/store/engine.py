@@ -74,7 +74,7 @@ def open_store(url: str) -> Store:
 def migrate(store: Store) -> None:
     """Bring the schema to the newest revision; nothing happens when it is there already."""
     config = Config()
-    config.set_main_option("script_location", "service:migrations")
+    config.set_main_option("script_location", "sprung.service:migrations")
     config.set_main_option("path_separator", "os")
     with store.write() as connection:
         config.attributes["connection"] = connection

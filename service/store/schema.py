@@ -172,4 +172,31 @@ jobs = Table(
     Column("error", String(500), nullable=True),
     Column("created_ns", BigInteger, nullable=False),
     Column("updated_ns", BigInteger, nullable=False),
+    Column("attempts", Integer, nullable=False, server_default="0"),  # starts that did not end in good order
+)
+
+tokens = Table(  # who may ask; the secret itself is kept nowhere
+    "tokens",
+    metadata,
+    Column("id", String(16), primary_key=True),
+    Column("digest", String(64), nullable=False, unique=True),  # SHA-256 of the secret, in hex
+    Column("name", String(128), nullable=False),
+    Column("scopes", JSON, nullable=False),  # ["read", ...]
+    Column("fleet", String(128), nullable=False),  # vehicles whose ids begin so; empty: all
+    Column("created_ns", BigInteger, nullable=False),
+    Column("expires_ns", BigInteger, nullable=True),
+    Column("revoked_ns", BigInteger, nullable=True),
+    Column("used_ns", BigInteger, nullable=True),
+)
+
+audit = Table(  # who did what, and when
+    "audit",
+    metadata,
+    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
+    Column("time_ns", BigInteger, nullable=False),
+    Column("actor", String(160), nullable=False),
+    Column("action", String(60), nullable=False),
+    Column("target", String(200), nullable=False),
+    Column("detail", JSON, nullable=True),
+    Index("ix_audit_time_ns", "time_ns"),
 )

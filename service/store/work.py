@@ -43,6 +43,7 @@ class JobRow:
     error: str | None
     created_ns: int
     updated_ns: int
+    attempts: int = 0  # starts that did not end in good order
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +105,11 @@ def unfinished_jobs(connection: Connection) -> Sequence[JobRow]:
     """Jobs that a previous process accepted and did not finish, oldest first."""
     query = select(jobs).where(jobs.c.state.in_(UNFINISHED)).order_by(jobs.c.created_ns)
     return [JobRow(*row) for row in connection.execute(query)]
+
+
+def stored_files(connection: Connection) -> set[str]:
+    """Names inside the upload folder that recordings refer to."""
+    return set(connection.execute(select(recordings.c.file).where(recordings.c.file.is_not(None))).scalars())
 
 
 def add_report(connection: Connection, row: ReportRow) -> None:

@@ -1,0 +1,107 @@
+"""One diagnosis, as a task for a process of its own: a file in, a report and its folder out.
+
+A diagnosis takes half a minute of both cores: apart, at low priority, requests and live windows go on meanwhile, and a
+stop can interrupt it.
+"""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sprung.model.system import System
+from sprung.replay.account import Account
+from sprung.replay.record import Record, load_record
+from sprung.service.ring import Excerpt
+from sprung.service.threads import hand_over_often, one_thread_each
+from sprung.service.worker import Emit
+
+SIGN_OF_LIFE_SECONDS = 10.0  # a stage may take longer
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisRequest:
+    """What to diagnose."""
+
+    path: Path
+    name: str  # of the recording, in the report
+    system: System
+    dbc: Path | None
+    out: Path  # folder for page, pictures and report; made when absent
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """How far it is."""
+
+    share: float  # 0..1
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisResult:
+    """What it came to."""
+
+    verdict: str
+    report: dict[str, Any]  # as `sprung diagnose --json` prints it
+
+
+def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """Diagnose and write the report.  Raises ValueErrors of one line for files that cannot be used."""
+    one_thread_each()  # candidates are fitted beside each other
+    hand_over_often()
+    from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+    from sprung.service.report import write_report
+
+    latest = Stage(0.0, "reading")
+
+    def show(share: float, text: str) -> None:
+        nonlocal latest
+        latest = Stage(share, text)
+        emit(latest)
+
+    done = threading.Event()
+
+    def live() -> None:
+        while not done.wait(SIGN_OF_LIFE_SECONDS):
+            emit(latest)
+
+    threading.Thread(target=live, daemon=True).start()
+    try:
+        show(0.0, "reading")
+        report = diagnose(request.system, _load(request), Options(file=request.name), show)
+        show(1.0, "writing the report")
+        write_report(report, request.system, request.out)
+        return DiagnosisResult(report.verdict, report.to_dict())
+    except ValueError as error:
+        raise ValueError(str(error).replace(str(request.path), request.name)) from error
+    finally:
+        done.set()
+
+
+def _load(request: DiagnosisRequest) -> Record:
+    if request.path.suffix == ".npz":
+        return load_excerpt(request.path)
+    return load_record(request.path, request.system.channels, request.system.sample_rate, dbc=request.dbc)
+
+
+def save_excerpt(path: Path, excerpt: Excerpt) -> None:
+    """Write samples as an .npz that `load_excerpt` reads; whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.part")
+    with open(part, "wb") as target:
+        np.savez_compressed(target, start=excerpt.start, sample_rate=excerpt.sample_rate, values=excerpt.values)
+    part.replace(path)
+
+
+def load_excerpt(path: Path) -> Record:
+    """Read what `save_excerpt` wrote."""
+    with np.load(path, allow_pickle=False) as data:
+        start, rate, values = int(data["start"]), float(data["sample_rate"]), data["values"]
+    missing = np.isnan(values)
+    lost = int(missing[:, ~missing.all(axis=0)].sum())
+    return Record(start, rate, values, lost, None, (), Account())

@@ -1,0 +1,207 @@
+"""Work in a process of its own, through a typed interface: one request in, messages and one result out.
+
+What may hang, exhaust memory or take down its interpreter runs here: reading files of strangers, and diagnoses.  The
+process is ended with its parent, however that ends, and can be ended at any moment.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import logging
+import multiprocessing
+import os
+import pickle
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any, Generic, TypeVar
+
+from sprung.service.errors import UserError
+
+log = logging.getLogger("sprung.worker")
+
+Request = TypeVar("Request")
+Message = TypeVar("Message")
+Result = TypeVar("Result")
+Emit = Callable[[Message], None]
+Task = Callable[[Request, Emit[Message]], Result]  # a function of a module: the new process imports it by name
+
+POLL_SECONDS = 0.1
+END_SECONDS = 5.0  # a process that was killed is gone long before
+PR_SET_PDEATHSIG = 1
+
+
+class WorkerFailed(RuntimeError):
+    """The work raised what no user can be told; the message is its traceback."""
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a process may use."""
+
+    silence_seconds: float  # without any message
+    seconds: float  # in all, waiting for the parent included
+    memory_bytes: int | None = None  # private memory; None: as much as there is
+
+
+@dataclass(frozen=True, slots=True)
+class _Said:
+    message: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Done:
+    result: Any
+
+
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    reason: str  # one line for the user
+
+
+@dataclass(frozen=True, slots=True)
+class _Broken:
+    text: str  # a traceback
+
+
+class Worker(Generic[Message, Result]):
+    """One run of a task.  Iterate `messages`, then read `result`; `kill` may be called from any thread."""
+
+    def __init__(self, task: Task[Request, Message, Result], request: Request, limits: Limits, what: str) -> None:
+        """what: names the work in errors, as in `the diagnosis`."""
+        self._limits = limits
+        self._what = what
+        self._result: Result | None = None
+        context = multiprocessing.get_context("spawn")
+        self._connection, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_run,
+            args=(task, request, theirs, limits.memory_bytes, os.getpid()),
+            name="sprung-worker",
+            daemon=True,
+        )
+        self._begun = time.monotonic()
+        self._process.start()
+        theirs.close()
+
+    @property
+    def pid(self) -> int:
+        """Of the process."""
+        return self._process.pid or 0
+
+    @property
+    def result(self) -> Result:
+        """What the task returned; `messages` must have ended."""
+        assert self._result is not None, "the worker has not finished"
+        return self._result
+
+    def messages(self, check: Callable[[], None] = lambda: None) -> Iterator[Message]:
+        """What the task tells, as it comes; ends when the task is done.
+
+        check: called ten times a second, may raise to give up; the process is then ended.
+        Raises UserError for input that cannot be used, for limits that are exceeded and for a process that died;
+        WorkerFailed for an error of the program.
+        """
+        try:
+            while True:
+                match self._next(check):
+                    case _Said(message):
+                        yield message
+                    case _Done(result):
+                        self._result = result
+                        return
+                    case _Refused(reason):
+                        raise UserError(reason)
+                    case _Broken(text):
+                        raise WorkerFailed(text)
+        finally:
+            self.kill()
+
+    def kill(self) -> None:
+        """End the process now, if it still runs."""
+        if self._process.is_alive():
+            self._process.kill()
+        self._process.join(END_SECONDS)
+
+    def _next(self, check: Callable[[], None]) -> Any:
+        """The next thing said; silence counts only while the parent waits for it."""
+        silent_since = time.monotonic()
+        try:
+            while True:
+                check()
+                if time.monotonic() - self._begun > self._limits.seconds:
+                    raise UserError(f"{self._what} took longer than {self._limits.seconds:.0f} s")
+                if self._connection.poll(POLL_SECONDS):
+                    return self._connection.recv()
+                if time.monotonic() - silent_since > self._limits.silence_seconds:
+                    raise UserError(f"{self._what} made no progress for {self._limits.silence_seconds:.0f} s")
+        except (EOFError, OSError, pickle.UnpicklingError):
+            check()
+            raise UserError(self._death()) from None
+
+    def _death(self) -> str:
+        self._process.join(END_SECONDS)
+        code = self._process.exitcode
+        if code is not None and code < 0:
+            name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+            return f"the process of {self._what} was ended by {name}: it crashed, or it used more memory than there is"
+        return f"the process of {self._what} ended without an answer (status {code})"
+
+
+def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, memory: int | None, parent: int) -> None:
+    """The new process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    end_with_parent(connection, parent)
+    be_modest(memory)
+    sending = threading.Lock()
+
+    def say(thing: Any) -> None:
+        with sending:
+            connection.send(thing)
+
+    try:
+        say(_Done(task(request, lambda message: say(_Said(message)))))
+    except MemoryError:
+        say(_Refused(f"it needs more memory than the {(memory or 0) / 1e9:.1f} GB that are allowed"))
+    except (ValueError, OSError) as error:  # what every folder raises for input that cannot be used
+        log.debug("refused", exc_info=True)
+        say(_Refused(" ".join(str(error).split())[:500] or type(error).__name__))
+    except Exception:
+        say(_Broken(traceback.format_exc()))
+
+
+def end_with_parent(lifeline: Connection, parent: int) -> None:
+    """End this process when its parent dies, even by SIGKILL: asked of the kernel on Linux, and seen at the pipe."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it died before we asked
+        os._exit(1)
+
+    def watch() -> None:
+        with suppress(EOFError, OSError):
+            lifeline.recv()  # the parent never sends: this returns when its end is closed
+        os._exit(1)
+
+    threading.Thread(target=watch, name="sprung-lifeline", daemon=True).start()
+
+
+def be_modest(memory: int | None) -> None:
+    """Low priority, first to go when memory runs out, and a bound on private memory where the platform has one."""
+    with suppress(OSError, AttributeError):
+        os.nice(10)
+    with suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as target:
+        target.write("900")
+    if memory is None:
+        return
+    with suppress(ImportError, ValueError, OSError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
