@@ -54,7 +54,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     """Diagnose and write the report.  Raises ValueErrors of one line for files that cannot be used."""
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
-    from sprung.model.diagnosis.investigation.diagnose import Options, diagnose
+    from sprung.model.diagnosis.api import Options, diagnose
     from sprung.service.report import write_report
 
     latest = Stage(0.0, "reading")

@@ -17,6 +17,8 @@ from sprung.service.store.work import JobRow
 from sprung.service.times import now_ns
 from sprung.service.worker import Limits
 
+SLOWEST_BYTES_PER_SECOND = 100_000  # any reader is faster, by an order of magnitude
+
 
 class RecordingJobs:
     """Runs jobs of kind `recording`: a file from the upload folder, read in a process of its own, into the pipeline."""
@@ -42,7 +44,7 @@ class RecordingJobs:
                 file_name=row.name,
                 recording_id=row.id,
                 batch_windows=self._settings.batch_windows,
-                limits=reading_limits(self._settings),
+                limits=reading_limits(self._settings, path),
                 on_batch=on_batch,
                 on_tally=self._counter(),
                 check=progress.check,
@@ -53,9 +55,14 @@ class RecordingJobs:
         return {"recording": row.id} | fed.summary()
 
 
-def reading_limits(settings: Settings) -> Limits:
+def reading_limits(settings: Settings, path: Path) -> Limits:
     """What reading a recording of a stranger may use."""
-    return Limits(settings.reading_silence_seconds, settings.recording_seconds, settings.worker_memory_bytes)
+    return Limits(
+        settings.reading_silence_seconds,
+        settings.recording_seconds,
+        settings.worker_memory_bytes,
+        60 + path.stat().st_size // SLOWEST_BYTES_PER_SECOND,
+    )
 
 
 def stored_file(settings: Settings, store: Store, job: JobRow) -> tuple[Path, work.RecordingRow]:

@@ -48,6 +48,7 @@ class Limits:
     silence_seconds: float  # without any message
     seconds: float  # in all, waiting for the parent included
     memory_bytes: int | None = None  # private memory; None: as much as there is
+    cpu_seconds: int | None = None  # of processor time
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +83,7 @@ class Worker(Generic[Message, Result]):
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
             target=_run,
-            args=(task, request, theirs, limits.memory_bytes, os.getpid()),
+            args=(task, request, theirs, limits, os.getpid()),
             name="sprung-worker",
             daemon=True,
         )
@@ -150,16 +151,18 @@ class Worker(Generic[Message, Result]):
         code = self._process.exitcode
         if code is not None and code < 0:
             name = signal.Signals(-code).name if -code in set(signal.Signals) else str(-code)
+            if name == "SIGXCPU" or (name == "SIGKILL" and self._limits.cpu_seconds is not None):
+                return f"{self._what} took more than {self._limits.cpu_seconds} s of processor time, or memory ran out"
             return f"the process of {self._what} was ended by {name}: it crashed, or it used more memory than there is"
         return f"the process of {self._what} ended without an answer (status {code})"
 
 
-def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, memory: int | None, parent: int) -> None:
+def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits: Limits, parent: int) -> None:
     """The new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     end_with_parent(connection, parent)
-    be_modest(memory)
+    be_modest(limits)
     sending = threading.Lock()
 
     def say(thing: Any) -> None:
@@ -169,7 +172,7 @@ def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, memory
     try:
         say(_Done(task(request, lambda message: say(_Said(message)))))
     except MemoryError:
-        say(_Refused(f"it needs more memory than the {(memory or 0) / 1e9:.1f} GB that are allowed"))
+        say(_Refused(f"it needs more memory than the {(limits.memory_bytes or 0) / 1e9:.1f} GB that are allowed"))
     except (ValueError, OSError) as error:  # what every folder raises for input that cannot be used
         log.debug("refused", exc_info=True)
         say(_Refused(" ".join(str(error).split())[:500] or type(error).__name__))
@@ -193,15 +196,16 @@ def end_with_parent(lifeline: Connection, parent: int) -> None:
     threading.Thread(target=watch, name="sprung-lifeline", daemon=True).start()
 
 
-def be_modest(memory: int | None) -> None:
-    """Low priority, first to go when memory runs out, and a bound on private memory where the platform has one."""
+def be_modest(limits: Limits) -> None:
+    """Low priority, first to go when memory runs out, and bounds of the kernel's where the platform has them."""
     with suppress(OSError, AttributeError):
         os.nice(10)
     with suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as target:
         target.write("900")
-    if memory is None:
-        return
     with suppress(ImportError, ValueError, OSError):
         import resource
 
-        resource.setrlimit(resource.RLIMIT_DATA, (memory, memory))
+        if limits.memory_bytes is not None:
+            resource.setrlimit(resource.RLIMIT_DATA, (limits.memory_bytes, limits.memory_bytes))
+        if limits.cpu_seconds is not None:
+            resource.setrlimit(resource.RLIMIT_CPU, (limits.cpu_seconds, limits.cpu_seconds))
