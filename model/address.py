@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, date, datetime
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
 
 from sprung.model.signals import TimeColumn
 from sprung.model.units import FACTORS, known, to_si
@@ -45,6 +45,16 @@ class Address(Strict):
     sign: Literal[1, -1] = Field(default=1, description="-1 where the recording counts the other way")
     unit: str | None = Field(default=None, description="of the scaled number; default SI")
     noise: float = Field(default=0.0, ge=0, description="standard deviation of one sample, SI")
+    range: tuple[float, float] | None = Field(
+        default=None, description="[lowest, highest] possible value, SI; others are taken as missing"
+    )
+
+    @field_validator("range")
+    @classmethod
+    def _ordered(cls, limits: tuple[float, float] | None) -> tuple[float, float] | None:
+        if limits is not None and limits[0] >= limits[1]:
+            raise ValueError(f"the lowest value {limits[0]:g} is not below the highest {limits[1]:g}")
+        return limits
 
     def conversion(self, si: str) -> tuple[float, float]:
         """Gain and offset from the recorded number to `si`; raises UnitError."""

@@ -34,6 +34,7 @@ class Channel:
     column: str | None = None  # column or variable of any tabular file
     gain: float = 1.0  # value in `unit` = gain * recorded + offset
     offset: float = 0.0
+    range: tuple[float, float] | None = None  # possible values in `unit`; None: what the unit makes plausible
 
     @property
     def table(self) -> str | None:

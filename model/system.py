@@ -21,12 +21,12 @@ MANCHESTER = BUNDLED / "manchester.yaml"
 MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
 USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
-_WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit")  # an address without its noise
+_WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range")  # an address without its noise
 
 
 def _channel(name: str, quantity: str, at: Address) -> Channel:
     gain, offset = at.conversion(SI[quantity])
-    return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset)
+    return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset, at.range)
 
 
 @dataclass(frozen=True, slots=True)

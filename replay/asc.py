@@ -13,8 +13,8 @@ from pathlib import Path
 from can.io.asc import ASCReader
 
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.frames import EXTENDED, FrameBlock
-from sprung.replay.textframes import LineFrames, decimal_ns, line_batches
+from sprung.replay.frames import FrameBlock
+from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, in_time, integer, line_batches
 
 DATE = re.compile(rb"(?:date|Begin Trigger ?block)\s+\w+\s+(?P<date>.+)", re.IGNORECASE)
 BASE = re.compile(rb"base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<stamps>absolute|relative))?", re.IGNORECASE)
@@ -60,10 +60,11 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
                 continue
             try:
                 stamp, frame = _event(line, header.base)
+                clock = in_time(clock + stamp if header.relative else stamp)
+                in_time(header.start + clock)
             except (ValueError, IndexError):
                 damaged += 1
                 continue
-            clock = clock + stamp if header.relative else stamp
             if isinstance(frame, tuple):
                 batch.add(header.start + clock, *frame)
             elif frame != NO_FRAME:
@@ -95,7 +96,7 @@ def _event(line: bytes, base: int) -> tuple[int, tuple[int, bytes] | str]:
         return stamp, "remote frame"
     if parts[4] not in (b"d", b"D"):
         return stamp, NO_FRAME
-    length = min(int(parts[5], base), 8)
+    length = min(integer(parts[5], base), 8)
     return stamp, (_identifier(parts[2], base), _payload(parts[6 : 6 + length], length, base))
 
 
@@ -104,7 +105,7 @@ def _fd_frame(parts: list[bytes], base: int) -> tuple[int, bytes] | str:
     if parts[4].lower() == b"errorframe":
         return "error frame"
     at = 5 if parts[5] in (b"0", b"1") else 6
-    length = int(parts[at + 3])
+    length = integer(parts[at + 3], 10)
     if length == 0:
         return "remote frame"
     data = parts[at + 4 : at + 4 + length]
@@ -113,15 +114,15 @@ def _fd_frame(parts: list[bytes], base: int) -> tuple[int, bytes] | str:
 
 def _identifier(text: bytes, base: int) -> int:
     if text[-1:] in (b"x", b"X"):
-        return int(text[:-1], base) | EXTENDED
-    return int(text, base)
+        return frame_id(text[:-1], base, extended=True)
+    return frame_id(text, base, extended=False)
 
 
 def _payload(data: list[bytes], length: int, base: int) -> bytes:
     if len(data) < length:
         raise ValueError("fewer bytes than announced")
     if base == 10:
-        return bytes(int(byte) for byte in data).hex().encode("ascii")
+        return bytes(integer(byte, 10) for byte in data).hex().encode("ascii")
     joined = b"".join(data)
     if len(joined) != 2 * length:
         raise ValueError("half a byte")

@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.frames import EXTENDED, FrameBlock
-from sprung.replay.textframes import LineFrames, decimal_ns, line_batches
+from sprung.replay.frames import FrameBlock
+from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, integer, line_batches
 
 ERROR_FLAG = 0x2000_0000
 
@@ -49,13 +49,12 @@ def _frame(parts: list[bytes]) -> tuple[int, int, bytes] | str:
         raise ValueError("no time stamp")
     time = decimal_ns(stamp[1:-1])
     identifier, separator, payload = body.partition(b"#")
-    frame_id = int(identifier, 16)
     if not separator:
         raise ValueError("no frame")
-    if len(identifier) > 3:
-        if frame_id & ERROR_FLAG:
-            return "error frame"
-        frame_id |= EXTENDED
+    extended = len(identifier) > 3  # can-utils writes 3 digits or 8
+    if extended and integer(identifier, 16) >> 29 == ERROR_FLAG >> 29:
+        return "error frame"
+    number = frame_id(identifier, 16, extended=extended)
     if payload[:1] == b"#":
         payload = payload[2:]
     elif payload[:1] in (b"R", b"r"):
@@ -64,7 +63,7 @@ def _frame(parts: list[bytes]) -> tuple[int, int, bytes] | str:
         payload = payload[:16] if payload[16:17] == b"_" else payload  # can-utils' `_` before a raw DLC
     if len(payload) % 2 or len(payload) > 128:
         raise ValueError("half a byte")
-    return time, frame_id, payload
+    return time, number, payload
 
 
 def _near(batch: LineFrames) -> str:

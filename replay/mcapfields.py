@@ -14,7 +14,6 @@ from difflib import get_close_matches
 from typing import Any, Literal
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.records import Channel as McapChannel
 from mcap.records import Schema
 from mcap_protobuf.decoder import DecoderFactory as ProtobufFactory
@@ -23,10 +22,12 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 from sprung.model.signals import FloatArray, IntArray
 from sprung.replay.account import Account
 from sprung.replay.mcapfile import Messages
+from sprung.replay.plausible import LATEST
 
 TimeSource = Literal["auto", "header", "publish", "log"]
 STAMP_PATHS = (("header", "stamp"), ("timestamp",), ("stamp",))
 STAMP_PARTS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs"))
+LOOKED_AT = 8  # messages of a batch in which a stamp is looked for: some may be damaged
 TOKEN = re.compile(r"[^.\[\]]+")
 Path = tuple[str | int, ...]
 
@@ -42,7 +43,7 @@ class Field:
 
 def parse_field(text: str) -> Path:
     """`a.b[2].c` -> ("a", "b", 2, "c")."""
-    return tuple(int(token) if token.isdigit() else token for token in TOKEN.findall(text))
+    return tuple(int(token) if token.isdecimal() else token for token in TOKEN.findall(text))
 
 
 class Topic:
@@ -55,11 +56,12 @@ class Topic:
         self.is_json = channel.message_encoding == "json"
         self.decode: Callable[[bytes], Any] | None = json.loads if self.is_json else None
         self._checked = False
+        self._stamp: tuple[tuple[str, ...], tuple[str, str]] | None = None  # where the messages carry their time
         for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
             try:
                 self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
-            except (McapError, ValueError, TypeError, UnicodeDecodeError) as error:
-                account.problem(f"schema of topic {self.name} cannot be read: {error}")
+            except Exception as error:  # the decoders' parsers raise what they happen to raise
+                account.problem(f"schema of topic {self.name} cannot be read: {_line(error)}")
         if self.decode is None:
             account.problem(f"topic {self.name}: encoding {channel.message_encoding!r} cannot be read here")
 
@@ -67,8 +69,7 @@ class Topic:
         """Place (n,), time (n, k) and value (n, k) of the k fields; unreadable messages are counted, not given."""
         documents, good = self._documents(messages.data)
         place = np.array(messages.place, dtype=np.int64)[good]
-        log = np.array(messages.log_time, dtype=np.uint64).astype(np.int64)[good]
-        publish = np.array(messages.publish_time, dtype=np.uint64).astype(np.int64)[good]
+        log, publish = _times(messages.log_time)[good], _times(messages.publish_time)[good]
         value = np.empty((len(documents), len(self.fields)))
         time = np.empty((len(documents), len(self.fields)), dtype=np.int64)
         if documents:
@@ -77,9 +78,8 @@ class Topic:
         for column, wanted in enumerate(self.fields):
             value[:, column] = self._column(documents, wanted.path)
             time[:, column] = _choose(wanted.source, stamps, publish, log)
-        missing = np.isnan(value)
-        self.account.values["missing or not a number"] += int(missing.sum())
-        nothing = missing.all(axis=1)
+        self.account.values["missing or not a number"] += int(np.isnan(value).sum())
+        nothing = ~np.isfinite(value).any(axis=1)
         self.account.drop(int(nothing.sum()), "no valid value")
         self.account.tally.used += int((~nothing).sum())
         return place, time, value
@@ -93,8 +93,8 @@ class Topic:
                 documents = json.loads(b"[" + b",".join(data) + b"]")
                 if len(documents) == len(data):
                     return documents, np.ones(len(data), dtype=bool)
-            except ValueError:
-                pass  # some message is damaged: find it below
+            except (ValueError, RecursionError):
+                pass  # some message is damaged, or nested beyond all reason: find it below
         documents = []
         good = np.zeros(len(data), dtype=bool)
         reasons: Counter[str] = Counter()
@@ -118,22 +118,23 @@ class Topic:
                 column = [walk(document, path) for document in documents]
         else:
             column = [walk(document, path) for document in documents]
-        if not set(map(type, column)) <= {float, int}:
-            column = [_number(item) for item in column]
-        values = np.array(column, dtype=np.float64)
-        values[~np.isfinite(values)] = np.nan
-        return values
+        if set(map(type, column)) <= {float, int}:
+            try:
+                return np.array(column, dtype=np.float64)
+            except OverflowError:
+                pass  # an integer larger than any float
+        return np.array([_number(item) for item in column], dtype=np.float64)
 
     def _stamps(self, documents: list[Any]) -> IntArray | None:
         """Header stamps in ns, 0 where empty; None when the messages have none."""
-        if not documents or all(field.source in ("publish", "log") for field in self.fields):
+        if all(field.source in ("publish", "log") for field in self.fields):
             return None
-        for path in STAMP_PATHS:
-            stamp = walk(documents[0], path)
-            for parts in STAMP_PARTS:
-                if all(isinstance(walk(stamp, (part,)), int) for part in parts):
-                    return np.array([_stamp_ns(walk(item, path), parts) for item in documents], dtype=np.int64)
-        return None
+        for document in documents[:LOOKED_AT] if self._stamp is None else ():
+            self._stamp = self._stamp or _stamp_of(document)
+        if self._stamp is None:
+            return None
+        path, parts = self._stamp
+        return np.array([_stamp_ns(walk(item, path), parts) for item in documents], dtype=np.int64)
 
     def _check_fields(self, document: Any) -> None:
         """Once: say which wanted fields the first message does not have."""
@@ -159,17 +160,41 @@ def walk(item: Any, path: Path | tuple[str, ...]) -> Any:
     return item
 
 
+def _stamp_of(document: Any) -> tuple[tuple[str, ...], tuple[str, str]] | None:
+    """Where a message carries its time: the path of the stamp, and the names of seconds and nanoseconds in it."""
+    for path in STAMP_PATHS:
+        stamp = walk(document, path)
+        for parts in STAMP_PARTS:
+            if all(isinstance(walk(stamp, (part,)), int) for part in parts):
+                return path, parts
+    return None
+
+
 def _number(item: Any) -> float:
     if isinstance(item, bool) or not isinstance(item, (int, float)):
         return float("nan")
-    return float(item)
+    try:
+        return float(item)
+    except OverflowError:
+        return float("inf")  # out of every range
 
 
 def _stamp_ns(stamp: Any, parts: tuple[str, str]) -> int:
+    """ns, or 0 where the stamp is empty or none."""
     whole, rest = walk(stamp, (parts[0],)), walk(stamp, (parts[1],))
     if not isinstance(whole, int) or not isinstance(rest, int):
         return 0
-    return whole * 1_000_000_000 + rest
+    total = whole * 1_000_000_000 + rest
+    return total if 0 < total <= LATEST else 0
+
+
+def _times(stamps: list[int]) -> IntArray:
+    """Unsigned ns as signed ones; what does not fit is later than any recording."""
+    return np.minimum(np.array(stamps, dtype=np.uint64), np.uint64(np.iinfo(np.int64).max)).astype(np.int64)
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
 
 
 def _choose(source: TimeSource, stamps: IntArray | None, publish: IntArray, log: IntArray) -> IntArray:

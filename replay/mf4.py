@@ -10,6 +10,7 @@ import numpy as np
 
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
+from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME, nanoseconds
 
 
 def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
@@ -21,25 +22,38 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     try:
         with MDF(path) as mdf:
             start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
-            groups = [found for index in range(len(mdf.groups)) if (found := _group(mdf, index))]
+            groups = list(_groups(mdf, account))
             mdf_version = mdf.version
-    except UnreadableRecording:
-        raise
-    except Exception as error:
-        raise UnreadableRecording(f"{path}: not an MDF file that can be read: {error}") from error
+    except Exception as error:  # asammdf raises what its parser happens to raise
+        line = " ".join(str(error).split())[:200] or type(error).__name__
+        raise UnreadableRecording(f"{path}: not an MDF file that can be read: {line}") from error
     if not groups:
         raise UnreadableRecording(f"{path}: MDF {mdf_version} without a CAN_DataFrame group (no bus log)")
     width = 64 if max(group[2].max(initial=0) for group in groups) > 8 else 8
-    seconds = np.concatenate([group[0] for group in groups])
-    order = np.argsort(seconds, kind="stable")
-    time = start + np.round(seconds * 1e9).astype(np.int64)
+    since, timely = nanoseconds(np.concatenate([group[0] for group in groups]))
+    timely &= (since <= LATEST - max(start, 0)) & (since >= EARLIEST - min(start, 0))
+    account.corrupt(int((~timely).sum()), OUT_OF_TIME)
     identifier = np.concatenate([group[1] for group in groups])
     length = np.concatenate([group[2] for group in groups])
     data = np.concatenate([_fit(group[3], width) for group in groups])
     data[np.arange(width) >= length[:, None]] = 0
+    order = np.argsort(since, kind="stable")
+    order = order[timely[order]]
     for first in range(0, len(order), BLOCK_FRAMES):
         rows = order[first : first + BLOCK_FRAMES]
-        yield FrameBlock(time[rows], identifier[rows], length[rows], data[rows])
+        yield FrameBlock(start + since[rows], identifier[rows], length[rows], data[rows])
+
+
+def _groups(mdf: Any, account: Account) -> Iterator[tuple[Any, Any, Any, Any]]:
+    """The groups of CAN frames; one that cannot be read is told and passed over."""
+    for index in range(len(mdf.groups)):
+        try:
+            found = _group(mdf, index)
+        except Exception as error:  # as above
+            account.problem(f"group {index} of the MDF file cannot be read ({type(error).__name__})")
+            continue
+        if found is not None:
+            yield found
 
 
 def _group(mdf: Any, index: int) -> tuple[Any, Any, Any, Any] | None:
@@ -51,14 +65,16 @@ def _group(mdf: Any, index: int) -> tuple[Any, Any, Any, Any] | None:
     def column(name: str) -> Any:
         return mdf.get(f"CAN_DataFrame.{name}", group=index, raw=True).samples
 
-    stamps = mdf.get_master(index)
+    stamps = np.asarray(mdf.get_master(index), dtype=np.float64)
     identifier = np.asarray(column("ID"), dtype=np.uint32) & np.uint32(0x1FFFFFFF)
     if "CAN_DataFrame.IDE" in names:
         identifier |= np.where(np.asarray(column("IDE")) != 0, np.uint32(EXTENDED), np.uint32(0))
     data = np.asarray(column("DataBytes"), dtype=np.uint8)
     has_length = "CAN_DataFrame.DataLength" in names
     length = np.asarray(column("DataLength" if has_length else "DLC"), dtype=np.uint8)
-    return stamps, identifier, np.minimum(length, 64), data
+    if data.ndim != 2 or not len(stamps) == len(identifier) == len(data) == len(length):
+        raise ValueError("its columns do not belong together")
+    return stamps, identifier, np.minimum(length, min(64, data.shape[1])), data
 
 
 def _fit(data: Any, width: int) -> Any:

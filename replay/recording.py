@@ -14,6 +14,7 @@ from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
+from sprung.replay.plausible import Screen
 
 FrameReader = Callable[[Path, Account], Iterator[FrameBlock]]
 
@@ -24,6 +25,7 @@ CAN_READERS: dict[str, FrameReader] = {
     ".mf4": mf4.frames,
 }
 EXTENSIONS = (".mcap", *CAN_READERS, ".csv")
+SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
 
 
 class Recording:
@@ -38,14 +40,21 @@ class Recording:
         self.account = account
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
         self._source = source
-        self._convert = converter(channels)
+        self._screen = Screen(channels, account, converter(channels))
 
     def blocks(self) -> Iterator[SampleBlock]:
-        """Blocks in file order; raises UnreadableRecording when none of the channels is in the file."""
-        for block in self._source:
+        """Blocks in file order; raises UnreadableRecording when none of the channels is in the file, or when it
+        gives more samples than its size makes plausible."""
+        left = SAMPLES_ALWAYS + SAMPLES_PER_BYTE * self.path.stat().st_size
+        for raw in self._source:
+            left -= len(raw.time)
+            if left < 0:
+                raise UnreadableRecording(f"{self.path}: gives more samples than a file of its size can hold")
+            block = self._screen.check(raw)
             if len(block.time):
                 self.seen[block.channel[~np.isnan(block.value)]] = True
-                yield self._convert(block)
+                yield block
+        self._screen.tell()
         if not self.seen.any():
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():
@@ -54,6 +63,8 @@ class Recording:
             self.account.problem(f"no values of {', '.join(names[:5])}{more}", incomplete=False)
 
     def _nothing(self) -> str:
+        if self.account.tally.used and self.account.problems:  # the channels are there
+            return f"{self.path}: none of its samples can be used; {self.account.problems[0]}"
         contents = [f"{name} ({count})" if count else name for name, count in self.account.contents.most_common(8)]
         more = " ..." if len(self.account.contents) > 8 else ""
         holds = f"it holds {', '.join(contents)}{more}" if contents else "it holds no messages"

@@ -1,16 +1,24 @@
-"""What the readers of textual CAN logs share: batches of parsed lines to blocks of frames."""
+"""What the readers of textual CAN logs share: bounded lines, exact numbers, and batches of them as blocks of frames."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from sprung.replay.account import Account
-from sprung.replay.frames import FrameBlock
+from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.plausible import EARLIEST, LATEST
 
 BATCH_BYTES = 1 << 19
+LONGEST_LINE = 1 << 12  # bytes; an FD frame in decimal digits takes about 400
+LONGEST_SECONDS = 10  # digits: until the year 2286
+LARGEST_ID = (1 << 29) - 1
+DIGITS = frozenset(b"0123456789")
+HEX_DIGITS = frozenset(b"0123456789abcdefABCDEF")
+BY_BASE = {10: DIGITS, 16: HEX_DIGITS}
 
 
 class LineFrames:
@@ -48,16 +56,52 @@ class LineFrames:
 
 
 def line_batches(path: Path) -> Iterator[list[bytes]]:
-    """The lines of a file in batches of about half a megabyte."""
+    """The lines of a file in batches of about half a megabyte; of a line that is too long only its beginning, which
+    no reader takes for a frame."""
     with path.open("rb") as file:
-        while lines := file.readlines(BATCH_BYTES):
-            yield lines
+        rest = b""
+        while piece := file.read(BATCH_BYTES):
+            lines = (rest + piece).splitlines(keepends=True)
+            rest = b"" if lines[-1].endswith(b"\n") else lines.pop()
+            if len(rest) > LONGEST_LINE:
+                rest = rest[:LONGEST_LINE]
+            if lines:
+                yield [line if len(line) <= LONGEST_LINE else line[:LONGEST_LINE] for line in lines]
+        if rest:
+            yield [rest]
 
 
 def decimal_ns(text: bytes) -> int:
-    """Seconds in decimal notation, as exact nanoseconds; raises ValueError when it is no number."""
+    """Seconds in decimal notation, as exact nanoseconds; raises ValueError when they are no number or no time."""
     whole, _, fraction = text.partition(b".")
-    return int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, b"0") or b"0")
+    if not (whole + fraction).isdigit() or not 0 < len(whole) <= LONGEST_SECONDS:
+        if text[:1] == b"-" and text[1:2] != b"-":
+            return in_time(-decimal_ns(text[1:]))
+        raise ValueError("no time")
+    return in_time(int(whole) * 1_000_000_000 + int(fraction[:9].ljust(9, b"0")))
+
+
+def in_time(time: int) -> int:
+    """The same; raises ValueError when no clock shows it."""
+    if not EARLIEST <= time <= LATEST:
+        raise ValueError("time stamp out of range")
+    return time
+
+
+def integer(text: bytes, base: int) -> int:
+    """A number of digits only (Python would take underscores, signs and spaces, too); raises ValueError."""
+    if len(text) > 20 or not BY_BASE[base].issuperset(text):
+        raise ValueError("no number")
+    return int(text, base)
+
+
+@lru_cache(maxsize=4096)  # a bus has a few hundred, every one in thousands of lines
+def frame_id(text: bytes, base: int, *, extended: bool) -> int:
+    """An identifier as `FrameBlock.id` has it; raises ValueError when it has more bits than identifiers have."""
+    identifier = integer(text, base)
+    if identifier > LARGEST_ID:
+        raise ValueError("identifier of more than 29 bits")
+    return identifier | EXTENDED if extended else identifier
 
 
 def _is_hex(payload: bytes) -> bool:
