@@ -23,6 +23,21 @@ class Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
+class LawValue(Strict):
+    """The value of a law's parameter; `fixed` ones are never estimated."""
+
+    value: float
+    std: float | None = Field(default=None, ge=0)  # standard deviation with which it was found
+    fixed: bool = False
+
+
+LawSetting = dict[str, float | LawValue | str]  # parameter to value; text: `with`, `variant`, `formula`, `memory`
+Laws = Annotated[
+    tuple[Annotated[dict[str, LawSetting], Field(min_length=1, max_length=1)], ...],
+    Field(description="what it does beyond its nominal behaviour: [{EFFECT: {PARAMETER: value}}]"),
+]
+
+
 def _as_text(raw: Any) -> Any:
     return str(raw) if isinstance(raw, int) and not isinstance(raw, bool) else raw
 
@@ -55,6 +70,7 @@ class Address(Strict):
         if limits is not None and limits[0] >= limits[1]:
             raise ValueError(f"the lowest value {limits[0]:g} is not below the highest {limits[1]:g}")
         return limits
+    laws: Laws = ()
 
     def conversion(self, si: str) -> tuple[float, float]:
         """Gain and offset from the recorded number to `si`; raises UnitError."""

@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from sprung.model.address import Address, Strict, TimeKey
+from sprung.model.address import Address, Laws, Strict, TimeKey
 from sprung.model.units import FACTORS, UnitError, known
 
 
@@ -66,6 +66,7 @@ class Body(Strict):
     roll_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     pitch_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     position: Point = (0.0, 0.0)  # m
+    laws: Laws = ()
     load: Annotated[Load | None, BeforeValidator(_as_load, json_schema_input_type=bool | Load | None)] = None
 
     @model_validator(mode="after")
@@ -82,6 +83,7 @@ class SupportInput(Strict):
     displacement: Address | None = None  # m
     velocity: Address | None = None  # m/s
     acceleration: Address | None = None  # m/s^2
+    laws: Laws = ()
 
     @model_validator(mode="after")
     def _is_measured(self) -> SupportInput:
@@ -106,6 +108,7 @@ class TrackInput(Strict):
     kind: Literal["track"]
     rail: Literal["left", "right"]
     position: Point  # m, of the wheel
+    laws: Laws = ()
 
 
 class ForceInput(Address):
@@ -127,6 +130,7 @@ class Element(Strict):
     position: Point | None = None
     stiffness: Quantity = Value(value=0.0, fixed=True)  # N/m
     damping: Quantity = Value(value=0.0, fixed=True)  # N s/m
+    laws: Laws = ()
 
 
 class MotionSensor(Address):

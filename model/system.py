@@ -7,10 +7,13 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from sprung.model.address import Address
+from sprung.model.laws import CATALOGUE, Law
+from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.mechanics import Mechanics, assemble
 from sprung.model.schema import SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
 from sprung.model.signals import Channel, FloatArray, TimeColumn
@@ -48,6 +51,12 @@ class System:
     """
 
     file: SystemFile
+    catalogue: tuple[Law, ...] = CATALOGUE
+
+    @cached_property
+    def laws(self) -> tuple[PlacedLaw, ...]:
+        """What is in place beyond the nominal structure."""
+        return placed_laws(self.file, self.catalogue)[0]
 
     @property
     def name(self) -> str:
@@ -172,27 +181,43 @@ class System:
         for part, key in [*added, (keep, "speed")]:
             if part.get(key) is None:
                 part.pop(key, None)
+        _without_empty_laws(keep)
         return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def load_system(path: str | Path = MANCHESTER) -> System:
+def _without_empty_laws(part: Any) -> None:
+    """Take out what older files do not have, and the deviations of laws' values."""
+    if isinstance(part, dict):
+        if not part.get("laws", True):
+            del part["laws"]
+        for setting in (s for law in part.get("laws", ()) for s in law.values()):
+            for value in setting.values():
+                if isinstance(value, dict):
+                    value.pop("std", None)
+        for child in part.values():
+            _without_empty_laws(child)
+
+
+def load_system(path: str | Path = MANCHESTER, catalogue: tuple[Law, ...] = CATALOGUE) -> System:
     """Load and check a system file; the bundled Manchester vehicle by default.
+
+    catalogue: the laws that the file may name; `model.laws.own.load_laws` adds laws of a user's own.
 
     Errors: `SystemFileError`, one line that names file, line and key, also when the sensors cannot observe the
     system whose parameters are to be estimated.
     """
-    return checked(System(read_system_file(path)), str(path))
+    return checked(System(read_system_file(path), catalogue), str(path))
 
 
-def parse_system(text: str, source: str = "system file") -> System:
+def parse_system(text: str, source: str = "system file", catalogue: tuple[Law, ...] = CATALOGUE) -> System:
     """The same from text."""
-    return checked(System(parse_system_file(text, source)), source)
+    return checked(System(parse_system_file(text, source), catalogue), source)
 
 
 def checked(system: System, source: str) -> System:
     """Refuse a system that the model cannot treat yet, and one whose sensors miss a whole mode: its parameters could
     not be told from any record."""
-    refused = unsupported(system.file)
+    refused = [*placed_laws(system.file, system.catalogue)[1], *unsupported(system.file)]
     if refused:
         raise SystemFileError(f"{source}: {'; '.join(refused)}", tuple(f"{source}: {line}" for line in refused))
     if not system.parameters:

@@ -2,8 +2,8 @@
 
 The force balance of a window (`model.identification.features`) is solved by least squares over bins and degrees of
 freedom.  What is learned: the weight of every row; how much of the known noise power to take out of the normal
-equations (noise in the regressors pulls estimates towards zero); a small network that corrects what remains; and the scale
-of the covariance.  Everything else is mechanics, so the estimator extrapolates as the mechanics does.
+equations (noise in the regressors pulls estimates towards zero); a small network that corrects what remains; and the
+scale of the covariance.  Everything else is mechanics, so the estimator extrapolates as the mechanics does.
 """
 
 from __future__ import annotations

@@ -1,0 +1,80 @@
+"""A law from a formula: an element law whose force, and rate of one hidden state, are text.
+
+Written in a system file as `formula: {formula: "a * d**3 + b * z", memory: "v - z / tau", a: 1e9, b: 2e3, tau: 0.1}`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, no_memory
+from sprung.model.laws.expression import MOTION, Expression, FormulaError, parse
+
+EFFECT = "formula"
+_ANY = 1e18
+
+
+def formula_law(
+    formula: str, memory: str, parameters: tuple[str, ...], units: dict[str, str] | None = None
+) -> ElementLaw:
+    """The law with this force (N) and, where `memory` is not empty, this rate of its state z (zero at first).
+
+    Errors: `FormulaError` for text that is no formula, unknown names and parameters that nothing uses.
+    """
+    known = {*parameters, *MOTION}
+    force = parse(formula, known)
+    rate = parse(memory, known) if memory else None
+    used = force.names | (rate.names if rate is not None else frozenset())
+    if "z" in used and rate is None:
+        raise FormulaError(f"formula {formula!r}: uses z; give its rate as `memory`")
+    idle = [name for name in parameters if name not in used]
+    if idle:
+        raise FormulaError(f"formula {formula!r}: parameter {idle[0]!r} is not used")
+    return ElementLaw(
+        name=EFFECT,
+        title="law of a formula",
+        parameters=tuple(_spec(name, (units or {}).get(name, "")) for name in parameters),
+        force=_evaluator(force, parameters),
+        shapes=lambda seen: np.zeros((0, len(parameters))),
+        absent=tuple(0.0 for _ in parameters),
+        looks_like="whatever its formula says",
+        confused_with=(),
+        sentence=f"a force {formula}",
+        strength=None,
+        memory=int(rate is not None),
+        memory_rate=no_memory if rate is None else _rate(rate, parameters),
+        formula=formula,
+        memory_formula=memory,
+    )
+
+
+def _spec(name: str, unit: str) -> ParameterSpec:
+    def typical(seen: Observed) -> float:
+        return 1.0
+
+    return ParameterSpec(name, unit, -_ANY, _ANY, f"{name} of the formula", typical)
+
+
+def _evaluator(text: Expression, parameters: tuple[str, ...]) -> Callable[[Motion, Values, SpringDamper], Any]:
+    def value(motion: Motion, p: Values, element: SpringDamper) -> Any:
+        values = dict(zip(parameters, p, strict=True))
+        values |= {"d": motion.deflection, "v": motion.rate, "t": motion.time}
+        values |= {"k": element.stiffness, "c": element.damping}
+        if len(motion.memory):
+            values["z"] = motion.memory[0]
+        shape = np.broadcast_shapes(np.shape(motion.deflection), np.shape(motion.rate))
+        return text(**values) + np.zeros(shape)  # a formula without motion in it still has the motion's shape
+
+    return value
+
+
+def _rate(text: Expression, parameters: tuple[str, ...]) -> Callable[[Motion, Values, SpringDamper], Any]:
+    evaluate = _evaluator(text, parameters)
+
+    def rate(motion: Motion, p: Values, element: SpringDamper) -> Any:
+        return np.asarray(evaluate(motion, p, element))[None]
+
+    return rate

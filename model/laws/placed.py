@@ -1,0 +1,153 @@
+"""Laws that a system file puts in place: `laws:` at elements, bodies, inputs and sensors, checked and with values."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from sprung.model.address import LawSetting, LawValue
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, SupportLaw
+from sprung.model.laws.expression import FormulaError
+from sprung.model.laws.formula import EFFECT, formula_law
+from sprung.model.schema import SupportInput, SystemFile
+
+_BESIDE = ("with", "variant", "formula", "memory")  # keys of a law that are no parameters
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedLaw:
+    """A law at a place with its values."""
+
+    law: Law
+    location: str  # element, body, input, channel or sensor; "left|right" of a pair or an axle
+    values: tuple[float, ...]  # in the law's order, SI
+    std: tuple[float | None, ...]  # as known when it was written, or None
+    fixed: tuple[bool, ...]  # not to be estimated
+    variant: str = ""  # of body laws: the mode's shape, the direction of a force
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """The one or two names of the location."""
+        return tuple(self.location.split("|"))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Full names of the parameters: `secondary_2r.coulomb_friction.force`."""
+        return tuple(f"{self.location}.{self.law.name}.{name}" for name in self.law.names)
+
+
+def placed_laws(file: SystemFile, catalogue: Sequence[Law] = CATALOGUE) -> tuple[tuple[PlacedLaw, ...], list[str]]:
+    """The laws of a system file in its order, and what is wrong with them, each as `key: what is wrong`."""
+    found: list[PlacedLaw] = []
+    problems: list[str] = []
+    for key, location, settings, kinds in _places(file):
+        for index, (effect, setting) in enumerate(settings):
+            try:
+                found.append(_placed(file, effect, setting, location, kinds, catalogue))
+            except ValueError as error:
+                problems.append(f"{key}.laws.{index}.{effect}: {error}")
+    return tuple(found), problems
+
+
+_Settings = list[tuple[str, LawSetting]]
+
+
+def _places(file: SystemFile) -> Iterator[tuple[str, str, _Settings, tuple[type, ...]]]:
+    for name, element in file.elements.items():
+        yield f"elements.{name}", name, _listed(element.laws), (ElementLaw,)
+    for name, body in file.bodies.items():
+        yield f"bodies.{name}", name, _listed(body.laws), (BodyLaw,)
+    for name, source in file.inputs.items():
+        yield f"inputs.{name}", name, _listed(source.laws), (SupportLaw, SensorLaw)
+        if isinstance(source, SupportInput):
+            for quantity, address in source.measured.items():
+                yield f"inputs.{name}.{quantity}", f"{name}.{quantity}", _listed(address.laws), (SensorLaw,)
+    for name, sensor in file.sensors.items():
+        yield f"sensors.{name}", name, _listed(sensor.laws), (SensorLaw,)
+
+
+def _listed(laws: Sequence[Mapping[str, LawSetting]]) -> _Settings:
+    return [(effect, setting) for entry in laws for effect, setting in entry.items()]
+
+
+def _placed(
+    file: SystemFile,
+    effect: str,
+    setting: LawSetting,
+    location: str,
+    kinds: tuple[type, ...],
+    catalogue: Sequence[Law],
+) -> PlacedLaw:
+    law = _law(effect, setting, kinds, catalogue)
+    numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
+    given, wanted = set(numbers), set(law.names)
+    if isinstance(law, ElementLaw) and law.wider is not None and given == set(law.wider.names):
+        law, wanted = law.wider, given
+    for name in sorted(given - wanted):
+        raise ValueError(
+            f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{_near(name, law.names)}"
+        )
+    for name in law.names:
+        if name not in numbers:
+            raise ValueError(f"{name} is missing")
+    values = [numbers[name] for name in law.names]
+    known = [value if isinstance(value, LawValue) else LawValue(value=float(value)) for value in values]
+    for spec, value in zip(law.parameters, known, strict=True):
+        if not spec.admits(value.value):
+            raise ValueError(
+                f"{spec.name} must lie between {spec.low:g} and {spec.high:g} {spec.unit}, not {value.value:g}"
+            )
+    return PlacedLaw(
+        law,
+        _location(file, law, location, setting),
+        tuple(value.value for value in known),
+        tuple(value.std for value in known),
+        tuple(value.fixed for value in known),
+        str(setting.get("variant", "")),
+    )
+
+
+def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: Sequence[Law]) -> Law:
+    texts = {name: value for name, value in setting.items() if isinstance(value, str)}
+    for name, text in texts.items():
+        if name not in _BESIDE:
+            raise ValueError(f"{name}: a number is expected, not {text!r}")
+    if effect == EFFECT and ElementLaw in kinds:
+        if "formula" not in texts:
+            raise ValueError("formula: the text of the force is missing")
+        names = tuple(name for name in setting if name not in texts)
+        try:
+            return formula_law(texts["formula"], texts.get("memory", ""), names)
+        except FormulaError as error:
+            raise ValueError(str(error)) from None
+    fitting = [law for law in catalogue if isinstance(law, kinds)]
+    for law in fitting:
+        if law.name == effect:
+            return law
+    elsewhere = any(law.name == effect for law in catalogue)
+    known = [law.name for law in fitting]
+    raise ValueError(
+        "this law does not belong here"
+        if elsewhere
+        else f"no such law; known here are {', '.join(known)}{_near(effect, known)}"
+    )
+
+
+def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) -> str:
+    """The place with its partner, for laws that act between two."""
+    partner = setting.get("with")
+    if getattr(law, "where", "") not in ("pair", "axle"):
+        if partner is not None:
+            raise ValueError("with: this law acts at one place")
+        return location
+    group = file.elements if isinstance(law, ElementLaw) else file.inputs
+    if not isinstance(partner, str) or partner not in group or partner == location:
+        raise ValueError(f"with: the name of the other one is expected, not {partner!r}")
+    return f"{location}|{partner}"
+
+
+def _near(name: str, known: Sequence[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""

@@ -1,0 +1,77 @@
+"""Laws in a system file: what is accepted, what is refused and how."""
+
+from __future__ import annotations
+
+import pytest
+
+from sprung.model.identification.estimator import bundled_estimator
+from sprung.model.schema import SystemFileError
+from sprung.model.system import load_system, parse_system
+
+TEXT = """
+name: quarter-car
+sample_rate: 200
+window: 200
+bodies:
+  wheel: {mass: 45}
+  car: {mass: 400}
+inputs:
+  road: {kind: displacement, displacement: {csv: road, noise: 1.0e-5}}
+elements:
+  tyre: {upper: wheel, lower: road, stiffness: 200000, damping: 50}
+  strut: {upper: car, lower: wheel, stiffness: 20000, damping: 1500%s}
+sensors:
+  wheel_a: {kind: acceleration, body: wheel, csv: a, noise: 0.01}
+  car_a: {kind: acceleration, body: car, csv: b, noise: 0.01%s}
+"""
+
+
+def system(strut: str = "", sensor: str = ""):
+    return parse_system(TEXT % (strut, sensor))
+
+
+def test_laws_are_placed_with_values_and_deviations() -> None:
+    (law, bias) = system(
+        ", laws: [{coulomb_friction: {force: {value: 30, std: 2}, smoothing: {value: 0.01, fixed: true}}}]",
+        ", laws: [{sensor_bias: {offset: 0.1}}]",
+    ).laws
+    assert (law.location, law.law.name, law.values) == ("strut", "coulomb_friction", (30.0, 0.01))
+    assert (law.std, law.fixed) == ((2.0, None), (False, True))
+    assert law.names == ("strut.coulomb_friction.force", "strut.coulomb_friction.smoothing")
+    assert (bias.location, bias.values) == ("car_a", (0.1,))
+
+
+def test_a_formula_is_a_law() -> None:
+    text = ', laws: [{formula: {formula: "a * d**3 + b * z", memory: "v - abs(v) * z / y", a: 1.0e6, b: 100, y: 0.01}}]'
+    (law,) = system(text).laws
+    assert law.law.names == ("a", "b", "y") and law.law.memory == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[{coulomb_frictoin: {force: 1}}]", "did you mean 'coulomb_friction'"),
+        ("[{coulomb_friction: {force: 1}}]", "elements.strut.laws.0.coulomb_friction: smoothing is missing"),
+        ("[{coulomb_friction: {force: 1, smoothing: 0.1, f: 2}}]", "f is no parameter of it"),
+        ("[{coulomb_friction: {force: -1, smoothing: 0.1}}]", "force must lie between 0 and"),
+        ("[{sensor_bias: {offset: 1}}]", "does not belong here"),
+        ("[{anti_roll_bar: {stiffness: 1}}]", "with: the name of the other one is expected"),
+        ("[{anti_roll_bar: {stiffness: 1, with: strut}}]", "with: the name of the other one"),
+        ('[{formula: {formula: "a * q", a: 1}}]', "'q' is none of"),
+        ('[{formula: {formula: "a * d", a: 1, b: 2}}]', "parameter 'b' is not used"),
+        ('[{formula: {formula: "a * z", a: 1}}]', "give its rate as `memory`"),
+        ("[{coulomb_friction: {force: much, smoothing: 0.1}}]", "a number is expected, not 'much'"),
+        ("[{bump_stop: {gap: 1, stiffness: 2}, clearance: {gap: 1}}]", "laws"),
+    ],
+)
+def test_a_wrong_law_is_told_by_its_key(text: str, said: str) -> None:
+    with pytest.raises(SystemFileError, match="strut") as told:
+        system(f", laws: {text}")
+    assert said in str(told.value) and "\n" not in str(told.value)
+
+
+def test_laws_count_in_the_digest_and_their_deviations_do_not() -> None:
+    law = ", laws: [{quadratic_damping: {c2: %s}}]"
+    assert system().digest != system(law % "10").digest
+    assert system(law % "{value: 10}").digest == system(law % "{value: 10, std: 3}").digest
+    assert bundled_estimator(load_system()) is not None  # files without laws keep the digest of their weights
