@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 
 from sprung.model.signals import Tally
 from sprung.service.board import Board
@@ -15,13 +16,14 @@ from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
 from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
 from sprung.service.housekeeping import Housekeeping
+from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
 from sprung.service.metrics import Metrics
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
 from sprung.service.ring import Rings
 from sprung.service.settings import Settings
-from sprung.service.store import Store, fleet, open_store
+from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.windows import latest_window
 from sprung.service.views import VehicleView, vehicle_view
 
@@ -43,6 +45,7 @@ class Core:
     diagnoses: Diagnoses
     diagnosis_jobs: DiagnosisJobs
     housekeeping: Housekeeping
+    hub: Hub
     stopping: threading.Event
 
     def tally_counter(self, source: str) -> OnTally:
@@ -52,6 +55,7 @@ class Core:
     def start(self) -> None:
         """Take up what was left, begin housekeeping."""
         self.housekeeping.clear_leftovers()
+        self.pipeline.refresh_statuses()
         self.board.restore(stored_views(self))
         self.jobs.start()
         self.housekeeping.start()
@@ -71,7 +75,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     store = open_store(settings.store_url)
     compute = Compute(settings.compute_queue)
     board = Board(engine, settings.vehicles_in_memory)
-    metrics = Metrics(board, settings.parameter_series_vehicles)
+    metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
     rings = Rings(
         settings.ring_vehicles,
         settings.ring_seconds,
@@ -79,6 +83,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         engine.system.sample_rate,
     )
     stopping = threading.Event()
+    hub = Hub()
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory)
     recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
@@ -89,7 +94,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     }
     jobs = Jobs(store, kinds, settings.job_queue)
     diagnoses = Diagnoses(settings, store, rings, jobs)
-    listeners.append(diagnoses.on_batch)
+    listeners += [diagnoses.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
     return Core(
         settings,
@@ -103,6 +108,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         diagnoses,
         diagnosis_jobs,
         housekeeping,
+        hub,
         stopping,
     )
 
@@ -119,13 +125,27 @@ def tally_counter(metrics: Metrics, source: str) -> OnTally:
     return count
 
 
-def stored_views(core: Core) -> list[VehicleView]:
-    """Views of the vehicles heard from last, from the store, oldest first."""
+def stored_views(core: Core) -> list[tuple[VehicleView, int]]:
+    """Views of the vehicles heard from last and of all that are not well, and when they were heard from, oldest first.
+
+    From the store.
+    """
     views = []
+    model_id = core.pipeline.model_id
     with core.store.read() as connection:
-        for vehicle in fleet.recent_vehicles(connection, core.pipeline.model_id, core.settings.vehicles_in_memory):
-            row = fleet.load_tracker(connection, vehicle, core.pipeline.model_id)
-            if row is not None:
-                last = latest_window(connection, vehicle, core.pipeline.model_id)
-                views.append(vehicle_view(core.engine, vehicle, core.engine.load_state(row.state), last))
-    return views[::-1]
+        recent = fleet.recent_vehicles(connection, model_id, core.settings.vehicles_in_memory)
+        wanted = dict.fromkeys([*status.alarmed_vehicles(connection), *recent[::-1]])
+        for vehicle in wanted:
+            row = fleet.load_tracker(connection, vehicle, model_id)
+            listed = status.fleet_row(connection, vehicle)
+            if row is not None and listed is not None and listed.retired_ns is None:
+                last = latest_window(connection, vehicle, model_id)
+                view = vehicle_view(core.engine, vehicle, core.engine.load_state(row.state), last)
+                views.append((view, listed.received_ns))
+    return sorted(views, key=lambda pair: pair[1])
+
+
+def fleet_counts(store: Store) -> dict[str, int]:
+    """Vehicles in service by health."""
+    with store.read() as connection:
+        return status.health_counts(connection, status.Wanted())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -15,9 +15,10 @@ from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
-from sprung.service.store import Store, fleet, history
+from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
 from sprung.service.times import now_ns
+from sprung.service.views import vehicle_view
 
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 
@@ -168,7 +169,7 @@ class Pipeline:
                 add_windows(connection, vehicle, self.model_id, new, now, recording_id)
                 history.add_to_rollups(connection, vehicle, self.model_id, new, now)
                 after = replace(after, revision=at.revision + 1)
-                self._save(connection, vehicle, after, now)
+                self._save(connection, vehicle, after, now, new)
         self._remember(vehicle, after)
         done = time.perf_counter()
         return Batch(
@@ -191,17 +192,19 @@ class Pipeline:
         state, last = at.state, at.last_window_ns
         records = []
         for window, estimate in zip(windows, estimates, strict=True):
-            posterior = None
+            posterior, fed = None, False
             if estimate is not None and window.start > last and window.start not in skip:
                 state = self.engine.tracker.update(state, estimate, window.start)
                 last = window.start
-                posterior = Posterior(*self.engine.tracker.posterior(state))
+                fed = True
+                if state.used:  # before, there is nothing but the prior: no measurement, and not drawn as one
+                    posterior = Posterior(*self.engine.tracker.posterior(state))
             records.append(
                 WindowRecord(
                     window.start,
                     *_outcome(window, estimate),
                     window.repaired_samples,
-                    posterior is not None,
+                    fed,
                     None if estimate is None else Solved.of(estimate),
                     posterior,
                 )
@@ -220,10 +223,53 @@ class Pipeline:
             return _Vehicle(0, -1, self.engine.tracker.initial_state())
         return _Vehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
 
-    def _save(self, connection: Connection, vehicle: str, at: _Vehicle, now: int) -> None:
+    def relearn(self, vehicle: str, names: Sequence[str] | None, connection: Connection) -> Batch:
+        """Forget baselines (all, or those of `names`) inside a transaction of the caller's, e.g. after a repair.
+
+        Raises TrackerStateError for a parameter that the system does not have.  Hand the batch to `tell` once the
+        transaction is committed.
+        """
+        now = self._clock()
+        at = self._current(connection, vehicle)
+        after = replace(at, state=self.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
+        fleet.ensure_vehicle(connection, vehicle, now)
+        self._save(connection, vehicle, after, now, [])
+        return Batch(vehicle, [], [], 0, after.state)
+
+    def tell(self, batch: Batch) -> None:
+        """Let every listener know of a change that came without windows."""
+        for listener in self._listeners:
+            listener(batch)
+
+    def refresh_statuses(self) -> int:
+        """Make the rows of the fleet's list that are missing, as in a store of an earlier version; how many."""
+        with self.store.read() as connection:
+            missing = status.outdated(connection, self.model_id)
+        for vehicle in missing:
+            with self.store.write() as connection:
+                at = self._current(connection, vehicle)
+                self._save_status(connection, vehicle, at, self._clock(), [])
+        return len(missing)
+
+    def _save_status(
+        self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]
+    ) -> None:
+        last = next((record for record in reversed(new) if record.solved is not None), None)
+        view = vehicle_view(self.engine, vehicle, at.state, last)
+        counts = Counter(record.outcome for record in new)
+        unfitting = [record for record in new if record.solved is not None and not record.solved.adequate]
+        counts["unfitting"] = len(unfitting)
+        found = view.status(self.engine.system.elements)
+        status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
+        reasons = [(record.outcome, record.reason, record.start) for record in new if record.reason]
+        reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
+        status.add_reasons(connection, vehicle, self.model_id, reasons)
+
+    def _save(self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]) -> None:
         row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
         fleet.save_tracker(connection, vehicle, self.model_id, row, now)
         fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+        self._save_status(connection, vehicle, at, now, new)
 
     def _remember(self, vehicle: str, at: _Vehicle) -> None:
         with self._lock:

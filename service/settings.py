@@ -58,6 +58,8 @@ class Settings(BaseSettings):
     ring_vehicles: int = Field(default=16, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
     ring_seconds: float = Field(default=60.0, gt=0)
 
+    silent_seconds: float = Field(default=600.0, gt=0)  # nothing heard for so long: the vehicle is shown as silent
+
     misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 

@@ -26,15 +26,15 @@ def optional_iso(nanoseconds: int | None) -> str | None:
 
 
 def from_iso(text: str) -> int:
-    """Nanoseconds since epoch of an RFC 3339 time, or of seconds since epoch; UTC where no zone is given.
+    """Nanoseconds since epoch of an RFC 3339 time, or of seconds since epoch.
 
-    Raises ValueError when it is neither.
+    Raises ValueError when it is neither: RFC 3339 has a time of day and a zone, and guessing either is off by hours.
     """
     try:
         return round(float(text) * NANOSECONDS)
     except (ValueError, OverflowError):
         moment = datetime.fromisoformat(text)
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
+    if moment.tzinfo is None or len(text) <= len("2026-09-21"):
+        raise ValueError(f"{text!r} has no time zone")
     whole = moment.replace(microsecond=0)
     return int(whole.timestamp()) * NANOSECONDS + moment.microsecond * 1000

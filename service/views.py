@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,13 +11,16 @@ from typing import Any
 import numpy as np
 
 from sprung.model.signals import FloatArray
-from sprung.model.tracking.tracker import Alarm, TrackerState
+from sprung.model.tracking.tracker import KNOWN, Alarm, TrackerState
 from sprung.service.engine import Engine
 from sprung.service.store.fleet import AlarmRow
+from sprung.service.store.status import Status
 from sprung.service.store.windows import WindowRecord
 from sprung.service.times import optional_iso, to_iso
 
 SEVERITIES = ("warning", "alarm")
+KINDS = ("change", "misfit", "sensor", "load")
+LETTERS = ".?owa"  # of an element in the small drawing, worse last: learning, not identifiable, ok, warning, alarm
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +54,17 @@ class ParameterView:
             "drift": self.drift,
             "drift_std": self.drift_std,
             "alarm": self.alarm,
+            "state": self.state,
         }
+
+    @property
+    def state(self) -> str:
+        """In one word; `learning` until the baseline is known."""
+        if self.alarm is not None:
+            return self.alarm
+        if not self.identifiable:
+            return "not_identifiable"
+        return "learning" if self.drift is None else "ok"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,9 +85,40 @@ class VehicleView:
         """Alarms that are not closed."""
         return tuple(alarm for alarm in self.alarms if alarm.closed is None)
 
+    @property
+    def largest(self) -> ParameterView | None:
+        """The parameter with the largest drift from its baseline; None while all are learning."""
+        drifted = [p for p in self.parameters if p.drift is not None and p.identifiable]
+        return max(drifted, key=lambda p: abs(p.drift or 0.0), default=None)
+
+    def status(self, elements: Sequence[str]) -> Status:
+        """The vehicle's line in the list of the fleet; `elements` in the order of the drawing."""
+        counts, largest = self.active_by_severity(), self.largest
+        solved = None if self.last is None else self.last.solved
+        letters = {name: "." for name in elements}
+        for p in self.parameters:
+            letters[p.element] = max(letters.get(p.element, "."), _letter(p), key=LETTERS.index)
+        learned = sum(p.baseline is not None for p in self.parameters) / max(len(self.parameters), 1)
+        return Status(
+            self.health,
+            counts["alarm"],
+            counts["warning"],
+            None if largest is None else largest.name,
+            None if largest is None else finite(largest.drift),
+            None if largest is None else finite(largest.drift_std),
+            None if solved is None else finite(solved.nrmse),
+            learned,
+            "".join(letters[name] for name in elements)[:400],
+            self.last_window_ns,
+        )
+
     def active_by_severity(self) -> dict[str, int]:
         """Active alarms counted, zero where there is none."""
         return {s: sum(alarm.severity == s for alarm in self.active) for s in SEVERITIES}
+
+    def active_by_kind(self) -> dict[str, int]:
+        """Active alarms counted by what they are about, zero where there is none."""
+        return dict.fromkeys(KINDS, 0) | Counter(alarm.kind for alarm in self.active)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON of `GET /vehicles/{id}`."""
@@ -123,6 +168,14 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
     )
 
 
+def _letter(p: ParameterView) -> str:
+    if p.alarm is not None:
+        return "a" if p.alarm == "alarm" else "w"
+    if not p.identifiable:
+        return "?" if p.baseline is not None or p.drift is not None else "."
+    return "." if p.drift is None else "o"
+
+
 def physical(engine: Engine, log_ratio: FloatArray, std: FloatArray) -> list[tuple[float, float]]:
     """(value, standard deviation) of every parameter in its unit, from log-ratios."""
     values = engine.system.nominal * np.exp(log_ratio)
@@ -153,7 +206,13 @@ def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
         "severity": alarm.severity,
     }
     if isinstance(alarm, AlarmRow):
-        found["report"] = alarm.report_id
+        found |= {
+            "report": alarm.report_id,
+            "id": alarm.id,
+            "vehicle": alarm.vehicle,
+            "acknowledged": optional_iso(alarm.acknowledged),
+            "acknowledged_by": alarm.acknowledged_by,
+        }
     return found
 
 
@@ -183,3 +242,8 @@ def window_dict(engine: Engine, record: WindowRecord) -> dict[str, Any]:
 def finite(value: float | None) -> float | None:
     """JSON knows no NaN."""
     return value if value is not None and math.isfinite(value) else None
+
+
+def known_limit(engine: Engine) -> float:
+    """Standard deviation of a log-ratio from which on a posterior is the prior and no measurement."""
+    return KNOWN * engine.tracker.settings.prior

@@ -14,7 +14,7 @@ from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.pipeline import Pipeline
-from sprung.service.store import Store, fleet, open_store
+from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.schema import posteriors, windows
 from tests.service_fakes import HOP, START, FakeIdentifier, make_window
 
@@ -84,7 +84,13 @@ def test_dropped_windows_are_counted_and_tell_nothing(
     assert batch.records[1].solved is None and batch.records[1].reason == "gap"
     assert batch.late == 0
     with store.read() as connection:
-        assert fleet.window_counts(connection, "a", pipeline.model_id) == {"used": 1, "repaired": 0, "dropped": 1}
+        assert status.fleet_row(connection, "a").windows == {  # type: ignore[union-attr]
+            "used": 1,
+            "repaired": 0,
+            "dropped": 1,
+            "uninformative": 0,
+            "unfitting": 0,
+        }
 
 
 def test_vehicles_do_not_touch_each_other(pipeline: Pipeline, system: System) -> None:
@@ -130,7 +136,7 @@ def test_alarms_of_the_tracker_reach_the_store(pipeline: Pipeline, store: Store,
     batch = pipeline.process("a", [make_window(system, i, level=0.2) for i in range(80, 140)])
     assert batch.state.active
     with store.read() as connection:
-        stored = fleet.list_alarms(connection, "a", pipeline.model_id, 100)
+        stored = fleet.list_alarms(connection, fleet.WantedAlarms("a"), 100)
     assert {a.parameter for a in stored} == {a.parameter for a in batch.state.active}
     assert all(a.change == pytest.approx(np.expm1(0.2), abs=0.01) for a in stored)
     assert all(abs(a.onset - (START + 80 * HOP)) < 4 * 10**9 for a in stored)

@@ -189,12 +189,17 @@ def test_two_processes_can_share_a_file(store: Store, tmp_path: Path) -> None:
         ("2026-09-21T14:13:20Z", 1_790_000_000 * NANOSECONDS),
         ("2026-09-21T14:13:20.500Z", 1_790_000_000 * NANOSECONDS + 500_000_000),
         ("2026-09-21T16:13:20+02:00", 1_790_000_000 * NANOSECONDS),
-        ("2026-09-21T14:13:20", 1_790_000_000 * NANOSECONDS),
         ("1790000000", 1_790_000_000 * NANOSECONDS),
     ],
 )
 def test_times_are_read_in_the_ways_people_write_them(text_: str, nanoseconds: int) -> None:
     assert from_iso(text_) == nanoseconds
+
+
+@pytest.mark.parametrize("text_", ["2026-09-21T14:13:20", "2026-09-21", "yesterday", ""])
+def test_a_time_without_zone_is_not_guessed(text_: str) -> None:
+    with pytest.raises(ValueError):
+        from_iso(text_)
 
 
 def test_times_are_written_to_the_millisecond() -> None:

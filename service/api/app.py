@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 from sprung import __version__
-from sprung.service.api import diagnose, docs, fleet, health, identify, problems, recordings
+from sprung.service.api import diagnose, docs, events, fleet, health, history, identify, problems, recordings
+from sprung.service.api.description import PROBLEMS, describe
 from sprung.service.api.limits import BodyLimit
+from sprung.service.api.queries import only_known_parameters
 from sprung.service.core import Core
-from sprung.service.pages import routes as pages
+from sprung.service.pages import routes as fleet_page
+from sprung.service.pages import vehicle as vehicle_page
+from sprung.service.pages.static import assets
 
 DESCRIPTION = (
     "Springs and dampers of rail vehicles, identified from running recordings. "
@@ -45,8 +49,10 @@ def create_app(
     )
     app.state.core = core
     problems.install(app)
-    for part in (identify, fleet, recordings, diagnose, health, docs, pages):
-        app.include_router(part.router)
+    describe(app)
+    for part in (identify, fleet, history, events, recordings, diagnose, health, docs, fleet_page, vehicle_page):
+        app.include_router(part.router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
+    app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes
     app.add_middleware(
         BodyLimit,

@@ -63,7 +63,7 @@ async def identify(request: Request, core: CoreOf, states: bool = False, track: 
         window = Window(now_ns() - length if start is None else start, engine.system.sample_rate, values)
         batch = await run_in_threadpool(core.pipeline.track, body.vehicle, window, estimates[0])
         posterior = batch.records[0].posterior
-        answer["tracked"] = posterior is not None
+        answer["tracked"] = batch.records[0].tracked
         if posterior is not None:
             answer["posterior"] = _parameters(engine, posterior.log_ratio, posterior.std, None)
     return json_response(answer)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import re
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+from sprung.service.times import to_iso
+
+STATIC = Path(__file__).parent / "static"
 LITERAL = re.compile(r"`([^`]*)`")
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
 
@@ -23,7 +28,8 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"quantity": quantity, "percent": percent, "code": code}
+    environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment}
+    environment.globals["asset"] = asset
     return environment
 
 
@@ -32,9 +38,22 @@ def render(template: str, **values: Any) -> str:
     return _environment().get_template(template).render(**values)
 
 
+@cache
+def asset(name: str) -> str:
+    """The URL of a static file, with a part that changes with its content: it may be kept for ever."""
+    digest = hashlib.sha256((STATIC / name).read_bytes()).hexdigest()[:12]
+    return f"/static/{name}?v={digest}"
+
+
 def code(text: str) -> Markup:
     """Plain text with its `literals` set as code."""
     return Markup(LITERAL.sub(r"<code>\1</code>", str(escape(text))))
+
+
+def moment(nanoseconds: int) -> Markup:
+    """`2026-09-21 14:13:20`: UTC, to the second; the machine's form beside it."""
+    iso = to_iso(nanoseconds)
+    return Markup('<time datetime="{}">{} {}</time>').format(iso, iso[:10], iso[11:19])
 
 
 def quantity(value: float, unit: str) -> str:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any
+from urllib.parse import urlencode
 
-import numpy as np
-from fastapi import APIRouter
+from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
-from sprung.service.api.access import CoreOf, known_vehicle, read
-from sprung.service.api.fleet import load_view
-from sprung.service.core import Core
-from sprung.service.pages.plot import Trace, drift_svg
+from sprung.service.api.access import CoreOf, read
+from sprung.service.api.fleet import silent_before
+from sprung.service.pages.drawing import columns, small_view
 from sprung.service.pages.render import render
-from sprung.service.store import fleet, history, work
-from sprung.service.times import to_iso
-from sprung.service.views import VehicleView, alarm_dict
+from sprung.service.store import status
+from sprung.service.store.status import Sort, Wanted
 
 router = APIRouter(include_in_schema=False)
 
-SHOWN_VEHICLES = 200
-SHOWN_ALARMS = 50
-PLOT_POINTS = 180
-FOREVER = 2**63 - 1
+PAGE_ROWS = 50
 HEALTH = {  # NAMUR NE 107
     "ok": "good",
     "maintenance_required": "maintenance required",
@@ -31,62 +28,64 @@ HEALTH = {  # NAMUR NE 107
     "check_function": "check function",
     "failure": "failure",
 }
+SORTS = (
+    ("urgency", "most urgent first"),
+    ("drift", "largest drift first"),
+    ("last_window", "newest first"),
+    ("id", "by name"),
+)
 
 
 @router.get("/")
-async def fleet_page(core: CoreOf) -> HTMLResponse:
-    """Every vehicle with its health."""
+async def fleet_page(
+    core: CoreOf,
+    q: Annotated[str, Query(max_length=128)] = "",
+    sort: Sort = "urgency",
+    health: str = "",
+    silent: bool = False,
+    open: bool = False,
+    retired: bool = False,
+    page: Annotated[int, Query(ge=1, le=100_000)] = 1,
+) -> HTMLResponse:
+    """The fleet, those that need attention first."""
+    before = silent_before(core)
+    wanted = Wanted(
+        q.strip(), health if health in HEALTH else None, before if silent else None, False if open else None, retired
+    )
 
-    def query(connection: Connection) -> list[tuple[fleet.VehicleRow, VehicleView]]:
-        rows = fleet.list_vehicles(connection, SHOWN_VEHICLES)
-        return [(row, load_view(core, connection, row.id)) for row in rows]
+    def query(connection: Connection) -> tuple[list[status.FleetRow], dict[str, int]]:
+        rows = status.fleet_page(connection, wanted, sort, PAGE_ROWS, (page - 1) * PAGE_ROWS)
+        return rows, status.health_counts(connection, wanted)
 
-    rows = await read(core, query)
-    order = list(HEALTH)
-    rows.sort(key=lambda pair: -order.index(pair[1].health))
-    return HTMLResponse(render("fleet.html", rows=rows, health=HEALTH, system=core.engine.system.name, to_iso=to_iso))
-
-
-@router.get("/pages/vehicles/{id}")
-async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
-    """One vehicle: parameters, drift, alarms, reports."""
-
-    def query(connection: Connection) -> dict[str, Any]:
-        known_vehicle(fleet.vehicle_exists(connection, id), id)
-        view = load_view(core, connection, id)
-        return {
-            "view": view,
-            "plots": _plots(core, connection, view),
-            "alarms": [
-                alarm_dict(row) for row in fleet.list_alarms(connection, id, core.pipeline.model_id, SHOWN_ALARMS)
-            ],
-            "reports": work.list_reports(connection, id, SHOWN_ALARMS),
-            "windows": fleet.window_counts(connection, id, core.pipeline.model_id),
-        }
-
-    values = await read(core, query)
-    return HTMLResponse(render("vehicle.html", **values, health=HEALTH, to_iso=to_iso))
-
-
-def _plots(core: Core, connection: Connection, view: VehicleView) -> list[str]:
-    key = (view.vehicle, core.pipeline.model_id)
-    resolution = history.fitting_resolution(connection, *key, 0, FOREVER, PLOT_POINTS)
-    points = history.history(connection, *key, 0, FOREVER, resolution, 2 * PLOT_POINTS)
-    if not points:
-        return []
-    ratio = np.exp(np.stack([p.mean for p in points]))  # shape (n, P)
-    std = ratio * np.stack([p.std for p in points])
-    times = [p.time for p in points]
-    return [
-        drift_svg(
-            Trace(
-                p.name,
-                times,
-                ratio[:, i],
-                std[:, i],
-                None if p.baseline is None else p.baseline / p.nominal,
-                p.alarm,
-            )
+    rows, counts = await read(core, query)
+    total = sum(counts.values()) if wanted.health is None else counts[wanted.health]
+    asked = {"q": q, "sort": sort, "health": health, "page": page}
+    asked |= {name: "true" for name, on in (("silent", silent), ("open", open), ("retired", retired)) if on}
+    return HTMLResponse(
+        render(
+            "fleet.html",
+            rows=rows,
+            counts=counts,
+            wanted=wanted,
+            searching=wanted != Wanted(),
+            health=HEALTH,
+            system=core.engine.system.name,
+            sort=sort,
+            sorts=SORTS,
+            page=page,
+            pages=-(-total // PAGE_ROWS),
+            silent_before=before,
+            small=partial(small_view, core.engine.system, columns(core.engine.system)),
+            link=linker("/", asked),
         )
-        for i, p in enumerate(view.parameters)
-    ]
+    )
+
+
+def linker(path: str, asked: dict[str, Any]) -> Callable[..., str]:
+    """A function that gives the present page's address with some parameters changed."""
+
+    def link(**changed: Any) -> str:
+        wanted = {name: value for name, value in (asked | changed).items() if value not in ("", 1, None)}
+        return f"{path}?{urlencode(wanted)}" if wanted else path
+
+    return link

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,66 +14,12 @@ from matplotlib.patches import Circle, Polygon
 
 from sprung.model.schema import ElementSensor, ForceInput
 from sprung.model.system import System
+from sprung.service.layout import Layout, Point, lay_out
 from sprung.service.report import ink
 
-Point = tuple[float, float]
-
-STOREY = 2.3  # drawn height between a body and what carries it
 WIDTH = 10.5  # in
-THICKNESS = 0.75  # drawn height of a body
 BODY = "#dfe6ec"
 LINE = "#52606d"
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where everything stands: levels count the storeys from the ground up."""
-
-    system: System
-    level: Mapping[str, int]
-    half_length: Mapping[str, float]  # m, of each body along x
-    slant: float  # sideways shift per metre of y
-    rise: float
-
-    def at(self, x: float, y: float, height: float) -> Point:
-        """Projection: the left side (y > 0) lies behind, up and to the right."""
-        return x + self.slant * y, height + self.rise * y
-
-    def bottom(self, name: str) -> float:
-        """Drawn height of the underside of a body, 0 for the ground and supports."""
-        return STOREY * self.level[name] if name in self.level else 0.0
-
-    def top(self, name: str) -> float:
-        return self.bottom(name) + THICKNESS if name in self.level else 0.0
-
-    def element_position(self, element: str) -> Point:
-        """(x, y) of an element; the body's own position where the file gives none."""
-        item = self.system.file.elements[element]
-        if item.position is not None:
-            return item.position
-        body = item.upper if item.upper in self.level else item.lower
-        position = self.system.file.bodies[body].position
-        return float(position[0]), float(position[1])
-
-
-def lay_out(system: System) -> Layout:
-    """Levels by what carries what; lengths by where elements are attached."""
-    file = system.file
-    level = dict.fromkeys(file.bodies, 1)
-    for _ in file.bodies:
-        for element in file.elements.values():
-            if element.upper in level and element.lower in level and element.upper != element.lower:
-                level[element.upper] = min(max(level[element.upper], level[element.lower] + 1), len(level))
-    reach: dict[str, float] = {}
-    for name, body in file.bodies.items():
-        away = [
-            abs(item.position[0] - body.position[0])
-            for item in file.elements.values()
-            if item.position is not None and name in (item.upper, item.lower)
-        ]
-        reach[name] = 1.25 * max(away, default=0.0) + 0.35
-    single = all(item.position is None for item in file.elements.values())
-    return Layout(system, level, reach, 0.0 if single else 0.62, 0.0 if single else 0.34)
 
 
 def _body(axes: Axes, layout: Layout, name: str, colour: str, edge: str) -> None:

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, func, select, update
+from sqlalchemy import Connection, and_, func, or_, select, update
 
 from sprung.model.tracking.tracker import Alarm
 from sprung.service.store.engine import insert_or_ignore, upsert
-from sprung.service.store.schema import alarms, models, tracker_states, vehicles, windows
+from sprung.service.store.schema import alarms, fleet_status, models, tracker_states, vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,20 +36,21 @@ class AlarmRow:
     std: float | None
     peak: float | None
     report_id: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class VehicleRow:
-    """One line of the fleet."""
-
-    id: str
-    created_ns: int
-    last_window_ns: int | None
+    id: int | None = None
+    vehicle: str | None = None
+    acknowledged: int | None = None  # ns since epoch
+    acknowledged_by: str | None = None
 
 
 def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
-    """Make the vehicle known."""
+    """Make the vehicle known, and list it, though nothing was identified of it yet."""
     insert_or_ignore(connection, vehicles, [{"id": vehicle, "created_ns": now}])
+    model = connection.execute(select(func.max(models.c.id))).scalar()
+    if model is not None:
+        numbers = ("revision", "urgency", "alarms", "warnings", "unacknowledged", "earlier", "learned")
+        numbers += ("used", "repaired", "dropped", "uninformative", "unfitting")
+        blank = {"vehicle_id": vehicle, "model_id": model, "health": "ok", "elements": "", "received_ns": now}
+        insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
 
 
 def ensure_model(connection: Connection, digest: str, system: str, description: dict[str, Any], now: int) -> int:
@@ -59,37 +60,9 @@ def ensure_model(connection: Connection, digest: str, system: str, description: 
     return connection.execute(select(models.c.id).where(models.c.digest == digest)).scalar_one()
 
 
-def list_vehicles(connection: Connection, limit: int, after: str = "") -> list[VehicleRow]:
-    """Vehicles by id, `limit` of them after `after`."""
-    last = (
-        select(func.max(windows.c.start_ns))
-        .where(windows.c.vehicle_id == vehicles.c.id)
-        .correlate(vehicles)
-        .scalar_subquery()
-    )
-    query = (
-        select(vehicles.c.id, vehicles.c.created_ns, last)
-        .where(vehicles.c.id > after)
-        .order_by(vehicles.c.id)
-        .limit(limit)
-    )
-    return [VehicleRow(*row) for row in connection.execute(query)]
-
-
 def vehicle_exists(connection: Connection, vehicle: str) -> bool:
     """Whether anything was ever stored of the vehicle."""
     return connection.execute(select(vehicles.c.id).where(vehicles.c.id == vehicle)).first() is not None
-
-
-def window_counts(connection: Connection, vehicle: str, model_id: int) -> dict[str, int]:
-    """How many windows of each outcome are stored."""
-    query = (
-        select(windows.c.outcome, func.count())
-        .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
-        .group_by(windows.c.outcome)
-    )
-    counts = {"used": 0, "repaired": 0, "dropped": 0}
-    return counts | {outcome: count for outcome, count in connection.execute(query)}
 
 
 def load_tracker(connection: Connection, vehicle: str, model_id: int) -> TrackerRow | None:
@@ -144,20 +117,67 @@ def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iter
     upsert(connection, alarms, values, key=("vehicle_id", "model_id", "kind", "parameter", "opened_ns"))
 
 
+@dataclass(frozen=True, slots=True)
+class WantedAlarms:
+    """Which alarms are asked for; None: any."""
+
+    vehicle: str | None = None
+    active: bool = False
+    acknowledged: bool | None = None
+    severity: str | None = None
+    kind: str | None = None
+    since: int | None = None  # opened at or after, ns
+
+
 def list_alarms(
-    connection: Connection, vehicle: str, model_id: int, limit: int, active_only: bool = False
+    connection: Connection, wanted: WantedAlarms, limit: int, after: tuple[int, int] | None = None
 ) -> list[AlarmRow]:
-    """Alarms of a vehicle, newest first."""
-    columns = ("kind", "parameter", "onset_ns", "opened_ns", "closed_ns", "severity")
+    """Alarms of every model, newest first; `after` holds (opened, id) of the last one of the page before."""
+    table = alarms
+    names = ("kind", "parameter", "onset_ns", "opened_ns", "closed_ns", "severity", "change", "std", "peak")
+    more = ("report_id", "id", "vehicle_id", "acknowledged_ns", "acknowledged_by")
     query = (
-        select(*(alarms.c[name] for name in (*columns, "change", "std", "peak", "report_id")))
-        .where(alarms.c.vehicle_id == vehicle, alarms.c.model_id == model_id)
-        .order_by(alarms.c.opened_ns.desc(), alarms.c.id.desc())
+        select(*(table.c[name] for name in (*names, *more)))
+        .order_by(table.c.opened_ns.desc(), table.c.id.desc())
         .limit(limit)
     )
-    if active_only:
-        query = query.where(alarms.c.closed_ns.is_(None))
+    for column, value in (("vehicle_id", wanted.vehicle), ("severity", wanted.severity), ("kind", wanted.kind)):
+        if value is not None:
+            query = query.where(table.c[column] == value)
+    if wanted.active:
+        query = query.where(table.c.closed_ns.is_(None))
+    if wanted.acknowledged is not None:
+        never = table.c.acknowledged_ns.is_(None)
+        query = query.where(~never if wanted.acknowledged else never)
+    if wanted.since is not None:
+        query = query.where(table.c.opened_ns >= wanted.since)
+    if after is not None:
+        opened, identity = after
+        same = and_(table.c.opened_ns == opened, table.c.id < identity)
+        query = query.where(or_(table.c.opened_ns < opened, same))
     return [AlarmRow(row[0], row[1] or None, *row[2:]) for row in connection.execute(query)]
+
+
+def acknowledge(connection: Connection, alarm_id: int, actor: str, now: int) -> str | None:
+    """Write down who has seen an alarm, once; its vehicle, or None where there is no such alarm."""
+    vehicle = connection.execute(select(alarms.c.vehicle_id).where(alarms.c.id == alarm_id)).scalar_one_or_none()
+    if vehicle is not None:
+        connection.execute(
+            update(alarms)
+            .where(alarms.c.id == alarm_id, alarms.c.acknowledged_ns.is_(None))
+            .values(acknowledged_ns=now, acknowledged_by=actor[:128])
+        )
+    return vehicle
+
+
+def close_alarms_of_other_models(connection: Connection, vehicle: str, model_id: int, now: int) -> int:
+    """A maintenance ends what an earlier model had raised: nothing else would ever close it."""
+    closed = connection.execute(
+        update(alarms)
+        .where(alarms.c.vehicle_id == vehicle, alarms.c.model_id != model_id, alarms.c.closed_ns.is_(None))
+        .values(closed_ns=now)
+    )
+    return closed.rowcount
 
 
 def attach_report(connection: Connection, vehicle: str, model_id: int, report_id: str) -> None:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Column, Connection, Table, func, select
+from sqlalchemy import Column, Connection, Table, func, literal, select
 
-from sprung.model.signals import FloatArray
+from sprung.model.signals import FloatArray, IntArray
 from sprung.service.store.engine import upsert
 from sprung.service.store.schema import posteriors, rollups, windows
 from sprung.service.store.windows import WindowRecord, pack, unpack
@@ -75,6 +75,18 @@ def add_to_rollups(
         upsert(connection, rollups, rows, key=("vehicle_id", "model_id", "resolution_s", "bucket_ns"))
 
 
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Posteriors of all parameters over n points, oldest first."""
+
+    time: IntArray  # ns since epoch, shape (n,); start of the window or bucket
+    windows: IntArray  # shape (n,)
+    mean: FloatArray  # log-ratios, shape (n, P)
+    std: FloatArray  # mean of the posterior's, shape (n, P)
+    low: FloatArray  # smallest posterior mean within the point, shape (n, P)
+    high: FloatArray  # largest, shape (n, P)
+
+
 def history(
     connection: Connection,
     vehicle: str,
@@ -84,21 +96,33 @@ def history(
     resolution: float,
     limit: int,
 ) -> list[Point]:
+    """`series` as points."""
+    found = series(connection, vehicle, model_id, since, until, resolution, limit)
+    return [Point(*row) for row in zip(found.time.tolist(), found.windows.tolist(), *_arrays(found), strict=True)]
+
+
+def series(
+    connection: Connection,
+    vehicle: str,
+    model_id: int,
+    since: int,
+    until: int,
+    resolution: float,
+    limit: int,
+) -> Series:
     """The newest `limit` points with since <= time < until, oldest first.
 
     resolution: seconds per point; below a minute made from raw windows, above from roll-ups; 0 gives raw windows.
     """
     level = max((level for level in LEVELS if level <= resolution), default=None)
-    newest_first: Iterator[Point]
     if level is None:
         query = (
-            select(windows.c.start_ns, posteriors.c.log_ratio, posteriors.c.std)
+            select(windows.c.start_ns, literal(1), posteriors.c.log_ratio, posteriors.c.std)
             .join(posteriors, posteriors.c.window_id == windows.c.id)
             .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
             .where(windows.c.start_ns >= since, windows.c.start_ns < until)
             .order_by(windows.c.start_ns.desc())
         )
-        newest_first = (_raw_point(row.start_ns, row.log_ratio, row.std) for row in connection.execute(query))
     else:
         table = rollups
         query = (
@@ -107,15 +131,50 @@ def history(
             .where(table.c.resolution_s == level, table.c.bucket_ns >= since, table.c.bucket_ns < until)
             .order_by(table.c.bucket_ns.desc())
         )
-        newest_first = (Point(row[0], row[1], *map(unpack, row[2:])) for row in connection.execute(query))
-    if resolution > (level or 0):
-        newest_first = bucketed(newest_first, resolution)
-    found = []
-    for point in newest_first:
-        found.append(point)
-        if len(found) == limit:
+    if resolution == (level or 0):
+        return _of_rows(connection.execute(query.limit(limit)).all())
+    width = round(resolution * NANOSECONDS)
+    rows: list[Any] = []
+    buckets = 0
+    for row in connection.execute(query):
+        buckets += not rows or rows[-1][0] // width != row[0] // width
+        if buckets > limit:
             break
-    return found[::-1]
+        rows.append(row)
+    return _merged(_of_rows(rows), width)
+
+
+def _arrays(found: Series) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    return found.mean, found.std, found.low, found.high
+
+
+def _of_rows(newest_first: Sequence[Any]) -> Series:
+    """Rows of (time, windows, mean, std[, low, high])."""
+    rows = newest_first[::-1]
+    time = np.array([row[0] for row in rows], dtype=np.int64)
+    count = np.array([row[1] for row in rows], dtype=np.int64)
+    width = len(rows[0]) if rows else 4
+    columns = [unpack(b"".join(row[i] for row in rows)).reshape(len(rows), -1 if rows else 0) for i in range(2, width)]
+    mean, std = columns[0], columns[1]
+    return Series(time, count, mean, std, *(columns[2:] or (mean, mean)))
+
+
+def _merged(found: Series, width: int) -> Series:
+    """Points that fall into the same bucket of `width` ns as one, at the bucket's start."""
+    if not len(found.time):
+        return found
+    bucket = found.time // width * width
+    first = np.flatnonzero(np.r_[True, bucket[1:] != bucket[:-1]])
+    count = np.add.reduceat(found.windows, first)
+    weight = found.windows[:, None]
+    return Series(
+        bucket[first],
+        count,
+        np.add.reduceat(found.mean * weight, first) / count[:, None],
+        np.add.reduceat(found.std * weight, first) / count[:, None],
+        np.minimum.reduceat(found.low, first),
+        np.maximum.reduceat(found.high, first),
+    )
 
 
 def bucketed(points: Iterable[Point], resolution: float) -> Iterator[Point]:
@@ -136,11 +195,6 @@ def bucketed(points: Iterable[Point], resolution: float) -> Iterator[Point]:
         yield current
 
 
-def _raw_point(time: int, log_ratio: bytes, std: bytes) -> Point:
-    mean = unpack(log_ratio)
-    return Point(time, 1, mean, unpack(std), mean, mean)
-
-
 def _stored(connection: Connection, vehicle: str, model_id: int, level: int, buckets: list[int]) -> list[Point]:
     table = rollups
     query = (
@@ -156,15 +210,26 @@ def fitting_resolution(
 ) -> float:
     """Seconds per point that show the whole range in about `points`; 0 where every window fits."""
 
-    def spans(table: Table, time: Column[int]) -> Any:
-        inside = (table.c.vehicle_id == vehicle, table.c.model_id == model_id, time >= since, time < until)
-        return connection.execute(select(func.count(), func.min(time), func.max(time)).where(*inside)).one()
+    def span(table: Table, time: Column[int]) -> tuple[int | None, int | None]:
+        """Oldest and newest time, each one step into the index."""
+        inside = select(time).where(
+            table.c.vehicle_id == vehicle, table.c.model_id == model_id, time >= since, time < until
+        )
+        if table is rollups:
+            inside = inside.where(table.c.resolution_s == LEVELS[0])
+        ends = (connection.execute(inside.order_by(order).limit(1)).scalar() for order in (time.asc(), time.desc()))
+        oldest, newest = ends
+        return oldest, newest
 
-    count, first, last = spans(windows, windows.c.start_ns)
-    buckets, oldest, newest = spans(rollups, rollups.c.bucket_ns)
-    if buckets and (not count or oldest < first - LEVELS[-1] * NANOSECONDS):
+    first, last = span(windows, windows.c.start_ns)
+    oldest, newest = span(rollups, rollups.c.bucket_ns)
+    if oldest is not None and newest is not None and (first is None or oldest < first - LEVELS[-1] * NANOSECONDS):
         seconds = (newest - oldest) / NANOSECONDS  # windows of the older part are forgotten: roll-ups have it
         return next((s for s in NICE if s >= LEVELS[0] and seconds / s <= points), NICE[-1])
-    if count <= points:
+    if first is None or last is None:
+        return 0.0
+    inside = select(literal(1)).where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    inside = inside.where(windows.c.start_ns >= since, windows.c.start_ns < until).limit(points + 1)
+    if connection.execute(select(func.count()).select_from(inside.subquery())).scalar_one() <= points:
         return 0.0
     return next((s for s in NICE if (last - first) / NANOSECONDS / s <= points), NICE[-1])

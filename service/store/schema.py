@@ -37,6 +37,47 @@ vehicles = Table(
     metadata,
     Column("id", String(128), primary_key=True),
     Column("created_ns", BigInteger, nullable=False),
+    Column("label", String(128), nullable=True),  # what people call it; the id stays what recordings call it
+    Column("retired_ns", BigInteger, nullable=True),  # no longer in service: out of the fleet's list, data kept
+)
+
+fleet_status = Table(  # one row a vehicle, written with its tracker: lists of the fleet read nothing else
+    "fleet_status",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
+    Column("revision", Integer, nullable=False),  # of the tracker that it was made from
+    Column("health", String(24), nullable=False),  # NAMUR NE 107
+    Column("urgency", Integer, nullable=False),  # larger comes first: health, unacknowledged alarms, their number
+    Column("alarms", Integer, nullable=False),  # active, of severity alarm
+    Column("warnings", Integer, nullable=False),  # active, of severity warning
+    Column("unacknowledged", Integer, nullable=False),  # active, of either severity
+    Column("earlier", Integer, nullable=False),  # of these, raised under an earlier model and never closed
+    Column("largest", String(160), nullable=True),  # parameter with the largest drift
+    Column("drift", Float, nullable=True),  # of it, relative to the vehicle's own baseline
+    Column("drift_std", Float, nullable=True),
+    Column("nrmse", Float, nullable=True),  # of the newest identified window
+    Column("learned", Float, nullable=False),  # share of the parameters that have a baseline
+    Column("elements", String(400), nullable=False),  # a letter an element, for the small drawing
+    Column("last_window_ns", BigInteger, nullable=True),  # as recorded
+    Column("received_ns", BigInteger, nullable=False),  # by this machine's clock
+    Column("used", Integer, nullable=False),  # windows since the model is in use
+    Column("repaired", Integer, nullable=False),
+    Column("dropped", Integer, nullable=False),
+    Column("uninformative", Integer, nullable=False),
+    Column("unfitting", Integer, nullable=False),  # of the used and repaired ones, those that do not fit the model
+    Index("ix_fleet_status_urgency_vehicle_id", "urgency", "vehicle_id"),
+)
+
+window_reasons = Table(  # why windows were dropped, repaired or not followed
+    "window_reasons",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), primary_key=True),
+    Column("outcome", String(20), primary_key=True),
+    Column("reason", String(200), primary_key=True),
+    Column("windows", Integer, nullable=False),
+    Column("last_ns", BigInteger, nullable=False),  # start of the newest such window
 )
 
 models = Table(  # what was identified with: a system file and a trained estimator
@@ -73,7 +114,7 @@ windows = Table(
     Column("start_ns", BigInteger, nullable=False),
     Column("stored_ns", BigInteger, nullable=False),
     Column("recording_id", String(36), ForeignKey("recordings.id"), nullable=True),
-    Column("outcome", String(10), nullable=False),  # used, repaired, dropped
+    Column("outcome", String(16), nullable=False),  # used, repaired, dropped, uninformative
     Column("reason", String(200), nullable=True),
     Column("repaired_samples", Integer, nullable=False),
     Column("tracked", Boolean, nullable=False),  # False: dropped, or older than what the tracker had seen
@@ -156,6 +197,9 @@ alarms = Table(
     Column("peak", Float, nullable=True),  # the largest change so far
     Column("severity", String(20), nullable=False),
     Column("report_id", String(36), ForeignKey("reports.id"), nullable=True),
+    Column("acknowledged_ns", BigInteger, nullable=True),
+    Column("acknowledged_by", String(128), nullable=True),
+    Index("ix_alarms_opened_ns", "opened_ns"),
     UniqueConstraint("vehicle_id", "model_id", "kind", "parameter", "opened_ns"),
 )
 
@@ -199,4 +243,45 @@ audit = Table(  # who did what, and when
     Column("target", String(200), nullable=False),
     Column("detail", JSON, nullable=True),
     Index("ix_audit_time_ns", "time_ns"),
+)
+
+marks = Table(  # what people wrote on a vehicle's time line
+    "marks",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
+    Column("kind", String(20), nullable=False),  # note, maintenance
+    Column("time_ns", BigInteger, nullable=False),  # what it is about
+    Column("text", String(2000), nullable=False),
+    Column("parameters", JSON, nullable=True),  # whose baselines were learned anew; null: none, []: all
+    Column("author", String(128), nullable=False),
+    Column("created_ns", BigInteger, nullable=False),
+    Index("ix_marks_vehicle_id_time_ns", "vehicle_id", "time_ns"),
+)
+
+deliveries = Table(  # notifications on their way; those that failed for good stay to be seen
+    "deliveries",
+    metadata,
+    Column("id", String(36), primary_key=True),
+    Column("kind", String(64), nullable=False),  # type of the event
+    Column("target", String(300), nullable=False),  # an URL, or mailto:ADDRESS
+    Column("event", JSON, nullable=False),  # CloudEvents 1.0, structured
+    Column("state", String(10), nullable=False),  # waiting, delivered, dead
+    Column("attempts", Integer, nullable=False),
+    Column("next_ns", BigInteger, nullable=False),
+    Column("error", String(300), nullable=True),
+    Column("created_ns", BigInteger, nullable=False),
+    Column("updated_ns", BigInteger, nullable=False),
+    Index("ix_deliveries_state_next_ns", "state", "next_ns"),
+)
+
+idempotency = Table(  # answers to requests that carried an Idempotency-Key
+    "idempotency",
+    metadata,
+    Column("key", String(200), primary_key=True),
+    Column("request", String(64), nullable=False),  # hash of method, path, caller
+    Column("status", Integer, nullable=False),
+    Column("body", JSON, nullable=False),
+    Column("location", String(200), nullable=True),
+    Column("created_ns", BigInteger, nullable=False),
 )

@@ -106,7 +106,7 @@ def upgrade() -> None:
         sa.Column("start_ns", sa.BigInteger(), nullable=False),
         sa.Column("stored_ns", sa.BigInteger(), nullable=False),
         sa.Column("recording_id", sa.String(length=36), nullable=True),
-        sa.Column("outcome", sa.String(length=10), nullable=False),
+        sa.Column("outcome", sa.String(length=16), nullable=False),
         sa.Column("reason", sa.String(length=200), nullable=True),
         sa.Column("repaired_samples", sa.Integer(), nullable=False),
         sa.Column("tracked", sa.Boolean(), nullable=False),

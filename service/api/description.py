@@ -1,0 +1,57 @@
+"""The OpenAPI description: every error as problem+json, examples, and no answer without a model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from sprung.service.api.models import ProblemAnswer
+
+MEDIA = "application/problem+json"
+ERRORS = {
+    404: ("Not Found", "No such thing.", "nothing is known of vehicle 'car-99'"),
+    413: ("Content Too Large", "The body is past the limit.", "the body is longer than 2000000 bytes"),
+    415: ("Unsupported Media Type", "Another kind of body is needed.", "send multipart/form-data or JSON"),
+    422: ("Unprocessable Content", "The body or the query is wrong; the fields are named.", "parameter: is needed"),
+    503: ("Service Unavailable", "A queue is full, or the service stops; `Retry-After` says when.", "try again"),
+}
+
+
+def _problem(status: int) -> dict[str, Any]:
+    title, text, detail = ERRORS[status]
+    example = {"type": "about:blank", "title": title, "status": status, "detail": detail, "instance": "/vehicles"}
+    schema = {"$ref": "#/components/schemas/ProblemAnswer"}
+    return {"description": text, "content": {MEDIA: {"schema": schema, "example": example}}}
+
+
+PROBLEMS: dict[int | str, dict[str, Any]] = {status: _problem(status) for status in (422, 503)}
+
+
+def describe(app: FastAPI) -> None:
+    """Give the application an `openapi` that is made once."""
+
+    def openapi() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            found = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+            schemas = found.setdefault("components", {}).setdefault("schemas", {})
+            own = ProblemAnswer.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= own.pop("$defs", {}) | {"ProblemAnswer": own}
+            for path, methods in found["paths"].items():
+                for operation in methods.values():
+                    _complete(path, operation)
+            app.openapi_schema = found
+        return app.openapi_schema
+
+    app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _complete(path: str, operation: dict[str, Any]) -> None:
+    answers = operation["responses"]
+    if "{" in path:
+        answers.setdefault("404", _problem(404))
+    if "requestBody" in operation:
+        answers.setdefault("413", _problem(413))
+    if path == "/diagnose":
+        answers.setdefault("415", _problem(415))

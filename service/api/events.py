@@ -1,0 +1,59 @@
+"""`GET /events`: what changes, as server-sent events."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request
+from fastapi.responses import Response, StreamingResponse
+
+from sprung.service.api.access import CoreOf
+from sprung.service.core import Core
+from sprung.service.hub import Listener
+from sprung.service.times import optional_iso
+
+router = APIRouter(tags=["vehicles"])
+LEAST_SECONDS = 1.0  # between two answers: a page that redraws more often is not read better
+BEAT_SECONDS = 15.0  # a comment, so that proxies keep the connection
+
+
+@router.get(
+    "/events",
+    summary="Follow the fleet, or one vehicle",
+    response_class=Response,
+    responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
+)
+async def events(
+    request: Request, core: CoreOf, vehicle: Annotated[str | None, Query(max_length=128)] = None
+) -> Response:
+    """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle."""
+    loop, ready = asyncio.get_running_loop(), asyncio.Event()
+    listener = core.hub.listen(vehicle, lambda: loop.call_soon_threadsafe(ready.set))
+    stream = _stream(request, core, listener, ready)
+    return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
+
+
+async def _stream(request: Request, core: Core, listener: Listener, ready: asyncio.Event) -> AsyncIterator[str]:
+    quiet = 0.0
+    try:
+        yield "retry: 3000\n\n"
+        while not core.stopping.is_set() and not await request.is_disconnected():
+            try:
+                await asyncio.wait_for(ready.wait(), LEAST_SECONDS)
+            except TimeoutError:
+                quiet += LEAST_SECONDS
+                if quiet >= BEAT_SECONDS:
+                    quiet = 0.0
+                    yield ": still here\n\n"
+                continue
+            ready.clear()
+            quiet = 0.0
+            for news in listener.take():
+                data = {"vehicle": news.vehicle, "window": optional_iso(news.window), "alarms": news.active}
+                yield f"event: vehicle\ndata: {json.dumps(data)}\n\n"
+            await asyncio.sleep(LEAST_SECONDS)
+    finally:
+        core.hub.leave(listener)

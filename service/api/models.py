@@ -1,0 +1,384 @@
+"""What clients are answered: one model an answer, for the description of the API and for typed clients."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+Health = Literal["ok", "maintenance_required", "out_of_specification", "check_function", "failure"]
+Severity = Literal["warning", "alarm"]
+Kind = Literal["change", "misfit", "sensor", "load"]
+
+
+class ProblemField(BaseModel):
+    """What is wrong with one field."""
+
+    field: str
+    detail: str
+
+
+class ProblemAnswer(BaseModel):
+    """RFC 9457 problem details."""
+
+    type: str = "about:blank"
+    title: str
+    status: int
+    detail: str
+    instance: str | None = None
+    errors: list[ProblemField] = Field(default_factory=list, description="the fields that are wrong")
+
+
+class Fit(BaseModel):
+    """How well a window fits: rms(error) / rms(measured)."""
+
+    nrmse: float | None
+    per_sensor: dict[str, float]
+    adequate: bool | None = Field(default=None, description="the window fits the model within its noise")
+    converged: bool | None = None
+
+
+class WindowParameter(BaseModel):
+    """One parameter as one window gives it."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+    nominal: float
+    ratio: float = Field(description="value / nominal")
+    identifiable: bool = True
+
+
+class Identified(BaseModel):
+    """Answer to `POST /identify`."""
+
+    vehicle: str | None
+    model: str
+    parameters: list[WindowParameter]
+    fit: Fit
+    states: dict[str, list[float]] | None = Field(default=None, description="simulated states, with ?states=true")
+    tracked: bool | None = Field(default=None, description="the window fed the vehicle's tracker, with ?track=true")
+    posterior: list[WindowParameter] | None = None
+
+
+class Parameter(BaseModel):
+    """One parameter as tracked."""
+
+    name: str
+    value: float
+    std: float
+    unit: str
+    nominal: float
+    ratio: float = Field(description="value / nominal")
+    identifiable: bool = Field(description="false: what is given is the prior, no measurement")
+    baseline: float | None = Field(description="the vehicle's own healthy value; null while it is learned")
+    drift: float | None = Field(description="value / baseline - 1")
+    drift_std: float | None
+    alarm: Severity | None
+    state: Literal["ok", "learning", "not_identifiable", "warning", "alarm"] | None = None
+
+
+class Alarm(BaseModel):
+    """One alarm; active while `recovered` is null."""
+
+    id: int | None = None
+    vehicle: str | None = None
+    parameter: str | None = Field(description="null for a misfit")
+    kind: Kind
+    onset: str = Field(description="estimated time of the change")
+    raised: str = Field(description="time of the window that gave the evidence")
+    recovered: str | None
+    change: float | None = Field(description="relative to the vehicle's own baseline")
+    std: float | None
+    severity: Severity
+    report: str | None = Field(default=None, description="mismatch report that belongs to it")
+    acknowledged: str | None = None
+    acknowledged_by: str | None = None
+
+
+class WindowCounts(BaseModel):
+    """Windows by what became of them."""
+
+    used: int
+    repaired: int
+    dropped: int
+    uninformative: int = 0
+    unfitting: int = Field(default=0, description="of the used and repaired ones, those that do not fit the model")
+
+
+class WindowReason(BaseModel):
+    """Why windows were dropped, repaired or not followed."""
+
+    outcome: str
+    reason: str
+    windows: int
+    last: str
+
+
+class VehicleLine(BaseModel):
+    """A vehicle in the list of the fleet."""
+
+    vehicle: str
+    label: str | None
+    health: Health
+    last_window: str | None = Field(description="start of the newest window, as recorded")
+    received: str | None = Field(description="when it came, by the service's clock")
+    silent: bool = Field(description="nothing came for longer than SPRUNG_SILENT_SECONDS")
+    alarms: int = Field(description="active ones of either severity")
+    unacknowledged: int
+    largest: str | None = Field(description="parameter with the largest drift")
+    drift: float | None
+    learned: float = Field(description="share of the parameters that have a baseline")
+    retired: str | None
+
+
+class Vehicles(BaseModel):
+    """Answer to `GET /vehicles`."""
+
+    vehicles: list[VehicleLine]
+    next: str | None = Field(description="`after` of the following page; null at the end")
+    counts: dict[str, int] = Field(default_factory=dict, description="vehicles by health, whatever health is asked for")
+
+
+class Vehicle(BaseModel):
+    """Answer to `GET /vehicles/{id}`."""
+
+    vehicle: str
+    label: str | None
+    retired: str | None
+    model: str
+    health: Health
+    last_window: str | None
+    received: str | None
+    silent: bool
+    fit: Fit | None
+    parameters: list[Parameter]
+    alarms: list[Alarm]
+    windows: WindowCounts
+    reasons: list[WindowReason] = Field(description="why windows were dropped, repaired or did not fit")
+
+
+class Point(BaseModel):
+    """A point of a history; of several windows where `windows` says so."""
+
+    time: str
+    value: float
+    std: float
+    lower95: float = Field(description="value - 1.96 std: the 95 % band")
+    upper95: float
+    low: float = Field(description="smallest of the windows' values within the point; no confidence band")
+    high: float = Field(description="largest of the windows' values within the point")
+    ratio: float = Field(description="value / nominal")
+    windows: int
+
+
+class History(BaseModel):
+    """One parameter over time, oldest first; points where it was not identifiable are left out."""
+
+    vehicle: str
+    parameter: str
+    unit: str
+    nominal: float
+    resolution: float = Field(description="seconds per point; 0: single windows")
+    points: list[Point]
+
+
+class Histories(BaseModel):
+    """Several parameters over time."""
+
+    vehicle: str
+    resolution: float
+    histories: list[History]
+
+
+class Column(BaseModel):
+    """One parameter as columns; null where it was not identifiable."""
+
+    unit: str
+    nominal: float
+    baseline: float | None
+    value: list[float | None]
+    std: list[float | None]
+
+
+class Columns(BaseModel):
+    """`format=columns`: small, for plots."""
+
+    vehicle: str
+    resolution: float
+    time: list[int] = Field(description="ms since the epoch")
+    windows: list[int]
+    parameters: dict[str, Column]
+
+
+class Alarms(BaseModel):
+    """A vehicle's alarms, newest first."""
+
+    vehicle: str
+    alarms: list[Alarm]
+
+
+class AlarmPage(BaseModel):
+    """Alarms of the fleet, newest first."""
+
+    alarms: list[Alarm]
+    next: str | None
+
+
+class Job(BaseModel):
+    """Work that goes on after its request was answered."""
+
+    id: str
+    kind: str
+    state: Literal["queued", "running", "done", "failed"]
+    recording: str | None
+    vehicle: str | None
+    progress: float
+    result: dict[str, Any] | None
+    error: str | None
+    created: str
+    updated: str
+
+
+class JobPage(BaseModel):
+    """Jobs, newest first."""
+
+    jobs: list[Job]
+    next: str | None
+
+
+class ReportLine(BaseModel):
+    """A mismatch report in a list."""
+
+    id: str
+    vehicle: str | None
+    recording: str | None
+    verdict: str
+    findings: list[str] = Field(description="a sentence each")
+    created: str
+    page: str
+
+
+class ReportPage(BaseModel):
+    """Reports, newest first."""
+
+    reports: list[ReportLine]
+    next: str | None
+
+
+class Recording(BaseModel):
+    """A file or stream that was read."""
+
+    id: str
+    vehicle: str | None
+    name: str
+    source: str
+    size_bytes: int | None
+    kept: bool = Field(description="the file is still there and can be diagnosed")
+    created: str
+    finished: str | None
+    tally: dict[str, Any] | None
+
+
+class RecordingPage(BaseModel):
+    """Recordings, newest first."""
+
+    recordings: list[Recording]
+    next: str | None
+
+
+class Mark(BaseModel):
+    """A note or a maintenance on a vehicle's time line."""
+
+    id: int
+    kind: Literal["note", "maintenance"]
+    time: str
+    text: str
+    parameters: list[str] | None = Field(description="baselines learned anew; empty: all; null: none")
+    author: str
+    created: str
+
+
+class Marks(BaseModel):
+    """Marks of a vehicle, newest first."""
+
+    vehicle: str
+    marks: list[Mark]
+
+
+class Delivery(BaseModel):
+    """A notification on its way."""
+
+    id: str
+    type: str
+    target: str
+    state: Literal["waiting", "delivered", "dead"]
+    attempts: int
+    next_attempt: str | None
+    error: str | None
+    created: str
+
+
+class DeliveryPage(BaseModel):
+    """Notifications, newest first."""
+
+    deliveries: list[Delivery]
+    next: str | None
+
+
+class Trace(BaseModel):
+    """One sensor of a window."""
+
+    unit: str
+    measured: list[float | None]
+    simulated: list[float]
+    residual: list[float | None]
+    nrmse: float | None
+
+
+class WindowAnswer(BaseModel):
+    """Measured against simulated of a vehicle's newest window."""
+
+    vehicle: str
+    start: str
+    sample_rate: float
+    adequate: bool
+    sensors: dict[str, Trace]
+
+
+class Live(BaseModel):
+    """The process runs."""
+
+    status: Literal["ok"]
+
+
+class Ready(BaseModel):
+    """The service can work."""
+
+    status: Literal["ok"]
+    model: str
+    waiting: int
+
+
+class SystemPart(BaseModel):
+    """An element of the system, as a client needs it to draw or to name it."""
+
+    name: str
+    upper: str
+    lower: str
+    position: list[float] | None
+    parameters: list[str]
+
+
+class SystemAnswer(BaseModel):
+    """What is monitored."""
+
+    name: str
+    model: str
+    sample_rate: float
+    window: int
+    parameters: list[dict[str, Any]]
+    elements: list[SystemPart]
+    sensors: list[str]
+    channels: list[str]

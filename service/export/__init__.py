@@ -1,0 +1,1 @@
+"""What leaves Sprung for other tools: tables of histories, bundles of alarms."""

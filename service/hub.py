@@ -1,0 +1,80 @@
+"""What happens, told at once to everybody who listens: pages that follow a vehicle, notifications."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sprung.service.errors import Busy
+from sprung.service.pipeline import Batch
+
+MOST_LISTENERS = 200
+MOST_WAITING = 1000  # vehicles with news that a slow listener has not fetched; older ones are forgotten
+
+
+@dataclass(frozen=True, slots=True)
+class News:
+    """A vehicle has new windows, or something about it was changed."""
+
+    vehicle: str
+    window: int | None  # start of its newest window, ns since epoch
+    active: int  # alarms
+
+
+class Listener:
+    """Holds the newest news of every vehicle until they are taken."""
+
+    def __init__(self, vehicle: str | None, wake: Callable[[], None]) -> None:
+        self._vehicle = vehicle
+        self._wake = wake
+        self._news: OrderedDict[str, News] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def put(self, news: News) -> None:
+        """Take news, unless they are about another vehicle."""
+        if self._vehicle not in (None, news.vehicle):
+            return
+        with self._lock:
+            self._news[news.vehicle] = news
+            while len(self._news) > MOST_WAITING:
+                self._news.popitem(last=False)
+        self._wake()
+
+    def take(self) -> list[News]:
+        """Everything new, oldest first."""
+        with self._lock:
+            found = list(self._news.values())
+            self._news.clear()
+        return found
+
+
+class Hub:
+    """Passes news on; never waits for a listener."""
+
+    def __init__(self) -> None:
+        self._listeners: set[Listener] = set()
+        self._lock = threading.Lock()
+
+    def on_batch(self, batch: Batch) -> None:
+        """Tell that a vehicle has changed."""
+        news = News(batch.vehicle, batch.state.time, len(batch.state.active))
+        with self._lock:
+            listeners = list(self._listeners)
+        for listener in listeners:
+            listener.put(news)
+
+    def listen(self, vehicle: str | None, wake: Callable[[], None]) -> Listener:
+        """Listen to one vehicle, or to all; `wake` is called from other threads.  Raises Busy past the limit."""
+        listener = Listener(vehicle, wake)
+        with self._lock:
+            if len(self._listeners) >= MOST_LISTENERS:
+                raise Busy(f"{MOST_LISTENERS} pages are followed already; reload later")
+            self._listeners.add(listener)
+        return listener
+
+    def leave(self, listener: Listener) -> None:
+        """Stop listening."""
+        with self._lock:
+            self._listeners.discard(listener)

@@ -1,0 +1,290 @@
+"""One row a vehicle for lists of the fleet: written with the tracker, sorted, filtered and paged by the database."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
+
+from sprung.service.store.engine import upsert
+from sprung.service.store.schema import alarms, fleet_status, tracker_states, vehicles, window_reasons
+
+HEALTHS = ("ok", "maintenance_required", "out_of_specification", "check_function", "failure")  # NE 107, worse last
+COUNTED = ("used", "repaired", "dropped", "uninformative", "unfitting")
+MOST_COUNTED = 499_999
+MOST_REASONS = 200  # of one vehicle; further ones are counted as OTHER
+OTHER = "other reasons"
+Sort = Literal["urgency", "id", "last_window", "drift"]
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """How a vehicle stands after its newest windows."""
+
+    health: str
+    alarms: int
+    warnings: int
+    largest: str | None  # parameter with the largest drift
+    drift: float | None
+    drift_std: float | None
+    nrmse: float | None
+    learned: float
+    elements: str  # a letter an element: . learning, ? not identifiable, o ok, w warning, a alarm
+    last_window_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class FleetRow:
+    """One line of the fleet."""
+
+    id: str
+    label: str | None
+    retired_ns: int | None
+    health: str
+    urgency: int
+    alarms: int
+    warnings: int
+    unacknowledged: int
+    earlier: int
+    largest: str | None
+    drift: float | None
+    drift_std: float | None
+    nrmse: float | None
+    learned: float
+    elements: str
+    last_window_ns: int | None
+    received_ns: int
+    windows: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """Which vehicles are asked for."""
+
+    search: str = ""  # in the id or the label
+    health: str | None = None
+    silent_since: int | None = None  # only those from which nothing came since then, ns
+    acknowledged: bool | None = None  # False: only those with alarms that nobody has acknowledged
+    retired: bool = False  # those out of service instead of those in service
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """How many windows of one outcome had one reason."""
+
+    outcome: str
+    reason: str
+    windows: int
+    last_ns: int
+
+
+def save_status(
+    connection: Connection,
+    vehicle: str,
+    model_id: int,
+    revision: int,
+    status: Status,
+    counts: Counter[str],
+    now: int,
+) -> None:
+    """Replace a vehicle's row; `counts` are added to its windows, `earlier` alarms looked up."""
+    table = fleet_status
+    old = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).first()
+    same = old is not None and old.model_id == model_id
+    earlier = _open_of_other_models(connection, vehicle, model_id)
+    numbers = {name: (getattr(old, name) if same else 0) + counts[name] for name in COUNTED}
+    values = asdict(status)
+    if status.nrmse is None and same:
+        values["nrmse"] = old.nrmse
+    values |= numbers | {
+        "vehicle_id": vehicle,
+        "model_id": model_id,
+        "revision": revision,
+        "health": _worse(status.health, "maintenance_required" if earlier else "ok"),
+        "earlier": earlier,
+        "received_ns": now if counts or old is None else old.received_ns,
+    }
+    values |= _urgency(connection, vehicle, values["health"])
+    upsert(connection, table, [values], key=("vehicle_id",))
+
+
+def refresh_urgency(connection: Connection, vehicle: str) -> None:
+    """After an acknowledgement: how urgent the vehicle is now."""
+    table = fleet_status
+    row = connection.execute(select(table.c.health).where(table.c.vehicle_id == vehicle)).first()
+    if row is not None:
+        values = _urgency(connection, vehicle, row.health)
+        connection.execute(table.update().where(table.c.vehicle_id == vehicle).values(**values))
+
+
+def add_reasons(connection: Connection, vehicle: str, model_id: int, found: Iterable[tuple[str, str, int]]) -> None:
+    """Count windows by outcome and reason; `found` holds (outcome, reason, start)."""
+    table = window_reasons
+    fresh: dict[tuple[str, str], list[int]] = {}
+    for outcome, reason, start in found:
+        fresh.setdefault((outcome, without_numbers(reason)), []).append(start)
+    if not fresh:
+        return
+    where = (table.c.vehicle_id == vehicle, table.c.model_id == model_id)
+    query = select(table.c.outcome, table.c.reason, table.c.windows, table.c.last_ns).where(*where)
+    stored = {(row.outcome, row.reason): row for row in connection.execute(query)}
+    merged: dict[tuple[str, str], list[int]] = {}
+    for (outcome, reason), starts in fresh.items():
+        room = (outcome, reason) in stored or len(stored) + len(merged) < MOST_REASONS
+        merged.setdefault((outcome, reason if room else OTHER), []).extend(starts)
+    rows = [
+        {
+            "vehicle_id": vehicle,
+            "model_id": model_id,
+            "outcome": key[0],
+            "reason": key[1],
+            "windows": len(starts) + (stored[key].windows if key in stored else 0),
+            "last_ns": max(*starts, stored[key].last_ns if key in stored else 0),
+        }
+        for key, starts in merged.items()
+    ]
+    upsert(connection, table, rows, key=("vehicle_id", "model_id", "outcome", "reason"))
+
+
+def reasons_of(connection: Connection, vehicle: str, model_id: int) -> list[Reason]:
+    """Why windows were dropped, repaired or did not fit; the most frequent first."""
+    table = window_reasons
+    query = (
+        select(table.c.outcome, table.c.reason, table.c.windows, table.c.last_ns)
+        .where(table.c.vehicle_id == vehicle, table.c.model_id == model_id)
+        .order_by(table.c.windows.desc(), table.c.reason)
+    )
+    return [Reason(*row) for row in connection.execute(query)]
+
+
+def fleet_page(
+    connection: Connection, wanted: Wanted, sort: Sort, limit: int, offset: int = 0, after: str | None = None
+) -> list[FleetRow]:
+    """`limit` vehicles; `after` is the `cursor` of the last row of the page before."""
+    query = _filtered(select(vehicles.c.label, vehicles.c.retired_ns, fleet_status), wanted)
+    order = _order(sort)
+    if after is not None:
+        query = query.where(_beyond(sort, after))
+    query = query.order_by(*order).limit(limit).offset(offset)
+    return [_fleet_row(row) for row in connection.execute(query)]
+
+
+def fleet_row(connection: Connection, vehicle: str) -> FleetRow | None:
+    """One vehicle's line."""
+    query = (
+        select(vehicles.c.label, vehicles.c.retired_ns, fleet_status)
+        .join(fleet_status, fleet_status.c.vehicle_id == vehicles.c.id)
+        .where(vehicles.c.id == vehicle)
+    )
+    row = connection.execute(query).first()
+    return None if row is None else _fleet_row(row)
+
+
+def cursor(sort: Sort, row: FleetRow) -> str:
+    """What `fleet_page` needs to go on after a row."""
+    value = {"urgency": row.urgency, "last_window": row.last_window_ns or 0, "id": ""}.get(sort, "")
+    if sort == "drift":
+        value = repr(abs(row.drift or 0.0))
+    return f"{value}:{row.id}"
+
+
+def health_counts(connection: Connection, wanted: Wanted) -> dict[str, int]:
+    """How many vehicles are in each state of health, whatever health is asked for."""
+    anyhow = Wanted(wanted.search, None, wanted.silent_since, wanted.acknowledged, wanted.retired)
+    query = _filtered(select(fleet_status.c.health, func.count()), anyhow).group_by(fleet_status.c.health)
+    return dict.fromkeys(HEALTHS, 0) | {health: count for health, count in connection.execute(query)}
+
+
+def alarmed_vehicles(connection: Connection) -> list[str]:
+    """Vehicles in service that are not well, the most urgent last."""
+    query = _filtered(select(fleet_status.c.vehicle_id), Wanted()).where(fleet_status.c.health != "ok")
+    return list(connection.execute(query.order_by(fleet_status.c.urgency)).scalars())
+
+
+def outdated(connection: Connection, model_id: int) -> list[str]:
+    """Vehicles whose row is older than their tracker (a store of an earlier version, or restored in part)."""
+    query = (
+        select(tracker_states.c.vehicle_id)
+        .join(fleet_status, fleet_status.c.vehicle_id == tracker_states.c.vehicle_id, isouter=True)
+        .where(tracker_states.c.model_id == model_id)
+        .where(or_(fleet_status.c.revision.is_(None), fleet_status.c.revision == 0))
+    )
+    return list(connection.execute(query).scalars())
+
+
+def without_numbers(reason: str) -> str:
+    """A reason as a kind of reason: measured numbers in it are left out, names with digits stay."""
+    return re.sub(r"(?<![\w.])[-+]?\d+(\.\d+)?(?![\w.])", "N", reason)[:200]
+
+
+def _filtered(query: Select[Any], wanted: Wanted) -> Select[Any]:
+    table = fleet_status
+    query = query.select_from(table.join(vehicles, vehicles.c.id == table.c.vehicle_id))
+    query = query.where(vehicles.c.retired_ns.is_not(None) if wanted.retired else vehicles.c.retired_ns.is_(None))
+    if wanted.search:
+        text = wanted.search.lower()
+        found = func.lower(vehicles.c.id).contains(text, autoescape=True)
+        query = query.where(or_(found, func.lower(vehicles.c.label).contains(text, autoescape=True)))
+    if wanted.health is not None:
+        query = query.where(table.c.health == wanted.health)
+    if wanted.silent_since is not None:
+        query = query.where(table.c.received_ns < wanted.silent_since)
+    if wanted.acknowledged is not None:
+        none_left = table.c.unacknowledged == 0
+        query = query.where(none_left if wanted.acknowledged else ~none_left)
+    return query
+
+
+def _order(sort: Sort) -> Sequence[ColumnElement[Any]]:
+    column, identity = _key(sort), fleet_status.c.vehicle_id.asc()
+    return (identity,) if column is None else (column.desc(), identity)
+
+
+def _key(sort: Sort) -> ColumnElement[Any] | None:
+    if sort == "urgency":
+        return fleet_status.c.urgency
+    if sort == "last_window":
+        return func.coalesce(fleet_status.c.last_window_ns, 0)
+    if sort == "drift":
+        return func.abs(func.coalesce(fleet_status.c.drift, 0.0))
+    return None
+
+
+def _beyond(sort: Sort, after: str) -> ColumnElement[bool]:
+    """Rows behind a cursor.  Raises ValueError for what is none."""
+    value, _, identity = after.partition(":")
+    column, own = _key(sort), fleet_status.c.vehicle_id
+    if column is None:
+        return own > identity
+    number = float(value) if sort == "drift" else int(value)
+    return or_(column < number, and_(column == number, own > identity))
+
+
+def _fleet_row(row: Any) -> FleetRow:
+    own = {name: getattr(row, name) for name in FleetRow.__slots__ if name not in ("id", "windows")}
+    return FleetRow(id=row.vehicle_id, windows={name: getattr(row, name) for name in COUNTED}, **own)
+
+
+def _open_of_other_models(connection: Connection, vehicle: str, model_id: int) -> int:
+    query = select(func.count()).where(
+        alarms.c.vehicle_id == vehicle, alarms.c.model_id != model_id, alarms.c.closed_ns.is_(None)
+    )
+    return int(connection.execute(query).scalar_one())
+
+
+def _urgency(connection: Connection, vehicle: str, health: str) -> dict[str, int]:
+    open_ = (alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None))
+    unseen = func.count().filter(alarms.c.acknowledged_ns.is_(None))
+    total, unacknowledged = connection.execute(select(func.count(), unseen).where(*open_)).one()
+    rank = HEALTHS.index(health) if health in HEALTHS else 1
+    number = min(total, MOST_COUNTED) + (MOST_COUNTED + 1) * (unacknowledged > 0)
+    return {"unacknowledged": unacknowledged, "urgency": rank * 1_000_000 + number}
+
+
+def _worse(one: str, other: str) -> str:
+    known = [health for health in (one, other) if health in HEALTHS]
+    return max(known, key=HEALTHS.index) if len(known) == 2 else one
