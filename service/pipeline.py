@@ -257,7 +257,11 @@ class Pipeline:
         last = next((record for record in reversed(new) if record.solved is not None), None)
         view = vehicle_view(self.engine, vehicle, at.state, last)
         counts = Counter(record.outcome for record in new)
-        unfitting = [record for record in new if record.solved is not None and not record.solved.adequate]
+        unfitting = [
+            record
+            for record in new
+            if record.outcome != "uninformative" and record.solved is not None and not record.solved.adequate
+        ]
         counts["unfitting"] = len(unfitting)
         found = view.status(self.engine.system.elements)
         status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
