@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +15,7 @@ from cantools.database import Database
 
 from sprung.model.signals import Channel, SampleBlock, Tally
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.bus import BusAddress, lost_by_kernel, opening_options, widen
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import EXTENDED, FrameBlock
@@ -21,14 +23,19 @@ from sprung.replay.recording import CAN_READERS
 
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0  # s, doubled from try to try
 MOST_FRAMES = 4096  # frames of one block, so that a flooded bus stays bounded in memory
-KEPT_PROBLEMS = 100  # lines; a bus may flap for weeks
 BUS_ERRORS = (can.CanError, OSError, ValueError)
+BEHIND_SECONDS = 5.0  # frames that wait longer are not worth reading: they are given up until ...
+CAUGHT_UP_SECONDS = 0.5  # ... the reader is this close again
+ASK_SECONDS = 5.0  # between two looks at the kernel's counters
+OFFSET_DRIFT = 1e-3  # by which the clock of an interface may drift against the host's
 
 
 class LiveBus:
     """Any python-can interface (`socketcan`, `virtual`, `udp_multicast`, ...), opened again when it is lost.
 
-    Time stamps are those of the interface.  `stop` ends `blocks()` within one latency.
+    Time stamps are those of the interface.  `stop` ends `blocks()` within one latency.  The bus is only listened to,
+    and filtered by the kernel, where the interface can.  A reader that falls behind gives up what waits, counted, and
+    goes on with what is new.
     """
 
     def __init__(
@@ -48,15 +55,26 @@ class LiveBus:
         if interface not in can.VALID_INTERFACES:
             known = ", ".join(sorted(can.VALID_INTERFACES))
             raise UnreadableRecording(f"CAN interface {interface!r} is not known; python-can has {known}")
-        self.name = f"{interface}:{channel}"
+        self.address = BusAddress(interface, channel, options)
+        self.name = self.address.name
         self.stop = stop or threading.Event()
         self.account = Account()
         self.connected = False
         self.reconnects = 0
+        self.trouble = ""  # why the bus is not connected
+        self.lost = 0  # frames that the kernel dropped
+        self.lag = 0.0  # s that the last frame had waited, against the quickest one
+        self.beat = time.monotonic()  # when the reader last came by; one that hangs does not
+        self._offset = math.inf  # s, host's clock less the interface's
+        self._lost_before = 0
+        self._behind = False
+        self._asked = 0.0
         self._decoder = CanDecoder(channels, dbc)
         self._convert = converter(channels)
+        self._ids = frozenset(self._decoder.ids.tolist())
         self._latency = latency
-        self._open = lambda: open_bus(interface=interface, channel=channel, **options)
+        wanted = opening_options(self.address, sorted(self._ids))
+        self._open = lambda: open_bus(interface=interface, channel=channel, **wanted)
 
     @property
     def tally(self) -> Tally:
@@ -74,14 +92,19 @@ class LiveBus:
         while not self.stop.is_set():
             try:
                 with self._open() as bus:  # type: ignore[no-untyped-call]
-                    self.connected = True
+                    widen(bus)
+                    self._opened(bus)
                     for messages in self._receive(bus):
                         retry = FIRST_RETRY
-                        block = self._convert(self._decoder.decode(frame_block(messages, self.account), self.account))
+                        self._ask(bus)
+                        wanted = self._current(self._wanted(messages))
+                        if not wanted:
+                            continue
+                        block = self._convert(self._decoder.decode(frame_block(wanted, self.account), self.account))
                         if len(block.time):
                             yield block
             except BUS_ERRORS as error:
-                self._lost(error, retry)
+                self._note_loss(error, retry)
                 self.stop.wait(retry)
                 retry = min(2.0 * retry, LAST_RETRY)
             finally:
@@ -90,6 +113,7 @@ class LiveBus:
     def _receive(self, bus: can.BusABC) -> Iterator[list[can.Message]]:
         """Frames collected for one latency; raises what the bus raises."""
         while not self.stop.is_set():
+            self.beat = time.monotonic()
             message = bus.recv(timeout=self._latency)
             if message is None:
                 continue
@@ -105,11 +129,50 @@ class LiveBus:
                 raise
             yield messages
 
-    def _lost(self, error: Exception, retry: float) -> None:
+    def _opened(self, bus: can.BusABC) -> None:
+        self.connected, self.trouble = True, ""
+        self._offset, self._behind, self.lag = math.inf, False, 0.0
+        self._lost_before = lost_by_kernel(bus, self.address)
+
+    def _ask(self, bus: can.BusABC) -> None:
+        """Add what the kernel has dropped since the last look."""
+        now = time.monotonic()
+        if now - self._asked < ASK_SECONDS:
+            return
+        self._asked = now
+        lost = lost_by_kernel(bus, self.address)
+        if lost > self._lost_before:
+            self.lost += lost - self._lost_before
+            self.account.drop(lost - self._lost_before, "dropped by the kernel")
+            self.account.incomplete = True
+        self._lost_before = lost
+
+    def _wanted(self, messages: list[can.Message]) -> list[can.Message]:
+        """Without frames of other ids: on a busy bus most are, and looking closer costs more than they are worth."""
+        ids = self._ids
+        wanted = [m for m in messages if (m.arbitration_id | (EXTENDED if m.is_extended_id else 0)) in ids]
+        self.account.foreign(len(messages) - len(wanted))
+        return wanted
+
+    def _current(self, messages: list[can.Message]) -> list[can.Message]:
+        """The messages, or none of them while the reader is too far behind."""
+        if not messages:
+            return messages
+        waited = time.time() - messages[-1].timestamp
+        self._offset = min(self._offset + OFFSET_DRIFT * self._latency, waited)
+        self.lag = waited - self._offset
+        if self.lag > (CAUGHT_UP_SECONDS if self._behind else BEHIND_SECONDS):
+            self._behind = True
+            self.account.drop(len(messages), "given up by a reader that was behind")
+            self.account.incomplete = True
+            return []
+        self._behind = False
+        return messages
+
+    def _note_loss(self, error: Exception, retry: float) -> None:
         self.reconnects += 1
-        if len(self.account.problems) < KEPT_PROBLEMS:
-            line = str(error).splitlines()[0] if str(error) else type(error).__name__
-            self.account.problem(f"bus {self.name} lost: {line}; trying again in {retry:.1f} s")
+        self.trouble = str(error).splitlines()[0] if str(error) else type(error).__name__
+        self.account.problem(f"bus {self.name} lost: {self.trouble}; trying again in {retry:.1f} s")
 
 
 def frame_block(messages: Sequence[can.Message], account: Account) -> FrameBlock:

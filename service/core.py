@@ -6,18 +6,21 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 
+from sprung import __version__
 from sprung.model.signals import Tally
 from sprung.service.board import Board
 from sprung.service.compute import Compute
+from sprung.service.condition import Condition
 from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
 from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
+from sprung.service.live import LiveFeed
 from sprung.service.metrics import Metrics
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
@@ -26,6 +29,7 @@ from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.windows import latest_window
 from sprung.service.views import VehicleView, vehicle_view
+from sprung.service.vitals import Vitals
 
 log = logging.getLogger("sprung")
 
@@ -46,7 +50,9 @@ class Core:
     diagnosis_jobs: DiagnosisJobs
     housekeeping: Housekeeping
     hub: Hub
+    condition: Condition
     stopping: threading.Event
+    feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
 
     def tally_counter(self, source: str) -> OnTally:
         """A callback that adds to `sprung_frames_total` what a source has read since the last call."""
@@ -96,7 +102,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     diagnoses = Diagnoses(settings, store, rings, jobs)
     listeners += [diagnoses.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
-    return Core(
+    core = Core(
         settings,
         engine,
         store,
@@ -109,8 +115,13 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         diagnosis_jobs,
         housekeeping,
         hub,
+        Condition(settings, store),
         stopping,
     )
+    waiting = {"windows": lambda: compute.waiting, "jobs": lambda: jobs.waiting}
+    vitals = Vitals(__version__, engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
+    metrics.registry.register(vitals)
+    return core
 
 
 def tally_counter(metrics: Metrics, source: str) -> OnTally:

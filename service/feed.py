@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
-from typing import Any, Protocol
+from typing import Any
 
-from sprung.model.signals import SampleBlock, Tally, Window
+from sprung.model.signals import Tally
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Priority
-from sprung.service.errors import Busy
 from sprung.service.pipeline import Batch, Identified, Pipeline
-from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched, windower_of
+from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
 from sprung.service.times import NANOSECONDS
 from sprung.service.worker import Limits
 
@@ -24,17 +22,6 @@ NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
 
 OnBatch = Callable[[Batch], None]
 OnTally = Callable[[Tally], None]
-
-
-class Source(Protocol):
-    """A recording or a live bus."""
-
-    @property
-    def tally(self) -> Tally:
-        """Messages so far, by what became of them."""
-
-    def blocks(self) -> Iterator[SampleBlock]:
-        """Samples in the order in which they come."""
 
 
 @dataclass(slots=True)
@@ -141,36 +128,9 @@ def feed_file(
     return fed
 
 
-def feed_live(pipeline: Pipeline, source: Source, vehicle: str, stopping: threading.Event, on_tally: OnTally) -> None:
-    """Feed a live source until it ends or `stopping` is set; every window as soon as it is whole."""
-    fed = Fed(vehicle)
-    try:
-        for window in _windows(pipeline, _until(source.blocks(), stopping)):
-            _count(fed, pipeline.process(fed.vehicle, [window], None, Priority.LIVE))
-            on_tally(source.tally)
-    except Busy:  # a service that stops accepts nothing more; what it had accepted is stored
-        if not stopping.is_set():
-            raise
-    on_tally(source.tally)
-
-
 def _count(fed: Fed, batch: Batch) -> Batch:
     fed.windows.update(record.outcome for record in batch.records)
     fed.reasons.update(r.reason or "" for r in batch.records if r.outcome == "dropped")
     fed.late += batch.late
     fed.state = batch.state
     return batch
-
-
-def _windows(pipeline: Pipeline, blocks: Iterable[SampleBlock]) -> Iterator[Window]:
-    windower = windower_of(pipeline.engine.system)
-    for block in blocks:
-        yield from windower.push(block)
-    yield from windower.flush()
-
-
-def _until(blocks: Iterable[SampleBlock], stopping: threading.Event) -> Iterator[SampleBlock]:
-    for block in blocks:
-        if stopping.is_set():
-            return
-        yield block

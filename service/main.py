@@ -17,12 +17,15 @@ from typing import NoReturn
 
 import uvicorn
 
+from sprung.replay import UnreadableRecording
+from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
-from sprung.service.feed import Fed, OnBatch, feed_file, feed_live, vehicle_of
+from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
+from sprung.service.live import LiveFeed
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
 from sprung.service.store.work import add_recording
@@ -39,7 +42,7 @@ class Feeds:
 
     files: tuple[Path, ...] = ()
     speed: float = 0.0  # times real time; 0: as fast as possible
-    buses: tuple[str, ...] = ()  # INTERFACE:CHANNEL
+    buses: tuple[str, ...] = ()  # INTERFACE:CHANNEL[,OPTION=VALUE...]
     vehicle: str | None = None
 
 
@@ -58,18 +61,19 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         listening = stack.enter_context(_listen(settings))
         core = build_core(settings, engine)
         stack.callback(core.close)
-        buses = [_bus(core, name) for name in feeds.buses]
-        threads = [threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)]
-        threads += [threading.Thread(target=_feed_bus, args=(core, bus, feeds.vehicle), daemon=True) for bus in buses]
+        core.feeds = [live_feed(core, text, feeds.vehicle) for text in feeds.buses]
+        files = threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)
 
         def start() -> None:
-            for thread in threads:
-                thread.start()
+            files.start()
+            for feed in core.feeds:
+                feed.start()
 
         def stop() -> None:
             core.stopping.set()
-            for thread in threads:
-                thread.join()
+            files.join(settings.shutdown_seconds)
+            for feed in core.feeds:
+                feed.join(settings.shutdown_seconds)
             core.close()
 
         host, port = listening.getsockname()[:2]
@@ -102,21 +106,24 @@ def _listen(settings: Settings) -> socket.socket:
         raise UserError(f"cannot listen on {settings.host}:{settings.port}: {detail}; choose another --port") from error
 
 
-def _bus(core: Core, name: str) -> LiveBus:
-    interface, separator, channel = name.partition(":")
-    if not separator or not interface or not channel:
-        raise UserError(f"--can {name}: give INTERFACE:CHANNEL, as in socketcan:can0")
-    if core.engine.dbc is None:
-        raise UserError(f"--can {name}: a CAN bus needs a CAN database; name it with --dbc")
-    return LiveBus(interface, channel, core.engine.system.channels, core.engine.dbc, stop=core.stopping)
-
-
-def _feed_bus(core: Core, bus: LiveBus, vehicle: str | None) -> None:
-    name = vehicle_of(vehicle, None, bus.name.replace("/", "_"))
+def live_feed(core: Core, text: str, vehicle: str | None) -> LiveFeed:
+    """The feed of a bus, as `--can` names it; raises UserError where there can be none."""
     try:
-        feed_live(core.pipeline, bus, name, core.stopping, core.tally_counter(bus.name))
-    except Exception:
-        log.exception("the feed of %s ended", bus.name)
+        address = parse_bus(text)
+    except UnreadableRecording as error:
+        raise UserError(f"--can: {error}") from None
+    if core.engine.dbc is None:
+        raise UserError(f"--can {text}: a CAN bus needs a CAN database; name it with --dbc")
+    bus = LiveBus(
+        address.interface,
+        address.channel,
+        core.engine.system.channels,
+        core.engine.dbc,
+        stop=core.stopping,
+        **address.options,
+    )
+    name = vehicle_of(vehicle, None, bus.name.replace("/", "_"))
+    return LiveFeed(core.pipeline, bus, name, core.stopping, core.tally_counter(bus.name))
 
 
 def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:

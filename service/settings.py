@@ -47,6 +47,8 @@ class Settings(BaseSettings):
 
     compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503
     job_queue: int = Field(default=16, gt=0)  # uploads and diagnoses waiting before 503
+    min_free_bytes: int = Field(default=200_000_000, ge=0)  # on the disk of data_dir; below, not ready and no uploads
+    max_uploads_bytes: int = Field(default=20_000_000_000, gt=0)  # all uploads and excerpts that are kept
     recording_seconds: float = Field(default=7200.0, gt=0)  # that reading an upload may take in all
     reading_silence_seconds: float = Field(default=60.0, gt=0)  # that it may go on without any sample
     diagnosis_seconds: float = Field(default=600.0, gt=0)

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.model.signals import SampleBlock, Tally
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
 from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
@@ -24,8 +23,9 @@ from sprung.service.core import Core, build_core
 from sprung.service.diagnosing import load_excerpt, save_excerpt
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
-from sprung.service.feed import feed_file, feed_live, prefetched, vehicle_of
-from sprung.service.main import Feeds, _bus
+from sprung.service.feed import feed_file, prefetched, vehicle_of
+from sprung.service.live import LiveFeed
+from sprung.service.main import Feeds, live_feed
 from sprung.service.pipeline import Pipeline
 from sprung.service.ring import Excerpt, Ring, Rings
 from sprung.service.settings import Settings
@@ -192,44 +192,12 @@ def test_more_jobs_than_the_queue_holds_are_refused(client: TestClient, core: Co
     assert answers == [202, 202, 503]
 
 
-class SlowSource:
-    """Blocks that come one at a time, for ever."""
-
-    def __init__(self, channels: int) -> None:
-        self.tally = Tally()
-        self._channels = channels
-
-    def blocks(self) -> Iterator[SampleBlock]:
-        row = 0
-        while True:
-            times = np.full(self._channels, START + row * 10_000_000)
-            self.tally.used += 1
-            row += 1
-            yield SampleBlock(times, np.arange(self._channels, dtype=np.int32), np.full(self._channels, 0.01))
-
-
-def test_a_live_source_stops_when_told_and_what_came_is_stored(core: Core, csv_engine: Engine) -> None:
-    stopping = threading.Event()
-    source = SlowSource(len(csv_engine.system.channels))
-    thread = threading.Thread(
-        target=feed_live, args=(core.pipeline, source, "live", stopping, core.tally_counter("test"))
-    )
-    thread.start()
-    eventually(lambda: any(entry.windows["used"] > 3 for entry in core.board.entries()))
-    stopping.set()
-    thread.join(5)
-    assert not thread.is_alive()
-    assert b'sprung_frames_total{outcome="used",source="test"}' in core.metrics.render()
-    core.close()
-
-
 def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: Path) -> None:
     core = build_core(Settings(data_dir=tmp_path), engine)
     database = cantools.database.load_file(MANCHESTER_DBC)
     bus = LiveBus("virtual", "sprung-test", engine.system.channels, MANCHESTER_DBC, stop=core.stopping)
-    thread = threading.Thread(
-        target=feed_live, args=(core.pipeline, bus, "live", core.stopping, core.tally_counter(bus.name))
-    )
+    feed = LiveFeed(core.pipeline, bus, "live", core.stopping, core.tally_counter(bus.name))
+    core.feeds.append(feed)
     frames = [
         can.Message(
             arbitration_id=message.frame_id,
@@ -238,7 +206,7 @@ def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: 
         )
         for message in database.messages
     ]
-    app = create_app(core, on_start=thread.start)
+    app = create_app(core, on_start=feed.start)
     with TestClient(app) as client, can.Bus(interface="virtual", channel="sprung-test") as sender:
         eventually(lambda: bus.connected)
         begun = time.monotonic()
@@ -250,15 +218,16 @@ def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: 
         eventually(lambda: client.get("/vehicles").json()["vehicles"], seconds=2.0)
         assert time.monotonic() - ended < 2.0
         assert 'source="virtual:sprung-test"' in client.get("/metrics").text
-    thread.join(5)
+        assert client.get("/health/ready").json()["feeds"][0]["state"] == "receiving"
+    assert feed.join(5)
 
 
-@pytest.mark.parametrize("name", ["can0", "virtual:", ":0", "carrier-pigeon:0"])
+@pytest.mark.parametrize("name", ["can0", "virtual:", ":0", "carrier-pigeon:0", "virtual:x,fd"])
 def test_a_bus_that_cannot_be_is_one_clear_line(engine: Engine, tmp_path: Path, name: str) -> None:
     core = build_core(Settings(data_dir=tmp_path), engine)
     try:
         with pytest.raises(ValueError, match="can"):
-            _bus(core, name)
+            live_feed(core, name, None)
     finally:
         core.close()
     assert Feeds().buses == ()

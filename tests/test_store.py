@@ -50,7 +50,7 @@ def test_sqlite_runs_in_wal_mode_with_foreign_keys(store: Store) -> None:
     with store.read() as connection:
         assert connection.execute(text("PRAGMA journal_mode")).scalar_one() == "wal"
         assert connection.execute(text("PRAGMA foreign_keys")).scalar_one() == 1
-        assert connection.execute(text("PRAGMA synchronous")).scalar_one() == 1  # NORMAL
+        assert connection.execute(text("PRAGMA synchronous")).scalar_one() == 2  # FULL
 
 
 def test_opening_again_changes_nothing(tmp_path: Path) -> None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 from fastapi import APIRouter
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
-from sqlalchemy import text
-from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.service.api.access import CoreOf, json_response, read
+from sprung.service.api.access import CoreOf, json_response
 from sprung.service.api.problems import Problem
 
 router = APIRouter(tags=["health"])
@@ -23,14 +23,22 @@ async def live() -> Response:
 
 @router.get("/health/ready", summary="The service can work")
 async def ready(core: CoreOf) -> Response:
-    """503 while the store does not answer or the service is stopping."""
+    """503 with the reason while the store cannot be written, a live feed does not work, or the service is stopping."""
     if core.stopping.is_set():
         raise Problem(503, "the service is stopping", headers={"Retry-After": "5"})
-    try:
-        await read(core, lambda connection: connection.execute(text("SELECT 1")).scalar_one())
-    except SQLAlchemyError as error:
-        raise Problem(503, "the store does not answer", headers={"Retry-After": "5"}) from error
-    return json_response({"status": "ok", "model": core.engine.digest, "waiting": core.compute.waiting})
+    feeds = [feed.status() for feed in core.feeds]
+    troubles = await run_in_threadpool(core.condition.troubles)
+    troubles += [f"feed {feed.name} is {feed.state}: {feed.detail}" for feed in feeds if not feed.works]
+    if troubles:
+        raise Problem(503, "; ".join(troubles)[:1000], headers={"Retry-After": "5"})
+    return json_response(
+        {
+            "status": "ok",
+            "model": core.engine.digest,
+            "waiting": core.compute.waiting,
+            "feeds": [asdict(feed) for feed in feeds],
+        }
+    )
 
 
 @router.get("/metrics", summary="Prometheus metrics")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 from collections.abc import Mapping, Sequence
@@ -12,12 +13,17 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import ValidationError
+from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
+from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 
-from sprung.service.errors import Busy, NotFound, UserError
+from sprung.service.errors import Busy, NoSpace, NotFound, UserError
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
+
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+WAIT = {"Retry-After": "10"}
 
 log = logging.getLogger("sprung.api")
 
@@ -65,13 +71,27 @@ def from_validation(error: ValidationError, prefix: str = "") -> Problem:
     return Problem(422, f"{first['field']}: {first['detail']}{more}", errors)
 
 
+EXPECTED = (
+    Problem,
+    HTTPException,
+    RequestValidationError,
+    UserError,
+    Busy,
+    NotFound,
+    NoSpace,
+    SQLAlchemyError,
+    OSError,
+    MemoryError,
+)
+
+
 def install(app: FastAPI) -> None:
     """Answer every exception of the app with a problem."""
 
     async def on_problem(request: Request, error: Exception) -> Response:
         return problem_response(_as_problem(error), request.url.path)
 
-    for kind in (Problem, HTTPException, RequestValidationError, UserError, Busy, NotFound, Exception):
+    for kind in (*EXPECTED, Exception):
         app.add_exception_handler(kind, on_problem)
 
 
@@ -93,6 +113,30 @@ def _as_problem(error: Exception) -> Problem:
             return Problem(404, str(error))
         case UserError():
             return Problem(422, str(error))
+        case NoSpace():
+            return Problem(507, str(error))
+        case SQLAlchemyError() | OSError() | MemoryError() if found := _resource_problem(error):
+            log.error("%s: %s", found.detail, error)
+            return found
         case _:
             log.error("unexpected error", exc_info=error)
             return Problem(500, "an unexpected error; the service's log has the details")
+
+
+def _resource_problem(error: BaseException) -> Problem | None:
+    """What the machine lacks, as the client should know it; None for an error of another kind."""
+    if isinstance(error, MemoryError):
+        return Problem(503, "the service is out of memory", headers=WAIT)
+    if isinstance(error, OSError):
+        if error.errno in NO_ROOM:
+            return Problem(507, "there is no room left on the service's disk", headers=WAIT)
+        if error.errno in (errno.EMFILE, errno.ENFILE):
+            return Problem(503, "the service has too many files open", headers=WAIT)
+        if error.errno in (errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM):
+            return Problem(503, "the service cannot write to its disk", headers=WAIT)
+        return None
+    if isinstance(error, OperationalError | InterfaceError | PoolTimeout):
+        if "full" in str(error.orig if isinstance(error, DBAPIError) else error):
+            return Problem(507, "there is no room left for the store", headers=WAIT)
+        return Problem(503, "the store does not take anything at the moment", headers=WAIT)
+    return None

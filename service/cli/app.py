@@ -99,7 +99,7 @@ def serve(
     ] = 0.0,
     can: Annotated[
         list[str] | None,
-        typer.Option("--can", help="Live bus, as socketcan:can0 or udp_multicast:239.0.0.1; repeatable."),
+        typer.Option("--can", help="Live bus, as socketcan:can0 or pcan:PCAN_USBBUS1,bitrate=500000; repeatable."),
     ] = None,
     vehicle: Vehicle = None,
 ) -> int:

@@ -18,6 +18,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
 from sprung.service.errors import UserError
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
+PROBE_SECONDS = 2.0
 UPSERT_DIALECTS = ("sqlite", "postgresql")
 
 
@@ -41,6 +42,27 @@ class Store:
             connection.execution_options(sprung_write=True)
             with connection.begin():
                 yield connection
+
+    def probe(self) -> None:
+        """Raises SQLAlchemyError or TimeoutError when nothing can be written now; changes nothing."""
+        if not self._writing.acquire(timeout=PROBE_SECONDS):
+            raise TimeoutError("another transaction has not ended for a while")
+        try:
+            with self.engine.connect() as connection:
+                sqlite_store = connection.dialect.name == "sqlite"
+                if sqlite_store:
+                    connection.exec_driver_sql(f"PRAGMA busy_timeout = {round(1000 * PROBE_SECONDS)}")
+                    connection.rollback()
+                try:
+                    connection.execution_options(sprung_write=True)
+                    with connection.begin() as transaction:
+                        connection.execute(text("SELECT 1"))
+                        transaction.rollback()
+                finally:
+                    if sqlite_store:
+                        connection.exec_driver_sql(f"PRAGMA busy_timeout = {BUSY_MILLISECONDS}")
+        finally:
+            self._writing.release()
 
     def close(self) -> None:
         """Close every connection; SQLite then folds its write-ahead log into the file."""
@@ -120,7 +142,7 @@ def _on_sqlite_connect(connection: Any, _record: Any) -> None:
     for pragma in (
         f"busy_timeout = {BUSY_MILLISECONDS}",
         "journal_mode = WAL",  # readers do not wait for the writer
-        "synchronous = NORMAL",  # with WAL: durable against a crash of the process, consistent against power loss
+        "synchronous = FULL",  # what was acknowledged survives a power cut, too; NORMAL would lose the last seconds
         "foreign_keys = ON",
     ):
         connection.execute(f"PRAGMA {pragma}")

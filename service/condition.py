@@ -1,0 +1,77 @@
+"""What the service needs of the machine: a store that can be written, room on the disk, files that can be opened."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from sprung.service.settings import Settings
+from sprung.service.store import Store
+
+FRESH_SECONDS = 1.0  # that an answer is given again: asking costs a transaction
+DESCRIPTORS = 8  # that must be left
+
+
+class Condition:
+    """Asked by `/health/ready`.  Safe to share between threads."""
+
+    def __init__(self, settings: Settings, store: Store) -> None:
+        self._settings = settings
+        self._store = store
+        self._lock = threading.Lock()
+        self._asked = -1e9
+        self._known: list[str] = []
+
+    def troubles(self) -> list[str]:
+        """One line for everything that is wrong now; takes a second or two when something is."""
+        with self._lock:
+            if time.monotonic() - self._asked > FRESH_SECONDS:
+                self._known = [line for line in (self._store_trouble(), *self._file_troubles()) if line]
+                self._asked = time.monotonic()
+            return list(self._known)
+
+    def _store_trouble(self) -> str:
+        try:
+            self._store.probe()
+        except (SQLAlchemyError, OSError, TimeoutError) as error:
+            return f"the store cannot be written: {_line(error)}"
+        return ""
+
+    def _file_troubles(self) -> list[str]:
+        folder = self._settings.data_dir
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder) as probe:
+                probe.write(b"x")
+            _open_some()
+            free = free_bytes(folder)
+        except OSError as error:
+            return [f"{folder}: {error.strerror or error}"]
+        if free < self._settings.min_free_bytes:
+            return [f"{folder}: {free / 1e6:.0f} MB are free, {self._settings.min_free_bytes / 1e6:.0f} MB are needed"]
+        return []
+
+
+def _open_some() -> None:
+    opened = []
+    try:
+        for _ in range(DESCRIPTORS):
+            opened.append(os.open(os.devnull, os.O_RDONLY))
+    finally:
+        for number in opened:
+            os.close(number)
+
+
+def free_bytes(folder: Path) -> int:
+    """Room on the disk of a folder."""
+    return shutil.disk_usage(folder).free
+
+
+def _line(error: Exception) -> str:
+    return str(getattr(error, "orig", None) or error or type(error).__name__).splitlines()[0]

@@ -1,0 +1,60 @@
+"""Prometheus metrics of the service itself: feeds, queues, disk, build."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Callable, Iterator
+
+import torch
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from sprung.service.live import FeedStatus
+
+STATES = ("receiving", "silent", "behind", "down", "failing", "hung", "ended")
+
+
+class Vitals(Collector):
+    """Reads what it is given at every scrape."""
+
+    def __init__(
+        self, version: str, model: str, feeds: Callable[[], list[FeedStatus]], gauges: dict[str, Callable[[], float]]
+    ) -> None:
+        """gauges: by what waits, as in `windows`, `jobs`."""
+        self._build = {
+            "version": version,
+            "model": model,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+        }
+        self._feeds = feeds
+        self._waiting = gauges
+
+    def describe(self) -> Iterator[Metric]:
+        """Nothing is collected at registration."""
+        return iter(())
+
+    def collect(self) -> Iterator[Metric]:
+        """Families of the service."""
+        yield InfoMetricFamily("sprung_build", "What runs", value=self._build)
+        waiting = GaugeMetricFamily("sprung_queue_length", "Work that waits", labels=["queue"])
+        for name, count in self._waiting.items():
+            waiting.add_metric([name], count())
+        yield waiting
+        yield from _feed_families(self._feeds())
+
+
+def _feed_families(feeds: list[FeedStatus]) -> Iterator[Metric]:
+    state = GaugeMetricFamily("sprung_feed_state", "1 for the state that a live feed is in", labels=["source", "state"])
+    lag = GaugeMetricFamily("sprung_feed_lag_seconds", "Time that the last frame had waited", labels=["source"])
+    lost = CounterMetricFamily("sprung_feed_lost", "What a live feed has lost, by cause", labels=["source", "cause"])
+    restarts = CounterMetricFamily("sprung_feed_restarts", "Begun again: bus, reader or writer", labels=["source"])
+    for feed in feeds:
+        for known in STATES:
+            state.add_metric([feed.name, known], float(feed.state == known))
+        lag.add_metric([feed.name], feed.lag_seconds)
+        lost.add_metric([feed.name, "windows given up"], feed.dropped_windows)
+        lost.add_metric([feed.name, "windows not identified"], feed.failed_windows)
+        lost.add_metric([feed.name, "frames dropped by the kernel"], feed.lost_frames)
+        restarts.add_metric([feed.name], feed.restarts)
+    yield from (state, lag, lost, restarts)
