@@ -60,6 +60,7 @@ class Address(Strict):
     sign: Literal[1, -1] = Field(default=1, description="-1 where the recording counts the other way")
     unit: str | None = Field(default=None, description="of the scaled number; default SI")
     noise: float = Field(default=0.0, ge=0, description="standard deviation of one sample, SI")
+    laws: Laws = ()
     range: tuple[float, float] | None = Field(
         default=None, description="[lowest, highest] possible value, SI; others are taken as missing"
     )
@@ -70,7 +71,6 @@ class Address(Strict):
         if limits is not None and limits[0] >= limits[1]:
             raise ValueError(f"the lowest value {limits[0]:g} is not below the highest {limits[1]:g}")
         return limits
-    laws: Laws = ()
 
     def conversion(self, si: str) -> tuple[float, float]:
         """Gain and offset from the recorded number to `si`; raises UnitError."""

@@ -160,6 +160,41 @@ def diagnose(
 
 
 @app.command()
+def simulate(
+    system_file: Annotated[Path, typer.Argument(help="System file, with laws where it has them.", metavar="SYSTEM")],
+    inputs: Annotated[Path, typer.Option("--inputs", help="Recording whose measured inputs drive the simulation.")],
+    out: Annotated[Path, typer.Option("--out", help="Recording to write: .mcap .csv .blf .asc .log.")],
+    dbc: Dbc = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=NUMBER", help="Another value, as car.mass=34000.")
+    ] = None,
+    noise: Annotated[bool, typer.Option("--noise", help="With the sensors' noise of the system file.")] = False,
+    seed: Annotated[int, typer.Option("--seed", help="Of the noise.")] = 0,
+) -> int:
+    """Write what the sensors of a vehicle with the laws of its system file would measure."""
+    from sprung.service.cli.simulate import simulate as run
+
+    return run(system_file, inputs, out, dbc, settings or [], noise, seed)
+
+
+@app.command()
+def compare(
+    measured: Annotated[Path, typer.Argument(help="Recording.", metavar="A")],
+    other: Annotated[
+        Path, typer.Argument(help="Second recording, or a system file that is simulated on A's inputs.", metavar="B")
+    ],
+    system: System = None,
+    dbc: Dbc = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder for pictures of signals and force loops.")] = None,
+    json_lines: Json = False,
+) -> int:
+    """How far a simulation is from a recording: errors of every sensor, residual spectra, force loops."""
+    from sprung.service.cli.simulate import show as run
+
+    return run(measured, other, system, dbc, out, json_lines)
+
+
+@app.command()
 def system(
     file: Annotated[Path | None, typer.Argument(help="System file; default: the Manchester vehicle.")] = None,
     json_lines: Json = False,
