@@ -24,7 +24,9 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yields the diagnosis and every published value beside the identified one."""
     system = load_system(SYSTEM)
     path = data_file(data, "closed_loop.csv")
-    said = diagnosis_of(system, load_record(path, system.channels, system.sample_rate), path.name, out)
+    said = diagnosis_of(
+        system, load_record(path, system.channels, system.sample_rate, time=system.time), path.name, out
+    )
     yield {
         "verdict": said["verdict"],
         "findings": said["findings"],

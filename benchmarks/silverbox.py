@@ -40,7 +40,7 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
     """
     system = load_system(SYSTEM)
     train = data_file(data, "train.csv")
-    record = load_record(train, system.channels, system.sample_rate)
+    record = load_record(train, system.channels, system.sample_rate, time=system.time)
     said = diagnosis_of(system, record, train.name, out)
     yield {
         "verdict": said["verdict"],
@@ -49,7 +49,7 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         "parameters": {p["name"]: [p["value"], p["std"]] for p in said["augmented"]["parameters"]},
     }
     for name, target in TARGETS.items():
-        test = load_record(data_file(data, name), system.channels, system.sample_rate)
+        test = load_record(data_file(data, name), system.channels, system.sample_rate, time=system.time)
         line: dict[str, Any] = {"file": name, "target_mv": target}
         for key in ("baseline", "augmented"):
             findings = said["findings"] if key == "augmented" else []

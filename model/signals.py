@@ -52,6 +52,9 @@ class TimeColumn:
     rate: float | None = None  # samples per second of a table without times
 
 
+ANY_TIME = TimeColumn()
+
+
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
     """A run of samples in the order in which a reader met them (columnar for speed)."""

@@ -1,4 +1,4 @@
-"""CSV tables: a header row, a column `time` in seconds, the other columns named in the system file."""
+"""Text tables (.csv .tsv .txt .dat): any separator, decimal sign, header, comment lines, units row, kind of time."""
 
 from __future__ import annotations
 
@@ -6,109 +6,167 @@ import csv
 import io
 import warnings
 from collections.abc import Iterator, Sequence
-from difflib import get_close_matches
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from sprung.model.signals import Channel, FloatArray, SampleBlock
+from sprung.model.signals import ANY_TIME, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.csvlayout import COMMENTS, SAMPLE, Layout, cells, is_number, number, sniff
+from sprung.replay.tables import Rows
 
-TIME = "time"
 BATCH_ROWS = 4096
+CHUNK = 1 << 20  # characters that are read at once; a line that is longer is damage
 
 
-def blocks(path: Path, channels: Sequence[Channel], account: Account) -> Iterator[SampleBlock]:
+def blocks(
+    path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn = ANY_TIME
+) -> Iterator[SampleBlock]:
     """Blocks of some thousand rows; empty and NaN cells are missing values, unreadable rows corrupt."""
-    with path.open(encoding="utf-8-sig", errors="replace", newline="") as file:
-        header_line = file.readline()
-        separator = ";" if header_line.count(";") > header_line.count(",") else ","
-        names = [name.strip() for name in next(csv.reader([header_line], delimiter=separator), [])]
-        wanted = _columns(path, names, channels)
-        index = np.array([place for place, _ in wanted], dtype=np.int32)
-        columns = [names.index(TIME), *(column for _, column in wanted)]
-        for name in names:
-            account.contents[name] = 0
-        while lines := list(islice(file, BATCH_ROWS)):
-            yield _block(lines, separator, len(names), columns, index, account)
+    layout, head = read_layout(path)
+    rows = Rows(path, layout.names, layout.units, channels, time, account, headed=layout.headed, csv=True)
+    reader = _Reader(layout, rows, account)
+    if layout.comma:
+        account.note("the decimal sign is a comma")
+    if layout.headed is False:
+        account.note(f"no header: the columns are numbered 1 to {len(layout.names)}")
+    waiting: list[str] = []
+    for number_, line in enumerate(_lines(path, head.encoding, account)):
+        if number_ < layout.skip:
+            continue
+        waiting.append(line)
+        if len(waiting) >= BATCH_ROWS:
+            yield reader.block(waiting)
+            waiting = []
+    if waiting:
+        yield reader.block(waiting)
 
 
-def _columns(path: Path, names: list[str], channels: Sequence[Channel]) -> list[tuple[int, int]]:
-    """(channel, column) of every channel that the table has; raises when it has none or no time."""
-    if TIME not in names:
-        raise UnreadableRecording(f"{path}: no column {TIME!r} (seconds); its columns: {_some(names)}")
-    named = [(place, name) for place, channel in enumerate(channels) if (name := channel.csv or channel.column)]
-    if not named:
-        raise UnreadableRecording(
-            "the system file names no CSV column; give its channels `csv: column` to read CSV recordings"
-        )
-    found = [(place, names.index(column)) for place, column in named if column in names]
-    lacking = [column for _, column in named if column not in names]
-    if not found or any(get_close_matches(column, names, n=1, cutoff=0.8) for column in lacking):
-        near = {column: get_close_matches(column, names, n=2, cutoff=0.3) for column in lacking}
-        hints = "; ".join(f"{column!r} (nearest: {_some(close or names)})" for column, close in near.items())
-        raise UnreadableRecording(f"{path}: columns not found: {hints}")
-    return found
+class Head:
+    """The first lines of a file and their encoding."""
+
+    def __init__(self, path: Path) -> None:
+        with path.open("rb") as file:
+            raw = file.read(CHUNK)
+        self.encoding = _encoding(raw)
+        text = raw.decode(self.encoding, errors="replace")
+        if 20 * text.count("\0") > len(text):
+            raise UnreadableRecording(f"{path}: not a text table (it holds binary data)")
+        lines = text.splitlines()
+        self.lines = lines[: 2 * SAMPLE] if len(raw) < CHUNK or len(lines) > 1 else []
 
 
-def _block(
-    lines: list[str],
-    separator: str,
-    width: int,
-    columns: list[int],
-    index: np.ndarray,
-    account: Account,
-) -> SampleBlock:
-    table = _fast(lines, separator, width, columns)
-    if table is None:
-        table = _careful(lines, separator, width, columns, account)
-    stamped = np.isfinite(table[:, 0])
-    account.corrupt(int((~stamped).sum()), "row without a time")
-    table = table[stamped]
-    values = table[:, 1:]
-    empty = np.isnan(values)
-    account.drop(int(empty.all(axis=1).sum()), "no valid value")
-    account.tally.used += int((~empty.all(axis=1)).sum())
-    account.values["empty or NaN"] += int(empty.sum())
-    time = np.round(table[:, 0] * 1e9).astype(np.int64)
-    return SampleBlock(np.repeat(time, len(index)), np.tile(index, len(table)), values.reshape(-1).copy())
+def read_layout(path: Path) -> tuple[Layout, Head]:
+    """What the table looks like; raises UnreadableRecording when it is none."""
+    head = Head(path)
+    layout = sniff(head.lines)
+    if layout is None:
+        begins = " ".join(head.lines[0].split())[:60] if head.lines else "nothing"
+        raise UnreadableRecording(f"{path}: no rows of numbers in its first lines; it begins with {begins!r}")
+    return layout, head
 
 
-def _fast(lines: list[str], separator: str, width: int, columns: list[int]) -> FloatArray | None:
-    """NumPy's reader for batches in which every cell of the wanted columns is a number."""
-    if any(line.count(separator) != width - 1 or '"' in line for line in lines):
-        return None
+def _encoding(raw: bytes) -> str:
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        return "utf-16"
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            return np.loadtxt(io.StringIO("".join(lines)), delimiter=separator, usecols=columns, ndmin=2, comments=None)
-    except (ValueError, UserWarning):
-        return None
+        raw[:-4].decode("utf-8")
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
 
 
-def _careful(lines: list[str], separator: str, width: int, columns: list[int], account: Account) -> FloatArray:
-    rows = []
-    for row in csv.reader(lines, delimiter=separator):
-        if not row:
-            continue
-        if len(row) != width:
-            account.corrupt(1, "row of the wrong length")
-            continue
+def _lines(path: Path, encoding: str, account: Account) -> Iterator[str]:
+    """The lines of a file, however they end; one that is longer than CHUNK is passed over."""
+    rest, skipping = "", False
+    with path.open(encoding=encoding, errors="replace", newline=None) as file:
+        while chunk := file.read(CHUNK):
+            *complete, rest = (rest + chunk).split("\n")
+            if skipping and complete:
+                complete, skipping = complete[1:], False
+            yield from complete
+            if len(rest) > CHUNK:
+                if not skipping:
+                    account.corrupt(1, "line longer than a mebibyte")
+                rest, skipping = "", True
+    if rest and not skipping:
+        yield rest
+
+
+class _Reader:
+    """Lines to blocks of samples."""
+
+    def __init__(self, layout: Layout, rows: Rows, account: Account) -> None:
+        self.layout, self.rows, self.account = layout, rows, account
+        self.columns = ([] if rows.time is None else [rows.time]) + rows.columns
+        self.written: bool | None = None  # the time is written as a date, not as a number
+
+    def block(self, lines: list[str]) -> SampleBlock:
+        """The rows of some lines."""
+        lines = [line for line in lines if line and not line.startswith(COMMENTS) and not line.isspace()]
+        if self.written is None:
+            self.written = self._is_written(lines)
+        table = None if self.written else self._fast(lines)
+        times: list[str] | None = None
+        if table is None:
+            times, table = self._careful(lines)
+        if self.rows.time is None:
+            return self.rows.block(None, table)
+        if self.written:
+            return self.rows.block(times or [], table)
+        return self.rows.block(table[:, 0], table[:, 1:])
+
+    def _is_written(self, lines: list[str]) -> bool:
+        if self.rows.time is None:
+            return False
+        for line in lines:
+            try:
+                row = cells(line, self.layout.separator)
+            except csv.Error:
+                continue
+            if len(row) == len(self.layout.names) and row[self.rows.time]:
+                return not is_number(row[self.rows.time], self.layout.comma)
+        return False
+
+    def _fast(self, lines: list[str]) -> FloatArray | None:
+        """NumPy's reader for batches in which every cell of the wanted columns is a number."""
+        separator, width = self.layout.separator, len(self.layout.names)
+        text = "\n".join(lines)
+        if '"' in text or "_" in text or not text.isascii():
+            return None
+        if separator is None:
+            if any(len(line.split()) != width for line in lines):
+                return None
+        elif any(line.count(separator) != width - 1 for line in lines):
+            return None
+        if self.layout.comma:
+            text = text.replace(",", ".")
         try:
-            rows.append([_number(row[column]) for column in columns])
-        except ValueError:
-            account.corrupt(1, "cell is no number")
-    return np.array(rows, dtype=np.float64).reshape(-1, len(columns))
+            with warnings.catch_warnings():
+                warnings.simplefilter("error")
+                table = np.loadtxt(io.StringIO(text), delimiter=separator, usecols=self.columns, ndmin=2, comments=None)
+        except (ValueError, UserWarning):
+            return None
+        return np.where(np.isfinite(table), table, np.nan)
 
-
-def _number(cell: str) -> float:
-    text = cell.strip().lower()
-    if text in ("", "nan", "na", "n/a", "null", "none", "-"):
-        return float("nan")
-    value = float(text)
-    return value if np.isfinite(value) else float("nan")
-
-
-def _some(names: list[str]) -> str:
-    return ", ".join(names[:8]) + (" ..." if len(names) > 8 else "")
+    def _careful(self, lines: list[str]) -> tuple[list[str], FloatArray]:
+        """Cell by cell; what cannot be read is counted."""
+        separator, comma, width = self.layout.separator, self.layout.comma, len(self.layout.names)
+        columns = self.columns[1:] if self.written else self.columns
+        rows, times = [], []
+        for line in lines:
+            try:
+                row = cells(line, separator)
+            except csv.Error:
+                row = []
+            if len(row) != width:
+                self.account.corrupt(1, "row of the wrong length")
+                continue
+            try:
+                rows.append([number(row[column], comma) for column in columns])
+            except ValueError:
+                self.account.corrupt(1, "cell is no number")
+                continue
+            if self.written:
+                times.append(row[self.columns[0]])
+        return times, np.array(rows, dtype=np.float64).reshape(-1, len(columns))

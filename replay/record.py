@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from cantools.database import Database
 
-from sprung.model.signals import Channel, FloatArray, SampleBlock
+from sprung.model.signals import ANY_TIME, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import REACH, place, resample
 from sprung.replay.recording import Recording, open_recording
@@ -45,13 +45,15 @@ def load_record(
     time_source: str | Mapping[str, str] = "auto",
     delay: float = 0.5,
     pause: float = 60.0,
+    time: TimeColumn = ANY_TIME,
+    start: int | None = None,
 ) -> Record:
     """Read everything; raises UnreadableRecording.
 
     Nothing is repaired: lost samples are NaN.  When the clock jumps or the sender pauses for more than `pause` s,
     the longest stretch is kept and the others are named in `problems`.
     """
-    recording = open_recording(path, channels, dbc=dbc, time_source=time_source)
+    recording = open_recording(path, channels, dbc=dbc, time_source=time_source, time=time, start=start)
     stretches = _stretches(recording, Order(delay, pause, confirm=max(8, 2 * len(channels))))
     longest = max(stretches, key=lambda block: len(block.time))
     if len(stretches) > 1:

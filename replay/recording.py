@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from cantools.database import Database
 
-from sprung.model.signals import Channel, SampleBlock, Tally
-from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4
+from sprung.model.signals import ANY_TIME, Channel, SampleBlock, Tally, TimeColumn
+from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
 from sprung.replay.plausible import Screen
+from sprung.replay.stamps import ABSOLUTE, SECOND
+from sprung.replay.tables import column_blocks
 
 FrameReader = Callable[[Path, Account], Iterator[FrameBlock]]
 
@@ -24,7 +27,10 @@ CAN_READERS: dict[str, FrameReader] = {
     ".log": candump.frames,
     ".mf4": mf4.frames,
 }
-EXTENSIONS = (".mcap", *CAN_READERS, ".csv")
+TEXT_TABLES = (".csv", ".tsv", ".txt", ".dat")
+PARQUET = (".parquet", ".pq")
+TABLES = (*TEXT_TABLES, *PARQUET, *series.KINDS)
+EXTENSIONS = (".mcap", *CAN_READERS, *TABLES)
 SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
 
 
@@ -34,18 +40,27 @@ class Recording:
     `tally`, `problems`, `vehicle` and `incomplete` are complete when `blocks()` has ended.
     """
 
-    def __init__(self, path: Path, channels: Sequence[Channel], source: Iterator[SampleBlock], account: Account):
+    def __init__(
+        self,
+        path: Path,
+        channels: Sequence[Channel],
+        source: Iterator[SampleBlock],
+        account: Account,
+        start: int | None = None,
+    ) -> None:
         self.path = path
         self.channels = tuple(channels)
         self.account = account
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
         self._source = source
+        self._start = start
         self._screen = Screen(channels, account, converter(channels))
 
     def blocks(self) -> Iterator[SampleBlock]:
         """Blocks in file order; raises UnreadableRecording when none of the channels is in the file, or when it
         gives more samples than its size makes plausible."""
         left = SAMPLES_ALWAYS + SAMPLES_PER_BYTE * self.path.stat().st_size
+        shift: int | None = None
         for raw in self._source:
             left -= len(raw.time)
             if left < 0:
@@ -53,7 +68,9 @@ class Recording:
             block = self._screen.check(raw)
             if len(block.time):
                 self.seen[block.channel[~np.isnan(block.value)]] = True
-                yield block
+                if shift is None:
+                    shift = self._shift(int(block.time.min()))
+                yield SampleBlock(block.time + shift, block.channel, block.value) if shift else block
         self._screen.tell()
         if not self.seen.any():
             raise UnreadableRecording(self._nothing())
@@ -61,6 +78,15 @@ class Recording:
             names = [channel.name for channel, seen in zip(self.channels, self.seen, strict=True) if not seen]
             more = f" and {len(names) - 5} more" if len(names) > 5 else ""
             self.account.problem(f"no values of {', '.join(names[:5])}{more}", incomplete=False)
+
+    def _shift(self, first: int) -> int:
+        """What is added to times that count from a start, ns."""
+        self.account.relative = self.account.relative or abs(first) < ABSOLUTE * SECOND
+        if self._start is None or not self.account.relative:
+            return 0
+        began = datetime.fromtimestamp(self._start / SECOND, UTC).strftime("%Y-%m-%d %H:%M:%S")
+        self.account.note(f"its times count from a start of their own: {began} UTC is taken for it")
+        return self._start - first
 
     def _nothing(self) -> str:
         if self.account.tally.used and self.account.problems:  # the channels are there
@@ -98,12 +124,15 @@ def open_recording(
     *,
     dbc: str | Path | Database | None = None,
     time_source: str | Mapping[str, str] = "auto",
+    time: TimeColumn = ANY_TIME,
+    start: int | None = None,
 ) -> Recording:
     """Choose the reader by the file's extension; raises UnreadableRecording with one line.
 
     `dbc` is the CAN database that CAN recordings need, a file or already loaded.  `time_source` (MCAP): "auto"
     (header stamp where the messages carry one, else publish time), "header", "publish" or "log"; or a table by
-    channel name.
+    channel name.  `time` says where tables keep their times.  `start` (ns since 1970) is when a
+    recording began whose times count from 0; without it such times stay as they are.
     """
     path = Path(path)
     extension = path.suffix.lower()
@@ -114,13 +143,22 @@ def open_recording(
     account = Account()
     if extension == ".mcap":
         source = mcaptopics.blocks(path, channels, account, time_source)
-    elif extension == ".csv":
-        source = csvtable.blocks(path, channels, account)
+    elif extension in TEXT_TABLES:
+        source = csvtable.blocks(path, channels, account, time)
+    elif extension in PARQUET:
+        source = parquet.blocks(path, channels, account, time)
+    elif extension in series.KINDS:
+        source = _series(path, channels, account, time)
     else:
         if dbc is None:
             raise UnreadableRecording(f"{path}: a CAN recording needs a CAN database; name it with --dbc")
         source = _decoded(CAN_READERS[extension](path, account), CanDecoder(channels, dbc), account)
-    return Recording(path, channels, source, account)
+    return Recording(path, channels, source, account, start)
+
+
+def _series(path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn) -> Iterator[SampleBlock]:
+    with series.opened(path) as columns:
+        yield from column_blocks(path, columns, channels, time, account)
 
 
 def _decoded(frames: Iterator[FrameBlock], decoder: CanDecoder, account: Account) -> Iterator[SampleBlock]:

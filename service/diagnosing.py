@@ -86,7 +86,8 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
 def _load(request: DiagnosisRequest) -> Record:
     if request.path.suffix == ".npz":
         return load_excerpt(request.path)
-    return load_record(request.path, request.system.channels, request.system.sample_rate, dbc=request.dbc)
+    system = request.system
+    return load_record(request.path, system.channels, system.sample_rate, dbc=request.dbc, time=system.time)
 
 
 def save_excerpt(path: Path, excerpt: Excerpt) -> None:

@@ -82,16 +82,18 @@ def feed_file(
     on_batch: OnBatch = lambda batch: None,
     on_tally: OnTally = lambda tally: None,
     check: Callable[[], None] = lambda: None,
+    start: int | None = None,
 ) -> Fed:
     """Read a recording to its end, through the pipeline.
 
     file_name: what the user calls the file, where `path` is a name of the service's own.
     speed: times real time; 0: as fast as possible.  limits: read in a process of its own, within these.
+    start: ns since 1970, when the recording began if its times count from 0; else the file's own time is taken.
     check: called while waiting; this stops with whatever it or `on_batch` raises, batches before are stored.
     Raises UnreadableRecording, or UserError where the limits are exceeded.
     """
     system = pipeline.engine.system
-    request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed)
+    request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start)
     reading: Reading = Here(request) if limits is None else Apart(request, limits)
     started = time.perf_counter()
     fed = Fed("")

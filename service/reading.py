@@ -32,6 +32,7 @@ class ReadRequest:
     dbc: Path | None
     batch_windows: int
     speed: float = 0.0  # times real time; 0: as fast as possible
+    start: int | None = None  # ns since 1970, of recordings whose times count from 0; None: as the file's own time
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,8 @@ def windower_of(system: System) -> Windower:
 def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     """Read to the end, handing over pieces of `batch_windows` windows.  Raises UnreadableRecording."""
     system = request.system
-    recording = open_recording(request.path, system.channels, dbc=request.dbc)
+    start = request.path.stat().st_mtime_ns if request.start is None and request.path.is_file() else request.start
+    recording = open_recording(request.path, system.channels, dbc=request.dbc, time=system.time, start=start)
     windower, spans = windower_of(system), Spans()
     held: list[Window] = []
     told = time.monotonic()

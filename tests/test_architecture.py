@@ -11,7 +11,7 @@ ROOT = Path(__file__).parent.parent
 OURS = ("model", "replay", "service", "benchmarks")
 MAY_IMPORT = {
     "model": {"model"},
-    "replay": {"replay", "model.signals"},
+    "replay": {"replay", "model.signals", "model.units"},
     "service": {"service", "model", "replay", "benchmarks"},
     "benchmarks": {"benchmarks", "model", "replay", "service"},
 }

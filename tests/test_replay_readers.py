@@ -182,7 +182,7 @@ def test_wrong_use_is_one_clear_line(tmp_path, dbc):
 
     assert "no such file" in complaint(tmp_path / "none.mcap")
     (tmp_path / "a.xyz").write_bytes(b"1")
-    assert "known are .mcap .blf .asc .log .mf4 .csv" in complaint(tmp_path / "a.xyz")
+    assert "known are .mcap .blf .asc .log .mf4 .csv .tsv .txt .dat .parquet" in complaint(tmp_path / "a.xyz")
     for name in ("a.mcap", "a.blf", "a.asc", "a.log", "a.csv"):
         (tmp_path / name).write_bytes(b"\x00\xff\x13 some other file \x80\n" * 50)
         assert complaint(tmp_path / name, dbc).startswith(str(tmp_path / name))
@@ -192,9 +192,9 @@ def test_wrong_use_is_one_clear_line(tmp_path, dbc):
     assert "needs a CAN database" in complaint(tmp_path / "b.blf")
     write_csv(tmp_path / "b.csv")
     typo = [Channel("left", "m", 1.0, csv="lefd")]
-    assert "'lefd' (nearest: left" in complaint(tmp_path / "b.csv", channels=typo)
-    (tmp_path / "c.csv").write_text("Time,left\n0,1\n")
-    assert "no column 'time'" in complaint(tmp_path / "c.csv")
+    assert "'lefd' (did you mean 'left'?)" in complaint(tmp_path / "b.csv", channels=typo)
+    (tmp_path / "c.csv").write_text("when,left\n0,1\n1,2\n")
+    assert "no column of times is recognised" in complaint(tmp_path / "c.csv")
     for path in (tmp_path / "b.csv", tmp_path / "b.blf"):
         assert "names no" in complaint(path, dbc, [Channel("x", "m", 1.0, mcap="/a.b")])
 

@@ -18,8 +18,10 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Files = Annotated[list[Path], typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4 or CSV.", metavar="FILE...")]
-File = Annotated[Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4 or CSV.", metavar="FILE")]
+Files = Annotated[
+    list[Path], typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables.", metavar="FILE...")
+]
+File = Annotated[Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables.", metavar="FILE")]
 System = Annotated[Path | None, typer.Option("--system", help="System file; default: the Manchester vehicle.")]
 Dbc = Annotated[Path | None, typer.Option("--dbc", help="CAN database; default: the bundled system's.")]
 Weights = Annotated[
@@ -30,6 +32,10 @@ StoreUrl = Annotated[
     typer.Option("--store", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
+Start = Annotated[
+    str | None,
+    typer.Option("--start", help="When the recording began, if its times count from 0; default: the file's own time."),
+]
 Vehicle = Annotated[
     str | None, typer.Option("--vehicle", help="Whose it is; default: as recorded, else the file's name.")
 ]
@@ -59,6 +65,7 @@ def replay(
     weights: Weights = None,
     vehicle: Vehicle = None,
     speed: Annotated[float, typer.Option("--speed", min=0, help="Times real time; 0: as fast as possible.")] = 0.0,
+    start: Start = None,
     json_lines: Json = False,
 ) -> int:
     """Recordings -> windows -> estimates -> drift.
@@ -76,6 +83,7 @@ def replay(
         weights=weights,
         vehicle=vehicle,
         speed=speed,
+        start=start,
         json_lines=json_lines,
     )
 
@@ -149,6 +157,7 @@ def diagnose(
     dbc: Dbc = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the pictures.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Of the recording, in the report.")] = None,
+    start: Start = None,
     json_lines: Json = False,
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
@@ -156,7 +165,7 @@ def diagnose(
     hand_over_often()
     from sprung.service.cli.diagnose import run
 
-    return run(file, system, dbc, out, name, json_lines)
+    return run(file, system, dbc, out, name, start, json_lines)
 
 
 @app.command()

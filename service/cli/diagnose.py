@@ -11,15 +11,23 @@ from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.replay.record import Record, load_record
 from sprung.service.cli.console import errors, silent_stage, stages
+from sprung.service.cli.starts import start_time
 from sprung.service.diagnosing import load_excerpt
 
 
 def run(
-    file: Path, system_file: Path | None, dbc: Path | None, out: Path | None, name: str | None, json_lines: bool
+    file: Path,
+    system_file: Path | None,
+    dbc: Path | None,
+    out: Path | None,
+    name: str | None,
+    start: str | None,
+    json_lines: bool,
 ) -> int:
     """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
     system = load_system(system_file or MANCHESTER)
-    record = load(file, system, dbc or (MANCHESTER_DBC if system_file is None else None))
+    known = dbc or (MANCHESTER_DBC if system_file is None else None)
+    record = load(file, system, known, start_time(start, [file]))
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
     try:
@@ -40,11 +48,11 @@ def run(
     return 0 if report.verdict == "consistent" and not report.advice else 1
 
 
-def load(file: Path, system: System, dbc: Path | None) -> Record:
+def load(file: Path, system: System, dbc: Path | None, start: int | None = None) -> Record:
     """A recording on one even grid; or an excerpt that the service saved."""
     if file.suffix == ".npz":
         return load_excerpt(file)
-    return load_record(file, system.channels, system.sample_rate, dbc=dbc)
+    return load_record(file, system.channels, system.sample_rate, dbc=dbc, time=system.time, start=start)
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from sprung.service.cli.console import parameter_table, print_table, progress
+from sprung.service.cli.starts import start_time
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.feed import Fed, feed_file
@@ -30,12 +31,14 @@ def run(
     weights: Path | None,
     vehicle: str | None,
     speed: float,
+    start: str | None,
     json_lines: bool,
 ) -> int:
     """Replay each file; 1 when a vehicle has alarms or a recording was incomplete."""
     settings = settings_with({"system": system, "dbc": dbc, "store": store, "weights": weights})
     for path in files:
         readable(path)
+    began = start_time(start, files)
     status = 0
     with ExitStack() as stack:
         engine = load_engine(settings)
@@ -49,7 +52,7 @@ def run(
         stack.callback(compute.close)
         pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
         for path in files:
-            fed = _replay(pipeline, opened, path, vehicle, speed, settings.batch_windows, json_lines)
+            fed = _replay(pipeline, opened, path, vehicle, speed, settings.batch_windows, began, json_lines)
             status = max(status, _report(pipeline, path, fed, json_lines))
     return status
 
@@ -67,6 +70,7 @@ def _replay(
     vehicle: str | None,
     speed: float,
     batch_windows: int,
+    start: int | None,
     json_lines: bool,
 ) -> Fed:
     system = pipeline.engine.system
@@ -88,6 +92,7 @@ def _replay(
             recording_id=row.id,
             batch_windows=batch_windows,
             speed=speed,
+            start=start,
             on_batch=on_batch,
         )
     finish_row(store, row, fed)
@@ -104,6 +109,9 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
         print_table(parameter_table(view))
         print(closing_line(pipeline, view, fed))
     complaint = incomplete_line(path, fed)
+    for line in fed.problems:
+        if line not in (complaint or ""):
+            print(f"sprung: {path}: {line}", file=sys.stderr)
     if complaint:
         print(f"sprung: {complaint}", file=sys.stderr)
     return int(bool(complaint) or bool(view.active))
@@ -117,6 +125,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
         "windows": dict(fed.windows),
         "frames": fed.tally.as_dict(),
         "samples": {"expected": fed.expected, "lost": fed.lost},
+        "problems": fed.problems,
         "parameters": [p.as_dict() for p in view.parameters],
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
         "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),

@@ -40,7 +40,7 @@ def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatA
     found = []
     for path in paths:
         windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
-        for block in open_recording(path, system.channels, dbc=dbc).blocks():
+        for block in open_recording(path, system.channels, dbc=dbc, time=system.time).blocks():
             found += [w.values for w in windower.push(block) if w.outcome != "dropped"]
         found += [w.values for w in windower.flush() if w.outcome != "dropped"]
     if not found:

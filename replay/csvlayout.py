@@ -1,0 +1,162 @@
+"""What a text table looks like: separator, decimal sign, lines before the data, header and units."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from sprung.model.units import RAW, known
+from sprung.replay.stamps import is_written
+
+COMMENTS = ("#", "%", "//", "!", "*")
+MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "-nan", "#n/a", "nan.0", "1.#qnan", "-1.#ind"})
+SAMPLE = 200  # lines of data that are looked at
+_NUMBER = re.compile(r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?$", re.ASCII)
+_SPECIAL = re.compile(r"^[+-]?(?:inf|infinity)$", re.IGNORECASE)
+_QUANTITIES = ("m", "m/s", "m/s^2", "rad/s", "N", "Pa", "kg", "s")
+_OTHER_UNITS = frozenset({"degc", "°c", "c", "k", "hz", "deg", "rad", "nm", "w", "kw", "db", "strain", "um/m", "-"})
+_IN_NAME = re.compile(
+    r"^(?P<name>.*?)\s*(?:\[(?P<square>[^\]]*)\]|\((?P<round>[^)]*)\)|(?:/|,\s*|\bin\s+)(?P<bare>\S+))$"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How to read the rows of a table."""
+
+    separator: str | None  # None: runs of blanks
+    comma: bool  # the decimal sign is a comma
+    skip: int  # lines before the first row of data
+    names: tuple[str, ...]  # of the columns; "1", "2", ... when there is no header
+    units: tuple[str | None, ...]  # of the columns, as a row of units or the header says
+    headed: bool
+
+
+def cells(line: str, separator: str | None) -> list[str]:
+    """The cells of one line; raises csv.Error."""
+    if separator is None:
+        return line.split()
+    if '"' not in line:
+        return [cell.strip() for cell in line.split(separator)]
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+
+
+def number(cell: str, comma: bool) -> float:
+    """The value of a cell, NaN where it says that there is none; raises ValueError."""
+    text = cell.replace(",", ".") if comma else cell
+    if _NUMBER.match(text):
+        return float(text.replace("d", "e").replace("D", "e"))
+    if text.lower() in MISSING or _SPECIAL.match(text):
+        return float("nan")
+    raise ValueError(cell)
+
+
+def is_number(cell: str, comma: bool) -> bool:
+    """Whether a cell holds a number."""
+    return _NUMBER.match(cell.replace(",", ".") if comma else cell) is not None
+
+
+def sniff(lines: list[str]) -> Layout | None:
+    """The layout of a table that begins with these lines; None when no rows of numbers are among them."""
+    best: tuple[float, Layout] | None = None
+    for separator, comma in _ways(lines):
+        found = _try(lines, separator, comma)
+        if found is not None and (best is None or found[0] > best[0]):
+            best = found
+    return best[1] if best else None
+
+
+def _ways(lines: list[str]) -> Iterator[tuple[str | None, bool]]:
+    """Separators and decimal signs, likely ones first."""
+    text = "\n".join(lines)
+    for separator in (",", ";", "\t", "|"):
+        if separator in text:
+            yield separator, False
+            if "," in text and (separator != "," or '"' in text):
+                yield separator, True
+    yield None, False
+    if "," in text:
+        yield None, True
+
+
+def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, Layout] | None:
+    """How many cells are understood this way, and the layout."""
+    rows: list[list[str]] = []
+    for line in lines:
+        try:
+            rows.append([] if not line.strip() or line.lstrip().startswith(COMMENTS) else cells(line, separator))
+        except csv.Error:
+            rows.append([])
+    good = [[is_number(cell, comma) or is_written(cell) for cell in row] for row in rows]
+    widths = Counter(len(row) for row, ok in zip(rows, good, strict=True) if any(ok) and 2 * sum(ok) >= len(row))
+    if not widths:
+        return None
+    width = max(widths, key=lambda w: (widths[w] * w, w))
+    of_width = [i for i, row in enumerate(rows) if len(row) == width]
+    numeric = [sum(good[i][c] for i in of_width) > 0.5 * len(of_width) for c in range(width)]
+    if not any(numeric):
+        numeric = [any(good[i][c] for i in of_width) for c in range(width)]
+    first = next((i for i in of_width if _is_data(rows[i], good[i], numeric)), None)
+    if first is None:
+        return None
+    data = [i for i in of_width if i >= first][:SAMPLE]
+    understood = sum(good[i][c] or rows[i][c].lower() in MISSING for i in data for c in range(width))
+    others = sum(len(row) not in (0, width) for row in rows[first:])
+    score = understood - 2.0 * others - 0.5 * sum(len(data) * (not n) for n in numeric)
+    return score, _layout(lines, rows, first, width, separator, comma)
+
+
+def _is_data(row: list[str], good: list[bool], numeric: list[bool]) -> bool:
+    """A row of data has numbers, or nothing, in most of the columns of numbers."""
+    fits = sum(ok or cell.lower() in MISSING for cell, ok, n in zip(row, good, numeric, strict=True) if n)
+    return 2 * fits > sum(numeric) and any(good)
+
+
+def _layout(
+    lines: list[str], rows: list[list[str]], first: int, width: int, separator: str | None, comma: bool
+) -> Layout:
+    """Header and units from the lines before the first row of data."""
+    above = [(i, row) for i, row in enumerate(rows[:first]) if len(row) == width and any(row)]
+    marked = [  # the header may itself be a comment
+        (i, cells(lines[i].lstrip().lstrip("".join(COMMENTS)).strip(), separator))
+        for i in range(first)
+        if not rows[i] and lines[i].lstrip().startswith(COMMENTS) and '"' not in lines[i]
+    ]
+    heads = above or [(i, row) for i, row in marked if len(row) == width]
+    if not heads:
+        return Layout(separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False)
+    names = heads[-1][1]
+    units: list[str | None] = [None] * width
+    if len(heads) > 1 and _are_units(heads[-1][1]):
+        names, units = heads[-2][1], [cell.strip("[]() ") or None for cell in heads[-1][1]]
+    elif len(heads) > 2 and _are_units(heads[-2][1]):  # another row below the units
+        names, units = heads[-3][1], [cell.strip("[]() ") or None for cell in heads[-2][1]]
+    units = [unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True)]
+    return Layout(separator, comma, first, tuple(names), tuple(units), True)
+
+
+def _are_units(row: list[str]) -> bool:
+    """Whether most of a row's cells are names of units."""
+    texts = [cell.strip("[]() ") for cell in row if cell.strip("[]() ")]
+    return bool(texts) and 2 * sum(is_unit(text) or "volt" in text.lower() for text in texts) > len(texts)
+
+
+def is_unit(text: str) -> bool:
+    """Whether this is the name of a unit of measurement."""
+    return text.lower() in _OTHER_UNITS or text in RAW or any(known(text, si) for si in _QUANTITIES)
+
+
+def unit_in(name: str) -> tuple[str, str | None]:
+    """A column's name without the unit that it holds: `Force [kN]`, `Time (ms)`, `x_mm`, `time_ms`, `a / g`."""
+    match = _IN_NAME.match(name.strip())
+    if match:
+        unit = (match["square"] or match["round"] or match["bare"] or "").strip()
+        if unit and (is_unit(unit) or match["square"]):
+            return match["name"].strip(), unit
+    stem, _, last = name.strip().rpartition("_")
+    if stem and last in ("s", "ms", "us", "ns", "mm", "um", "cm", "kN", "N", "g", "bar", "kPa"):
+        return stem, last
+    return name.strip(), None

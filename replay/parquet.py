@@ -1,0 +1,71 @@
+"""Parquet tables (extra `parquet`), through pyarrow, a batch of rows at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sprung.model.signals import Channel, SampleBlock, TimeColumn
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.csvlayout import unit_in
+from sprung.replay.extras import needed
+from sprung.replay.tables import ROWS, Rows
+
+
+def blocks(path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn) -> Iterator[SampleBlock]:
+    """Blocks in the order of the rows."""
+    needed("pyarrow", "parquet", path)
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            rows = Rows(path, names, units(file), channels, time, account)
+            wanted = ([] if rows.time is None else [names[rows.time]]) + [names[i] for i in rows.columns]
+            for batch in file.iter_batches(batch_size=ROWS, columns=list(dict.fromkeys(wanted))):
+                values = np.stack([_floats(batch.column(names[i]), names[i], path) for i in rows.columns], axis=1)
+                yield rows.block(None if rows.time is None else _times(batch.column(names[rows.time])), values)
+    except (pa.ArrowException, OSError) as error:
+        raise UnreadableRecording(f"{path}: not a Parquet file that can be read: {error}") from error
+
+
+def listing(path: Path) -> list[tuple[str, str | None]]:
+    """Name and unit of every column of numbers or times."""
+    needed("pyarrow", "parquet", path)
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with pq.ParquetFile(path) as file:
+            kinds = file.schema_arrow.types
+            numeric = [pa.types.is_floating(k) or pa.types.is_integer(k) or pa.types.is_timestamp(k) for k in kinds]
+            pairs = zip(file.schema_arrow.names, units(file), strict=True)
+            return [pair for pair, keep in zip(pairs, numeric, strict=True) if keep]
+    except (pa.ArrowException, OSError) as error:
+        raise UnreadableRecording(f"{path}: not a Parquet file that can be read: {error}") from error
+
+
+def units(file: Any) -> list[str | None]:
+    """Units of the columns: the field's metadata `unit`, else what the name holds."""
+    found = []
+    for field in file.schema_arrow:
+        stated = (field.metadata or {}).get(b"unit") or (field.metadata or {}).get(b"units")
+        found.append(stated.decode("utf-8", "replace") if stated else unit_in(field.name)[1])
+    return found
+
+
+def _floats(column: Any, name: str, path: Path) -> Any:
+    values = column.to_numpy(zero_copy_only=False)
+    try:
+        return values.astype(np.float64)
+    except (TypeError, ValueError):
+        raise UnreadableRecording(f"{path}: column {name!r} holds {column.type}, not numbers") from None
+
+
+def _times(column: Any) -> Any:
+    values = column.to_numpy(zero_copy_only=False)
+    return values if values.dtype.kind != "O" else [str(cell) for cell in values]

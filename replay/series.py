@@ -1,0 +1,206 @@
+"""Files that hold whole series: MATLAB, HDF5, JSON, UFF 58 and TDMS, each as a list of columns."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sprung.replay.account import UnreadableRecording
+from sprung.replay.extras import needed
+from sprung.replay.stamps import SECOND
+from sprung.replay.tables import Clock, Column, whole
+
+DEEPEST = 8  # structures inside each other
+WIDEST = 512  # columns of one matrix
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[list[Column]]:
+    """The columns of a file, by its extension; they can be read while it is open."""
+    with KINDS[path.suffix.lower()](path) as columns:
+        if not columns:
+            raise UnreadableRecording(f"{path}: it holds no series of numbers")
+        yield columns
+
+
+@contextmanager
+def _mat(path: Path) -> Iterator[list[Column]]:
+    """MATLAB files: version 7.3 is HDF5, older ones are read by SciPy."""
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    with path.open("rb") as file:
+        start = file.read(128)
+    if start.startswith(b"MATLAB 7.3") or start.startswith(b"\x89HDF"):
+        with _hdf5(path) as columns:
+            yield columns
+        return
+    try:
+        content = loadmat(path, simplify_cells=True)
+    except (MatReadError, ValueError, TypeError, OSError, NotImplementedError, IndexError, KeyError, MemoryError) as e:
+        raise UnreadableRecording(f"{path}: not a MATLAB file that can be read: {e}") from e
+    yield list(_flat({k: v for k, v in content.items() if not k.startswith("__")}))
+
+
+@contextmanager
+def _json(path: Path) -> Iterator[list[Column]]:
+    """JSON: an object of arrays, an array of objects, or matrices as arrays of arrays."""
+    try:
+        content = json.loads(path.read_bytes())
+    except (ValueError, RecursionError) as error:
+        raise UnreadableRecording(f"{path}: not JSON that can be read: {error}") from error
+    if isinstance(content, list) and content and isinstance(content[0], Mapping):
+        keys = list(dict.fromkeys(key for row in content if isinstance(row, Mapping) for key in row))
+        content = {key: [row.get(key) if isinstance(row, Mapping) else None for row in content] for key in keys}
+    yield list(_flat(content if isinstance(content, Mapping) else {"data": content}))
+
+
+def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
+    """Every series in nested structures: `rig.force`; columns of matrices as `data(:,2)`."""
+    if isinstance(content, Mapping):
+        if depth < DEEPEST:
+            for key, value in content.items():
+                yield from _flat(value, f"{name}.{key}" if name else str(key), depth + 1)
+        return
+    try:
+        values = np.asarray(content)
+    except ValueError:  # rows of different lengths
+        return
+    if values.dtype.kind == "O":
+        try:
+            values = np.array([np.nan if v is None else v for v in values.ravel()], float).reshape(values.shape)
+        except (TypeError, ValueError):
+            return
+    yield from of_matrix(name, values)
+
+
+def of_matrix(name: str, values: NDArray[Any], unit: str | None = None) -> Iterator[Column]:
+    """A vector, or the columns of a matrix (its rows where it lies on its side), as columns."""
+    if values.dtype.kind not in "fiubUM" or values.ndim not in (1, 2) or max(values.shape, default=0) < 2:
+        return
+    if values.ndim == 1 or 1 in values.shape:
+        yield whole(name, values.reshape(-1), unit)
+        return
+    upright = values if values.shape[0] >= values.shape[1] else values.T
+    if upright.shape[1] <= WIDEST:
+        for i in range(upright.shape[1]):
+            yield whole(f"{name}(:,{i + 1})", upright[:, i], unit)
+
+
+@contextmanager
+def _hdf5(path: Path) -> Iterator[list[Column]]:
+    """HDF5 and MATLAB 7.3: `group/data`, read piece by piece; compound tables as `table.column`."""
+    needed("h5py", "hdf5", path)
+    import h5py
+
+    try:
+        file = h5py.File(path, "r")
+    except (OSError, RuntimeError) as error:
+        raise UnreadableRecording(f"{path}: not an HDF5 file that can be read: {error}") from error
+    with file:
+        found: list[Column] = []
+
+        def visit(name: str, item: Any) -> None:
+            if isinstance(item, h5py.Dataset) and not name.startswith("#"):
+                found.extend(_datasets(name, item))
+
+        file.visititems(visit)
+        yield found
+
+
+def _datasets(name: str, item: Any) -> Iterator[Column]:
+    unit = item.attrs.get("unit", item.attrs.get("units"))
+    unit = unit.decode("utf-8", "replace") if isinstance(unit, bytes) else unit if isinstance(unit, str) else None
+    if item.dtype.names and item.ndim == 1:
+        for field in item.dtype.names:
+            if item.dtype[field].kind in "fiub":
+                yield Column(f"{name}.{field}", len(item), _field(item, field), unit)
+        return
+    if item.dtype.kind not in "fiub" or item.ndim not in (1, 2) or max(item.shape, default=0) < 2:
+        return
+    if item.ndim == 1:
+        yield Column(name, len(item), lambda a, b: item[a:b], unit)
+        return
+    length, width, lying = max(item.shape), min(item.shape), item.shape[0] < item.shape[1]
+    for i in range(width if width <= WIDEST else 0):
+        read = _across(item, i) if lying else _down(item, i)
+        yield Column(name if width == 1 else f"{name}(:,{i + 1})", length, read, unit)
+
+
+Read = Callable[[int, int], NDArray[Any]]
+
+
+def _field(item: Any, field: str) -> Read:
+    return lambda a, b: item[a:b][field]
+
+
+def _across(item: Any, i: int) -> Read:
+    return lambda a, b: item[i, a:b]
+
+
+def _down(item: Any, i: int) -> Read:
+    return lambda a, b: item[a:b, i]
+
+
+@contextmanager
+def _tdms(path: Path) -> Iterator[list[Column]]:
+    """National Instruments TDMS: `group/channel`, with the waveform's start and increment where it has them."""
+    needed("nptdms", "tdms", path)
+    from nptdms import TdmsFile
+
+    try:
+        file = TdmsFile.open(path)
+    except Exception as error:  # the library raises many kinds
+        raise UnreadableRecording(f"{path}: not a TDMS file that can be read: {error}") from error
+    with file:
+        columns = []
+        for group in file.groups():
+            for channel in group.channels():
+                said = channel.properties
+                if channel.data_type is None or len(channel) < 2:
+                    continue
+                unit = said.get("unit_string") or said.get("Unit") or said.get("NI_UnitDescription")
+                name = f"{group.name}/{channel.name}"
+                columns.append(Column(name, len(channel), _reader(channel), unit or None, _waveform(said)))
+        yield columns
+
+
+def _reader(channel: Any) -> Read:
+    return lambda a, b: channel.read_data(a, b - a)
+
+
+def _waveform(said: Mapping[str, Any]) -> Clock | None:
+    step = float(said.get("wf_increment") or 0.0)
+    if not step > 0:
+        return None
+    start = said.get("wf_start_time")
+    offset = round(float(said.get("wf_start_offset") or 0.0) * SECOND)
+    if start is None:
+        return Clock(offset, step, True)
+    began = int(np.datetime64(start).astype("datetime64[ns]").astype(np.int64))
+    return Clock(began + offset, step, began < 0)
+
+
+@contextmanager
+def _uff(path: Path) -> Iterator[list[Column]]:
+    from sprung.replay import uff
+
+    yield uff.columns(path)
+
+
+KINDS: dict[str, Callable[[Path], Any]] = {
+    ".mat": _mat,
+    ".json": _json,
+    ".h5": _hdf5,
+    ".hdf5": _hdf5,
+    ".hdf": _hdf5,
+    ".tdms": _tdms,
+    ".uff": _uff,
+    ".unv": _uff,
+}

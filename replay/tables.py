@@ -1,0 +1,309 @@
+"""What all tabular files share: finding columns and the time, and putting columns into blocks of samples."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sprung.model.signals import Channel, FloatArray, IntArray, SampleBlock, TimeColumn
+from sprung.model.units import FACTORS, known
+from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.csvlayout import unit_in
+from sprung.replay.stamps import SECOND, Stamps
+
+ROWS = 16_384  # that are handed out together
+MOST_COLUMNS = 10_000
+TIME_NAMES = (
+    *("time", "t", "timestamp", "timestamps", "time stamp", "datetime", "date time", "date/time", "seconds", "secs"),
+    *("sec", "elapsed time", "elapsed", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "x_time", "rel time"),
+    *("time_s", "t_s", "epoch", "unix time", "utc", "stamp"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Even times that a file states for a column by itself."""
+
+    start: int  # ns since the Unix epoch, or from the start of the measurement
+    step: float  # s
+    relative: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One series of a file that holds whole series."""
+
+    name: str
+    length: int
+    read: Callable[[int, int], NDArray[Any]]  # rows a to b
+    unit: str | None = None
+    clock: Clock | None = None
+
+    @property
+    def group(self) -> str:
+        """What stands before the last part of its name."""
+        cut = max(self.name.rfind("/"), self.name.rfind("."))
+        return self.name[: cut + 1]
+
+
+def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: Clock | None = None) -> Column:
+    """A column whose values are in memory."""
+    return Column(name, len(values), lambda a, b: values[a:b], unit, clock)
+
+
+def time_name(names: Sequence[str], time: TimeColumn, headed: bool = True) -> str | None:
+    """The column that holds the time; None when there is none."""
+    if time.name is not None or time.rate is not None:
+        return time.name
+    if not headed:
+        return names[0] if names else None
+    plain = {unit_in(name)[0].strip().lower().replace("-", " "): name for name in reversed(names)}
+    plain |= {name.strip().lower(): name for name in reversed(names)}
+    return next((plain[word] for word in TIME_NAMES if word in plain), None)
+
+
+def position(name: str, names: Sequence[str]) -> int | None:
+    """Where a column is: by its name, else by its number from 1; raises UnreadableRecording when two have the name."""
+    count = names.count(name) if isinstance(names, (list, tuple)) else 0
+    if count > 1:
+        at = [str(i + 1) for i, other in enumerate(names) if other == name]
+        raise UnreadableRecording(
+            f"{count} columns are called {name!r}; say which by its number: `column: {at[0]}` or {', '.join(at[1:])}"
+        )
+    if count:
+        return names.index(name)
+    if name.isascii() and name.isdigit() and 1 <= int(name) <= len(names):
+        return int(name) - 1
+    return None
+
+
+def find_columns(
+    path: Path, names: Sequence[str], channels: Sequence[Channel], account: Account, *, csv: bool = False
+) -> list[tuple[int, int]]:
+    """(channel, column) of every channel that the table has.
+
+    Errors: UnreadableRecording when it has none, or when a name is nearly that of a column that nothing else uses.
+    """
+    wanted = [(i, (c.csv or c.column) if csv else (c.column or c.csv)) for i, c in enumerate(channels)]
+    named = [(place, name) for place, name in wanted if name]
+    if not named:
+        key = "`csv: name`" if csv else "`column: name`"
+        raise UnreadableRecording(f"{path}: the system file names no columns; give its channels {key} to read tables")
+    found: list[tuple[int, int]] = []
+    lacking: list[tuple[int, str]] = []
+    for place, name in named:
+        try:
+            at = position(name, list(names))
+        except UnreadableRecording as error:
+            raise UnreadableRecording(f"{path}: {error}") from None
+        found.append((place, at)) if at is not None else lacking.append((place, name))
+    free = [name for i, name in enumerate(names) if i not in {at for _, at in found}]
+    near = {name: difflib.get_close_matches(name, free, n=3, cutoff=0.6) for _, name in lacking}
+    if not found or any(near.values()):
+        hints = "; ".join(
+            f"{name!r}{' (did you mean ' + some([repr(n) for n in close], ' or ') + '?)' if close else ''}"
+            for name, close in near.items()
+        )
+        raise UnreadableRecording(f"{path}: columns not found: {hints}; its columns: {some(names)}")
+    for place, name in lacking:
+        account.note(f"no column {name!r} for {channels[place].name}")
+    return [(place, at) for place, at in found]
+
+
+def no_time(path: Path, names: Sequence[str], time: TimeColumn) -> UnreadableRecording:
+    """The error of a table whose time cannot be found."""
+    if time.name is not None:
+        near = difflib.get_close_matches(time.name, list(names), n=1, cutoff=0.5)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        return UnreadableRecording(f"{path}: no time column {time.name!r}{hint}; its columns: {some(names)}")
+    return UnreadableRecording(
+        f"{path}: no column of times is recognised; say `time: {{column: NAME, unit: s}}` or "
+        f"`time: {{rate: HZ}}` in the system file; its columns: {some(names)}"
+    )
+
+
+def some(names: Sequence[str], between: str = ", ") -> str:
+    """A few of them."""
+    return between.join(names[:12]) + (f" and {len(names) - 12} more" if len(names) > 12 else "")
+
+
+def seconds_of(unit: str | None) -> float | None:
+    """A unit of time, s; None when it is none."""
+    name = known(unit, "s") if unit else None
+    return FACTORS["s"].get(name) if name else None
+
+
+class Rows:
+    """A table that comes row by row: its time and the columns that are wanted."""
+
+    def __init__(
+        self,
+        path: Path,
+        names: Sequence[str],
+        units: Sequence[str | None],
+        channels: Sequence[Channel],
+        time: TimeColumn,
+        account: Account,
+        *,
+        headed: bool = True,
+        csv: bool = False,
+    ) -> None:
+        if len(names) > MOST_COLUMNS:
+            raise UnreadableRecording(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are read")
+        for name in names:
+            account.contents[name] = 0
+        self.account, self.rate = account, time.rate
+        self.time: int | None = None
+        if time.rate is None:
+            named = time_name(names, time, headed)
+            self.time = None if named is None else position(named, list(names))
+            if self.time is None:
+                raise no_time(path, names, time)
+        found = find_columns(path, names, channels, account, csv=csv)
+        self.columns = [column for _, column in found]
+        self._index = np.array([place for place, _ in found], dtype=np.int32)
+        unit = None if self.time is None else seconds_of(units[self.time])
+        self._stamps = Stamps(time, unit, account)
+        self._rows = 0
+        if self.time is None:
+            account.relative = True
+
+    def block(self, times: NDArray[Any] | Sequence[str] | None, values: FloatArray) -> SampleBlock:
+        """Rows (n, columns) with their times; None: the rate says when they were."""
+        if times is None:
+            stamps: IntArray = np.rint((self._rows + np.arange(len(values))) * (SECOND / float(self.rate or 1))).astype(
+                np.int64
+            )
+            good = np.ones(len(values), dtype=bool)
+        else:
+            stamps, good = self._stamps.nanoseconds(times)
+        self._rows += len(values)
+        self.account.corrupt(int((~good).sum()), "row without a time")
+        stamps, values = stamps[good], values[good]
+        empty = np.isnan(values)
+        self.account.drop(int(empty.all(axis=1).sum()), "no valid value")
+        self.account.tally.used += int((~empty.all(axis=1)).sum())
+        self.account.values["empty or NaN"] += int(empty.sum())
+        index = np.tile(self._index, len(values))
+        return SampleBlock(np.repeat(stamps, len(self._index)), index, values.reshape(-1).copy())
+
+
+def column_blocks(
+    path: Path, columns: Sequence[Column], channels: Sequence[Channel], time: TimeColumn, account: Account
+) -> Iterator[SampleBlock]:
+    """Blocks of a file of whole series, which may have times of their own; in time order across them."""
+    names = [column.name for column in columns]
+    for column in columns:
+        account.contents[column.name] = column.length
+    found = find_columns(path, names, channels, account)
+    by_time: dict[Any, list[tuple[int, Column]]] = {}
+    for place, at in found:
+        by_time.setdefault(_time_of(path, columns[at], columns, time), []).append((place, columns[at]))
+    series = [_Series(key, members, time, account) for key, members in by_time.items()]
+    while any(one.more() for one in series):
+        waiting = [one for one in series if one.more()]
+        horizon = min(one.last for one in waiting)
+        parts = [part for one in waiting for part in one.until(horizon)]
+        block = SampleBlock(
+            np.concatenate([part.time for part in parts]),
+            np.concatenate([part.channel for part in parts]),
+            np.concatenate([part.value for part in parts]),
+        )
+        order = np.argsort(block.time, kind="stable") if len(waiting) > 1 else slice(None)
+        yield SampleBlock(block.time[order], block.channel[order], block.value[order])
+
+
+def _time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | Clock:
+    """The times of a column: what the system file says, a time column of its length in its group or anywhere, else
+    its own clock."""
+    if time.rate is not None:
+        return Clock(0, 1.0 / time.rate, True)
+    if column.clock is not None and time.name is None:
+        return column.clock
+    names = [one.name for one in columns if one.length == column.length]
+    near = [name for name in names if name.startswith(column.group) and "/" not in name[len(column.group) :]]
+    chosen = None
+    if time.name is not None:
+        chosen = next((name for name in (column.group + time.name, time.name) if name in names), None)
+        if chosen is None and any(one.name == time.name for one in columns):
+            length = next(one.length for one in columns if one.name == time.name)
+            raise UnreadableRecording(
+                f"{path}: {column.name} has {column.length} values, its time {time.name} has {length}"
+            )
+    else:
+        for group in (near, names):
+            short = {name.rsplit("/", 1)[-1].rsplit(".", 1)[-1]: name for name in group}
+            chosen = short.get(time_name(list(short), time) or "")
+            if chosen:
+                break
+    if chosen is None:
+        if column.clock is not None:
+            return column.clock
+        raise no_time(path, [one.name for one in columns], time)
+    return next(one for one in columns if one.name == chosen)
+
+
+class _Series:
+    """Columns that share their times, read piece by piece."""
+
+    def __init__(
+        self, time: Column | Clock, members: list[tuple[int, Column]], key: TimeColumn, account: Account
+    ) -> None:
+        self.time, self.members, self.account = time, members, account
+        self.length = min(column.length for _, column in members)
+        unit = None
+        if isinstance(time, Column):
+            unit = seconds_of(time.unit) or seconds_of(unit_in(time.name.rsplit("/", 1)[-1])[1])
+        self._stamps = Stamps(key, unit, account)
+        self._epoch = key.epoch or 0
+        self._at = 0
+        self._held: list[SampleBlock] = []
+        if isinstance(time, Clock):
+            account.relative = account.relative or (time.relative and key.epoch is None)
+
+    def more(self) -> bool:
+        """Whether something is left; reads on when nothing is held."""
+        while not self._held and self._at < self.length:
+            block = self._read()
+            if len(block.time):
+                self._held = [block]
+        return bool(self._held)
+
+    @property
+    def last(self) -> int:
+        """The latest time that is held."""
+        return int(self._held[0].time.max())
+
+    def until(self, horizon: int) -> list[SampleBlock]:
+        """What is held up to a time."""
+        block = self._held[0]
+        now = block.time <= horizon
+        if now.all():
+            self._held = []
+            return [block]
+        self._held = [SampleBlock(block.time[~now], block.channel[~now], block.value[~now])]
+        return [SampleBlock(block.time[now], block.channel[now], block.value[now])]
+
+    def _read(self) -> SampleBlock:
+        a, b = self._at, min(self._at + ROWS, self.length)
+        self._at = b
+        if isinstance(self.time, Clock):
+            shift = self._epoch if self.time.relative else 0
+            stamps = self.time.start + shift + np.rint(np.arange(a, b) * (self.time.step * SECOND)).astype(np.int64)
+            good = np.ones(b - a, dtype=bool)
+        else:
+            stamps, good = self._stamps.nanoseconds(self.time.read(a, b))
+        self.account.corrupt(int((~good).sum()), "row without a time")
+        values = np.stack([np.asarray(c.read(a, b), dtype=np.float64) for _, c in self.members], axis=1)[good]
+        empty = np.isnan(values)
+        self.account.drop(int(empty.all(axis=1).sum()), "no valid value")
+        self.account.tally.used += int((~empty.all(axis=1)).sum())
+        self.account.values["empty or NaN"] += int(empty.sum())
+        index = np.array([place for place, _ in self.members], dtype=np.int32)
+        return SampleBlock(np.repeat(stamps[good], len(index)), np.tile(index, len(values)), values.reshape(-1).copy())

@@ -1,0 +1,177 @@
+"""Universal File Format, dataset 58 (functions at nodal degrees of freedom), text and binary (58b): time responses.
+
+Layout: https://www.ceas3.uc.edu/sdrluff/ (Structural Dynamics Research Laboratory, University of Cincinnati), datasets
+58 and 58b; units: dataset 164.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sprung.replay.account import UnreadableRecording
+from sprung.replay.stamps import SECOND
+from sprung.replay.tables import Clock, Column, whole
+
+BORDER = b"    -1"
+TIME_RESPONSE, TIME = 1, 17  # function type; specific data type of the abscissa
+KINDS = {2: ("f4", 1), 4: ("f8", 1), 5: ("f4", 2), 6: ("f8", 2)}  # ordinate: type, numbers per value
+DIRECTIONS = {0: "", 1: "+X", -1: "-X", 2: "+Y", -2: "-Y", 3: "+Z", -3: "-Z"}
+DIRECTIONS |= {4: "+RX", -4: "-RX", 5: "+RY", -5: "-RY", 6: "+RZ", -6: "-RZ"}
+_DATES = ("%d-%b-%y %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%d-%b-%y", "%Y-%m-%d %H:%M:%S", "%Y-%m-%dT%H:%M:%S")
+
+
+@dataclass(frozen=True, slots=True)
+class _Function:
+    """One dataset 58."""
+
+    title: str
+    place: str  # node and direction
+    unit: str | None
+    clock: Clock | None  # None: uneven, `times` holds them
+    times: NDArray[np.float64] | None  # s
+    values: NDArray[np.float64]
+
+
+def columns(path: Path) -> list[Column]:
+    """The time responses of a file, named by node and direction (`12+Z`), else by their first line of text."""
+    data = path.read_bytes()
+    if BORDER not in data[:4096]:
+        raise UnreadableRecording(f"{path}: not a universal file (no '    -1' line at its beginning)")
+    try:
+        functions = [found for found in _datasets(data) if found is not None]
+    except (ValueError, IndexError) as error:
+        raise UnreadableRecording(f"{path}: a damaged dataset 58: {error}") from error
+    if not functions:
+        raise UnreadableRecording(f"{path}: no time responses (dataset 58, function type 1) in it")
+    places, titles = Counter(f.place for f in functions), Counter(f.title for f in functions)
+    out: list[Column] = []
+    for i, f in enumerate(functions):
+        name = f.place if f.place and places[f.place] == 1 else f.title
+        if not name or (name == f.title and titles[f.title] > 1):
+            name = f"{f.place or f.title or 'response'} #{i + 1}"
+        if f.times is None:
+            out.append(whole(name, f.values, f.unit, f.clock))
+        else:
+            out += [whole(f"{name}/time", f.times, "s"), whole(f"{name}/value", f.values, f.unit)]
+    return out
+
+
+def _datasets(data: bytes) -> Iterator[_Function | None]:
+    """Every dataset 58 of a file; other datasets are passed over."""
+    at = 0
+    while (start := _border(data, at)) is not None:
+        head, at = _line(data, start)
+        kind = head[:6].split()
+        if not kind or kind[0] not in (b"58", b"58b"):
+            end = _border(data, at)
+            at = len(data) if end is None else end
+            continue
+        lines: list[bytes] = []
+        for _ in range(11):
+            line, at = _line(data, at)
+            lines.append(line)
+        if head[6:7].lower() == b"b" or kind[0] == b"58b":
+            size = int(head[31:43])
+            body, at = data[at : at + size], at + size
+            order = "<" if int(head[7:13]) == 1 else ">"
+            if int(head[13:19]) != 2:
+                raise ValueError("its numbers are not in IEEE 754")
+            yield _function(lines, _binary(lines, body, order))
+        else:
+            end = _border(data, at)
+            body = data[at : len(data) if end is None else data.rindex(BORDER, at, end)]
+            yield _function(lines, _text(lines, body))
+            at = len(data) if end is None else end
+            continue
+        end = _border(data, at)
+        at = len(data) if end is None else end
+
+
+def _border(data: bytes, at: int) -> int | None:
+    """The byte after the next line that holds nothing but -1."""
+    while (found := data.find(BORDER, at)) >= 0:
+        line, after = _line(data, found)
+        if line.strip() == b"-1" and (found == 0 or data[found - 1 : found] in (b"\n", b"\r")):
+            return after
+        at = found + len(BORDER)
+    return None
+
+
+def _line(data: bytes, at: int) -> tuple[bytes, int]:
+    end = data.find(b"\n", at)
+    end = len(data) if end < 0 else end
+    return data[at:end].rstrip(b"\r"), end + 1
+
+
+def _text(lines: list[bytes], body: bytes) -> NDArray[np.float64]:
+    """Numbers of fixed width (two of them may touch: -1.0E+00-2.0E+00)."""
+    kind, _, even = _shape(lines)
+    widths = {("f4", True): [13], ("f8", True): [20], ("f4", False): [13], ("f8", False): [13, 20]}
+    pattern = widths[KINDS[kind][0], even]
+    out = []
+    for line in body.splitlines():
+        at = turn = 0
+        while line[at:].strip():
+            width = pattern[turn % len(pattern)]
+            out.append(float(line[at : at + width].replace(b"D", b"E")))
+            at, turn = at + width, turn + 1
+    return np.array(out)
+
+
+def _binary(lines: list[bytes], body: bytes, order: str) -> NDArray[np.float64]:
+    kind, count, even = _shape(lines)
+    letter, per = KINDS[kind]
+    if even or letter == "f4":
+        return np.frombuffer(body[: len(body) // int(letter[1]) * int(letter[1])], dtype=order + letter).astype(float)
+    pair = np.dtype([("x", order + "f4"), ("y", order + letter, (per,))])
+    pairs = np.frombuffer(body[: count * pair.itemsize], dtype=pair)
+    return np.column_stack([pairs["x"].astype(float), pairs["y"]]).reshape(-1)
+
+
+def _shape(lines: list[bytes]) -> tuple[int, int, bool]:
+    """Kind of the ordinate, number of values, and whether the abscissa is even."""
+    record = lines[6]
+    kind, count, even = int(record[:10]), int(record[10:20]), int(record[20:30]) == 1
+    if kind not in KINDS:
+        raise ValueError(f"unknown kind of data {kind}")
+    return kind, count, even
+
+
+def _function(lines: list[bytes], numbers: NDArray[np.float64]) -> _Function | None:
+    """A time response; None for spectra, frequency responses and complex functions."""
+    text = [line.decode("latin-1") for line in lines]
+    kind, count, even = _shape(lines)
+    function, abscissa = int(text[5][:5] or 0), int(text[7][:10] or 0)
+    if function not in (0, TIME_RESPONSE) or abscissa not in (0, TIME) or KINDS[kind][1] != 1:
+        return None
+    first, step = float(text[6][30:43] or 0), float(text[6][43:56] or 0)
+    unit = text[8][47:67].strip() if len(text[8]) > 47 else ""
+    node, direction = int(text[5][41:51] or 0), int(text[5][51:55] or 0)
+    place = f"{node}{DIRECTIONS.get(direction, '')}" if node else ""
+    label = unit if unit.upper() != "NONE" else ""
+    title = text[0].strip() if text[0].strip().upper() != "NONE" else ""
+    began = _instant(text[2])
+    if not even:
+        pairs = numbers[: 2 * count].reshape(-1, 2)
+        return _Function(title, place, label or None, None, pairs[:, 0], pairs[:, 1])
+    if not step > 0:
+        raise ValueError("its time step is not positive")
+    clock = Clock((began or 0) + round(first * SECOND), step, began is None)
+    return _Function(title, place, label or None, clock, None, numbers[:count])
+
+
+def _instant(text: str) -> int | None:
+    """The date in the third line, ns since 1970."""
+    for form in _DATES:
+        try:
+            return int(datetime.strptime(text.strip(), form).replace(tzinfo=UTC).timestamp()) * SECOND
+        except ValueError:
+            continue
+    return None

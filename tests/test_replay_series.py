@@ -1,0 +1,230 @@
+"""The same record as Parquet, MATLAB, HDF5, JSON, UFF and TDMS, written by the libraries that others use."""
+
+import json
+from datetime import UTC, datetime
+
+import numpy as np
+import pytest
+import scipy.io
+
+from sprung.model.signals import Channel, TimeColumn
+from sprung.replay import UnreadableRecording, open_recording, series
+from sprung.replay.extras import needed
+from sprung.replay.record import load_record
+from tests.test_replay_tables import SECONDS, START, VALUES, F, X, check, read
+
+h5py = pytest.importorskip("h5py")
+pa = pytest.importorskip("pyarrow")
+nptdms = pytest.importorskip("nptdms")
+import pyarrow.parquet as pq  # noqa: E402
+
+COLUMNS = {"time": SECONDS, "x": VALUES[:, 0], "F": VALUES[:, 1]}
+
+
+def write_mat(path):
+    scipy.io.savemat(path, {**COLUMNS, "rate": 100.0, "title": "damper"})
+
+
+def write_hdf5(path):
+    with h5py.File(path, "w") as file:
+        for name, values in COLUMNS.items():
+            file[name] = values
+
+
+def write_mat73(path):
+    """MATLAB writes version 7.3 as HDF5 behind a header of 512 bytes, its vectors as rows of one column."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in COLUMNS.items():
+            file[name] = values[None, :]
+        file["#refs#/a"] = np.arange(7.0)
+    with path.open("r+b") as raw:
+        raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
+
+
+def write_parquet(path):
+    pq.write_table(pa.table(COLUMNS), path, row_group_size=128)
+
+
+def write_json(path):
+    path.write_text(json.dumps({name: values.tolist() for name, values in COLUMNS.items()}))
+
+
+WRITERS = {
+    "a.parquet": write_parquet,
+    "a.mat": write_mat,
+    "b.mat": write_mat73,
+    "a.h5": write_hdf5,
+    "a.hdf5": write_hdf5,
+    "a.json": write_json,
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_of_series_gives_the_same_samples(tmp_path, name):
+    WRITERS[name](tmp_path / name)
+    assert check(tmp_path / name).relative
+    record = load_record(tmp_path / name, (X, F), 100.0)
+    assert np.array_equal(record.values, VALUES)
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_path, name):
+    WRITERS[name](tmp_path / name)
+    with pytest.raises(UnreadableRecording, match=r"columns not found: 'Fx'.*(its columns|did you mean)") as error:
+        read(tmp_path / name, (Channel("F", "N", 1.0, column="Fx"),))
+    assert "\n" not in str(error.value)
+    for damage in (b"", b"no such format" * 40, (tmp_path / name).read_bytes()[:700]):
+        (tmp_path / name).write_bytes(damage)
+        with pytest.raises(UnreadableRecording) as error:
+            read(tmp_path / name)
+        assert str(error.value).startswith(str(tmp_path / name))
+        assert "\n" not in str(error.value).strip()
+
+
+def test_parquet_with_real_time_stamps_and_units(tmp_path):
+    stamps = (START + 10_000_000 * np.arange(500)).astype("datetime64[ns]")
+    fields = [
+        pa.field("when", pa.timestamp("ns")),
+        pa.field("x", pa.float32(), metadata={"unit": "mm"}),
+        pa.field("F", pa.float64()),
+    ]
+    table = pa.table([pa.array(stamps), pa.array(VALUES[:, 0], pa.float32()), VALUES[:, 1]], schema=pa.schema(fields))
+    pq.write_table(table, tmp_path / "a.parquet")
+    times, values, account = read(tmp_path / "a.parquet", time=TimeColumn("when"))
+    assert (times[0], times[-1]) == (START, START + 4_990_000_000)
+    assert np.allclose(values, VALUES, atol=1e-7)
+    assert not account.relative
+
+
+def test_structures_and_matrices_of_matlab_have_names_as_in_matlab(tmp_path):
+    rig = {"t": SECONDS, "signals": {"values": VALUES}}
+    scipy.io.savemat(tmp_path / "a.mat", {"rig": rig, "label": np.array(["a", "b"]), "empty": np.zeros((0, 3))})
+    x = Channel("x", "m", 1.0, column="rig.signals.values(:,1)")
+    f = Channel("F", "N", 1.0, column="rig.signals.values(:,2)")
+    check(tmp_path / "a.mat", (x, f))
+    check(tmp_path / "a.mat", (x, f), TimeColumn("rig.t"))
+
+
+def test_json_rows_and_matrices(tmp_path):
+    rows = [
+        {"time": t, "x": x, "F": f, "note": "n"} for t, (x, f) in zip(SECONDS.tolist(), VALUES.tolist(), strict=True)
+    ]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    check(tmp_path / "a.json")
+    (tmp_path / "b.json").write_text(json.dumps({"data": np.c_[SECONDS, VALUES].tolist(), "rate": 100}))
+    numbered = (Channel("x", "m", 1.0, column="data(:,2)"), Channel("F", "N", 1.0, column="data(:,3)"))
+    check(tmp_path / "b.json", numbered, TimeColumn("data(:,1)"))
+
+
+def test_nodes_of_different_rates_have_times_of_their_own_and_come_in_time_order(tmp_path):
+    fast, slow = np.arange(4000) / 400.0, np.arange(1000) / 100.0
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["node1/time"], file["node1/acc"] = fast, np.sin(fast)
+        file["node2/time"], file["node2/acc"] = slow, np.cos(slow)
+    one, two = (Channel(f"n{i}", "m/s^2", 0.01, column=f"node{i}/acc") for i in (1, 2))
+    blocks = list(open_recording(tmp_path / "a.h5", (one, two)).blocks())
+    times = np.concatenate([block.time for block in blocks])
+    assert (np.diff(times) >= 0).all()
+    record = load_record(tmp_path / "a.h5", (one, two), 100.0)
+    grid = np.arange(len(record.values)) / 100.0
+    assert np.array_equal(record.values[:1000, 1], np.cos(slow))
+    assert np.abs(record.values[30:-30, 0] - np.sin(grid)[30:-30]).max() < 1e-3
+    with pytest.raises(UnreadableRecording, match=r"node1/acc has 4000 values, its time node2/time has 1000"):
+        load_record(tmp_path / "a.h5", (one,), 100.0, time=TimeColumn("node2/time"))
+
+
+def test_tdms_waveforms_have_their_own_clock(tmp_path):
+    def channel(name, values, **extra):
+        start = np.datetime64(datetime.fromtimestamp(START / 1e9, UTC).replace(tzinfo=None), "us")
+        said = {"wf_start_time": start, "wf_increment": 0.01, "wf_start_offset": 0.0, "unit_string": "N", **extra}
+        return nptdms.ChannelObject("Messung", name, values, properties=said)
+
+    with nptdms.TdmsWriter(tmp_path / "a.tdms") as writer:
+        for part in np.array_split(np.arange(500), 3):  # segments
+            writer.write_segment([channel("x", VALUES[part, 0]), channel("F", VALUES[part, 1])])
+    x, f = Channel("x", "m", 1.0, column="Messung/x"), Channel("F", "N", 1.0, column="Messung/F")
+    assert not check(tmp_path / "a.tdms", (x, f), start=START).relative
+    with series.opened(tmp_path / "a.tdms") as columns:
+        assert [(c.name, c.unit, c.length) for c in columns] == [("Messung/x", "N", 500), ("Messung/F", "N", 500)]
+    with nptdms.TdmsWriter(tmp_path / "b.tdms") as writer:
+        objects = [nptdms.ChannelObject("g", name, values) for name, values in COLUMNS.items()]
+        writer.write_segment(objects)
+    check(tmp_path / "b.tdms", (Channel("x", "m", 1.0, column="g/x"), Channel("F", "N", 1.0, column="g/F")))
+
+
+def uff58(node, direction, values, *, kind=4, even=True, binary=None, date="NONE", unit="N", times=SECONDS):
+    """One dataset 58 as its definition has it."""
+    head = [
+        f"    58{'' if binary is None else 'b'}",
+        "Signal of a test".ljust(80),
+        "NONE",
+        date,
+        "NONE",
+        "NONE",
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {'NONE':>10s}{node:10d}{direction:4d} {'NONE':>10s}{0:10d}{0:4d}",
+        f"{kind:10d}{len(values):10d}{int(even):10d}{times[0]:13.5E}{0.01:13.5E}{0:13.5E}",
+        f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':>20s} {'s':>20s}",
+        f"{13:10d}{0:5d}{0:5d}{0:5d} {'Force':>20s} {unit:>20s}",
+        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
+        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
+    ]
+    if binary is not None:
+        data = np.asarray(values, dtype=f"{binary}{'f8' if kind == 4 else 'f4'}").tobytes()
+        head[0] += f"{1 if binary == '<' else 2:6d}{2:6d}{11:12d}{len(data):12d}{0:6d}{0:6d}{0:12d}{0:12d}"
+        body = data + b"\n"
+    else:
+        if not even:
+            cells = [
+                f"{t:13.5E}" + (f"{v:20.12E}" if kind == 4 else f"{v:13.5E}")
+                for t, v in zip(times, values, strict=True)
+            ]
+            per_line = 2 if kind == 4 else 3
+        else:
+            cells = [f"{v:20.12E}" if kind == 4 else f"{v:13.5E}" for v in values]
+            per_line = 4 if kind == 4 else 6
+        lines = ["".join(cells[i : i + per_line]) for i in range(0, len(cells), per_line)]
+        body = ("\n".join(lines) + "\n").encode()
+    return b"    -1\n" + "\n".join(head).encode() + b"\n" + body + b"    -1\n"
+
+
+UNITS_DATASET = b"    -1\n   164\n         1SI: m N s            2\n  1.0  1.0  1.0\n    -1\n"
+
+
+@pytest.mark.parametrize("binary", [None, "<", ">"])
+@pytest.mark.parametrize("kind", [2, 4])
+def test_universal_files_in_text_and_binary(tmp_path, binary, kind):
+    data = UNITS_DATASET
+    data += uff58(12, 3, VALUES[:, 0], kind=kind, binary=binary) + uff58(7, -1, VALUES[:, 1], kind=kind, binary=binary)
+    (tmp_path / "a.uff").write_bytes(data)
+    x, f = Channel("x", "m", 1.0, column="12+Z"), Channel("F", "N", 1.0, column="7-X")
+    times, values, _ = read(tmp_path / "a.uff", (x, f))
+    assert np.array_equal(times, np.rint(SECONDS * 1e9).astype(np.int64))
+    assert np.allclose(values, VALUES, rtol=1e-5 if kind == 2 else 1e-11, atol=1e-9)
+    with series.opened(tmp_path / "a.uff") as columns:
+        assert [(c.name, c.unit) for c in columns] == [("12+Z", "N"), ("7-X", "N")]
+
+
+def test_universal_files_with_uneven_times_dates_and_other_functions(tmp_path):
+    times = SECONDS + np.where(np.arange(500) % 2, 0.002, 0.0)
+    frf = uff58(3, 3, np.zeros(8), kind=4).replace(f"{1:5d}{0:10d}{0:5d}".encode(), f"{4:5d}{0:10d}{0:5d}".encode(), 1)
+    data = frf + uff58(12, 3, VALUES[:, 0], even=False, times=times)
+    (tmp_path / "a.unv").write_bytes(data.replace(b"\n", b"\r\n"))
+    blocks = list(open_recording(tmp_path / "a.unv", (Channel("x", "m", 1.0, column="12+Z/value"),)).blocks())
+    assert np.allclose(blocks[0].time / 1e9, times, atol=1e-5)
+    assert np.allclose(blocks[0].value, VALUES[:, 0], atol=1e-9)
+    (tmp_path / "b.uff").write_bytes(uff58(0, 0, VALUES[:, 0], date="21-SEP-26 14:13:20"))
+    x = Channel("x", "m", 1.0, column="Signal of a test")
+    assert read(tmp_path / "b.uff", (x,))[0][0] == START
+    (tmp_path / "c.uff").write_bytes(frf)
+    with pytest.raises(UnreadableRecording, match="no time responses"):
+        read(tmp_path / "c.uff", (x,))
+    (tmp_path / "d.uff").write_bytes(uff58(12, 3, VALUES[:, 0]).replace(b"E-01", b"E-x1"))
+    with pytest.raises(UnreadableRecording, match="a damaged dataset 58"):
+        read(tmp_path / "d.uff", (x,))
+
+
+def test_a_missing_library_is_named_with_what_to_install(tmp_path):
+    with pytest.raises(
+        UnreadableRecording, match=r"a.h5: reading .h5 files needs no_such; pip install 'sprung\[hdf5\]'"
+    ):
+        needed("no_such", "hdf5", tmp_path / "a.h5")
