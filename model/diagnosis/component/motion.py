@@ -1,0 +1,144 @@
+"""Deflection and rate of an element from a measured displacement, with what their noise is known to be.
+
+A displacement that has no velocity beside it is differentiated.  White noise of variance N per bin becomes w^2 N, so
+the spectrum is first cut to where the motion stands out (Wiener's filter H = 1 - N / P on a smoothed periodogram P),
+and what noise passes is reported: it is the errors-in-variables part of the force's noise floor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from sprung.model.signals import FloatArray
+
+_ORDER = 6  # of the differences that tell white noise
+_BLOCKS = 40  # of them, the median counts: bursts are no noise
+_STANDS_OUT = 3.0  # power of a bin over that of the noise from which it is motion
+_STILL_SECONDS, _STILL_SAMPLES = 0.25, 25
+_STILL = 0.004  # of the whole motion's deviation: less is standstill
+
+
+@dataclass(frozen=True)
+class ElementMotion:
+    """Motion of one element, evenly sampled."""
+
+    time: FloatArray  # s since the start of the recording, (T,)
+    deflection: FloatArray  # m, (T,)
+    rate: FloatArray  # m/s, (T,)
+    deflection_noise: float  # m, what is left of the measurement's noise
+    rate_noise: float  # m/s
+
+    @property
+    def step(self) -> float:
+        return float(self.time[1] - self.time[0])
+
+    @property
+    def middle(self) -> float:
+        """The position half way between the ends of the travel, m."""
+        return 0.5 * float(self.deflection.max() + self.deflection.min())
+
+    def every(self, stride: int) -> ElementMotion:
+        """Every so many samples."""
+        return ElementMotion(
+            self.time[::stride], self.deflection[::stride], self.rate[::stride], self.deflection_noise, self.rate_noise
+        )
+
+
+def white_noise(series: FloatArray) -> float:
+    """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
+
+    Smooth motion leaves them by its power above about a third of the sample rate only.
+    """
+    differences = np.diff(series, _ORDER) ** 2 / comb(2 * _ORDER, _ORDER)
+    blocks = np.array_split(differences, min(_BLOCKS, max(1, len(differences) // 10)))
+    return float(np.sqrt(np.median([block.mean() for block in blocks])))
+
+
+def still_stretches(series: FloatArray, sample_rate: float) -> list[slice]:
+    """Where a motion (T,) stands still for at least a quarter of a second."""
+    span = max(_STILL_SAMPLES, int(_STILL_SECONDS * sample_rate))
+    if len(series) < 4 * span:
+        return []
+    mean = uniform_filter1d(series, span)
+    deviation = np.sqrt(np.maximum(uniform_filter1d(series**2, span) - mean**2, 0.0))
+    rests = deviation < max(_STILL * float(np.std(series)), 2.0 * white_noise(series))
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(int), [0]])))
+    pairs = zip(edges[::2], edges[1::2], strict=True)
+    return [slice(int(a), int(b)) for a, b in pairs if b - a >= span]
+
+
+def noise_at_rest(series: FloatArray, stretches: list[slice]) -> float | None:
+    """Standard deviation about a line over the stretches of standstill; None where there are none."""
+    squares, count = 0.0, 0
+    for stretch in stretches:
+        values = series[stretch]
+        at = np.arange(len(values))
+        rest = values - np.polyval(np.polyfit(at, values, 1), at)
+        squares += float(rest @ rest)
+        count += len(values) - 2
+    return float(np.sqrt(squares / count)) if count > 0 else None
+
+
+def element_motion(
+    displacement: FloatArray, velocity: FloatArray | None, sample_rate: float, start: float = 0.0
+) -> ElementMotion:
+    """Motion from a measured displacement (T,) and, where there is one, a measured velocity (T,)."""
+    count, step = len(displacement), 1 / sample_rate
+    time = start + step * np.arange(count)
+    spectrum, omega, line = _continued(displacement, sample_rate)
+    noise = white_noise(displacement)
+    passed = _wiener(spectrum, noise)
+    rate_spectrum = 1j * omega * passed * spectrum
+    rate_power = omega**2 * passed**2 * noise**2
+    if velocity is not None:
+        level = white_noise(velocity)
+        seen, _, _ = _continued(velocity, sample_rate, odd=False)
+        seen[0] -= 3 * count * line
+        variance_d = (omega * noise) ** 2  # of the differentiated displacement
+        share = variance_d / np.maximum(variance_d + max(level, 1e-300) ** 2, 1e-300)  # of the measured velocity
+        rate_spectrum = share * seen + (1 - share) * 1j * omega * spectrum
+        rate_spectrum = _wiener(rate_spectrum, level) * rate_spectrum
+        rate_power = share * level**2
+    here = slice(count, 2 * count)
+    rate = np.fft.irfft(rate_spectrum, 3 * count)[here] + line
+    smooth = np.fft.irfft(passed * spectrum, 3 * count)[here] + _line(displacement, sample_rate, count, line)
+    left = float(np.sqrt(np.mean(passed**2)) * noise)
+    return ElementMotion(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
+
+
+def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> FloatArray:
+    return series[0] + slope * np.arange(count) / sample_rate
+
+
+def _continued(
+    series: FloatArray, sample_rate: float, odd: bool = True
+) -> tuple[FloatArray, FloatArray, float]:
+    """Spectrum of a series continued at both ends without a jump, three times as long; w; the slope taken out.
+
+    Positions are continued as odd functions about their ends, so that their slope goes on; rates as even ones.
+    """
+    count = len(series)
+    slope = float(series[-1] - series[0]) / ((count - 1) / sample_rate) if odd else 0.0
+    rest = series - _line(series, sample_rate, count, slope) if odd else series
+    sign = -1.0 if odd else 1.0
+    # the line joins the two ends, so that both are zero and the odd continuation passes through them
+    whole = np.concatenate([sign * rest[::-1], rest, sign * rest[::-1]])
+    omega = 2 * np.pi * np.fft.rfftfreq(3 * count, 1 / sample_rate)
+    return np.fft.rfft(whole), omega, slope
+
+
+def _wiener(spectrum: FloatArray, noise: float) -> FloatArray:
+    """Filter that passes what stands out of white noise, up to the highest such frequency."""
+    count = 2 * (len(spectrum) - 1)
+    power = np.abs(spectrum) ** 2 / max(count, 1)
+    reach = max(5, count // 400) | 1
+    smooth = uniform_filter1d(median_filter(power, size=3), size=reach)
+    level = max(noise**2, 1e-300)
+    passed = np.clip(1 - level / np.maximum(smooth, 1e-300), 0.0, 1.0)
+    out = np.flatnonzero(smooth > _STANDS_OUT * level)
+    passed[(out[-1] + 1 if len(out) else 1) :] = 0.0
+    return passed
