@@ -20,6 +20,7 @@ from sprung.model.laws import SpringDamper, grid
 from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
+_LOWEST_KNEE = 0.3  # of the median rate: a valve that opens far below usual rates acts as friction, and is called so
 
 
 @dataclass(frozen=True)
@@ -136,6 +137,7 @@ DAHL = Piece(
     lambda a, s, e: {"force": (a[0], "N"), "stiffness": (a[0] / s[0], "N/m")},
     lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
     kind="hysteresis",
+    plain=1,
 )
 
 
@@ -208,7 +210,6 @@ FREE_BOUC_WEN = Piece(
     },
     lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
     kind="hysteresis",
-    plain=1,
 )
 
 
@@ -234,14 +235,21 @@ PINCHED = Piece(
     },
     lambda a, s, e: {"yield_force": (a[0], "N")},
     kind="hysteresis",
-    plain=1,
+    plain=2,
 )
 
 
 def _backlash(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
     gap, reach = shape
     u = stop_path(motion.deflection, 0.5 * gap + reach)
-    return (np.sign(u) * np.maximum(np.abs(u) - 0.5 * gap, 0.0) / reach)[:, None]
+    beyond = np.sign(u) * np.maximum(np.abs(u) - 0.5 * gap, 0.0) / reach
+    return np.column_stack([beyond, u / (0.5 * gap + reach)])
+
+
+def _backlash_values(a: FloatArray, s: Sequence[float], element: SpringDamper) -> Values:
+    gap, reach = s
+    inside = a[1] / (0.5 * gap + reach)  # N/m, of what still holds within the gap
+    return {"force": (a[0] + a[1], "N"), "gap": (gap, "m"), "stiffness": (a[0] / reach + inside, "N/m")}
 
 
 FRICTION_BACKLASH = Piece(
@@ -251,9 +259,13 @@ FRICTION_BACKLASH = Piece(
     lambda seen: grid(seen.travel * np.geomspace(0.02, 0.9, 7), seen.travel * np.geomspace(0.01, 0.5, 6)),
     lambda seen: [(2e-3 * seen.travel, 1.8 * seen.travel), (1e-3 * seen.travel, 1.5 * seen.travel)],
     _backlash,
-    (1,),
-    lambda a, s, e: {"force": (a[0], "N"), "gap": (s[0], "m"), "stiffness": (a[0] / s[1], "N/m")},
-    lambda a, s, e: {"slip_force": (a[0], "N"), "lost_motion": (s[0], "m")},
+    (1, 1),
+    _backlash_values,
+    lambda a, s, e: {
+        "slip_force": (a[0] + a[1], "N"),
+        "lost_motion": (s[0], "m"),
+        "stiffness_within_gap": (a[1] / (0.5 * s[0] + s[1]), "N/m"),
+    },
     kind="hysteresis",
 )
 
@@ -288,8 +300,8 @@ BLOWOFF = Piece(
     "damper_blowoff",
     "damper blow-off",
     ("knee",),
-    lambda seen: grid(_rates(seen, [0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
-    lambda seen: [(float(seen.rate[4]), float(seen.rate[97]))],
+    lambda seen: grid(_rates(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
+    lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))],
     _blowoff,
     (-1,),
     lambda a, s, e: {"knee": (s[0], "m/s"), "ratio": (1 + a[0] / max(float(e.damping), 1e-300), "1")},
@@ -306,8 +318,8 @@ TWO_KNEES = Piece(
     "damper_blowoff",
     "damper blow-off, different in extension and compression",
     ("knee", "knee_compression"),
-    lambda seen: grid(_rates(seen, [0.15, 0.4, 0.7]), _rates(seen, [0.15, 0.4, 0.7])),
-    lambda seen: [(float(seen.rate[4]), float(seen.rate[97]))] * 2,
+    lambda seen: grid(_rates(seen, [0.2, 0.4, 0.7]), _rates(seen, [0.2, 0.4, 0.7])),
+    lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))] * 2,
     _two_knees,
     (-1, -1),
     lambda a, s, e: {

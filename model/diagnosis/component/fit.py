@@ -1,0 +1,251 @@
+"""A component's force fitted to a record: strengths by linear least squares, shapes around them.
+
+Uncertainty: errors that repeat with every cycle of a test do not average out, so the covariance is the sandwich
+
+    (J^T J)^-1  [sum over bins of J_f^H J_f |r_f|^2]  (J^T J)^-1
+
+with the residual's raw periodogram |r_f|^2 (White 1980, in the frequency domain), which counts an error at a test's
+own frequency with its full size; never less than what white noise of the residual's level would give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import least_squares, lsq_linear
+
+from sprung.model.diagnosis.component.motion import ElementMotion
+from sprung.model.diagnosis.component.pieces import Piece, Seen, Values
+from sprung.model.laws import SpringDamper
+from sprung.model.signals import FloatArray
+
+_STEPS = 40  # evaluations of a search for shapes
+_RELATIVE = 1e-4  # steps of finite differences
+
+
+@dataclass(frozen=True)
+class Nominal:
+    """Spring and damper as the system file has them; None: free."""
+
+    stiffness: float | None  # N/m, if it is fixed
+    damping: float | None  # N s/m, if it is fixed
+
+
+@dataclass(frozen=True)
+class Task:
+    """A record of one component, of which the first `split` samples are fitted."""
+
+    motion: ElementMotion
+    force: FloatArray  # N, (T,)
+    split: int
+    nominal: Nominal = Nominal(None, None)
+
+    @cached_property
+    def seen(self) -> Seen:
+        return Seen.of(self.motion)
+
+    def every(self, stride: int) -> Task:
+        """The same thinned out."""
+        return replace(
+            self, motion=self.motion.every(stride), force=self.force[::stride], split=-(-self.split // stride)
+        )
+
+    @cached_property
+    def linear(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Columns of preload, k and c that are free (T, m), which they are (3,), and the force without the others."""
+        columns = np.column_stack([np.ones(len(self.force)), self.motion.deflection, self.motion.rate])
+        known = np.array([0.0, self.nominal.stiffness or 0.0, self.nominal.damping or 0.0])
+        free = np.array([True, self.nominal.stiffness is None, self.nominal.damping is None])
+        return columns[:, free], free, self.force - columns @ known
+
+
+@dataclass(frozen=True)
+class ComponentModel:
+    """Pieces and their shapes."""
+
+    pieces: tuple[Piece, ...] = ()
+    shapes: tuple[tuple[float, ...], ...] = ()
+
+    def plus(self, piece: Piece, shape: tuple[float, ...]) -> ComponentModel:
+        return ComponentModel((*self.pieces, piece), (*self.shapes, shape))
+
+    def without(self, index: int) -> ComponentModel:
+        keep = [i for i in range(len(self.pieces)) if i != index]
+        return ComponentModel(tuple(self.pieces[i] for i in keep), tuple(self.shapes[i] for i in keep))
+
+    def columns(self, task: Task) -> FloatArray:
+        """(T, m) of all pieces."""
+        found = [p.columns(task.motion, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
+        return np.column_stack(found) if found else np.zeros((len(task.force), 0))
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        return tuple(sign for piece in self.pieces for sign in piece.signs)
+
+    @property
+    def count(self) -> int:
+        """Free numbers of the laws."""
+        return sum(len(p.signs) + len(p.shapes) for p in self.pieces)
+
+
+@dataclass(frozen=True)
+class ComponentFit:
+    """A fitted model."""
+
+    task: Task
+    model: ComponentModel
+    preload: float  # N, force at zero deflection
+    element: SpringDamper
+    strengths: FloatArray  # of all pieces' columns
+    residual: FloatArray  # N, measured less modelled, whole record, (T,)
+
+    @property
+    def error(self) -> float:
+        """Mean square of the fitted part's residual, N^2."""
+        return float(np.mean(self.residual[: self.task.split] ** 2))
+
+    @property
+    def held_out(self) -> float:
+        """Mean square of the held-out part's residual, N^2."""
+        return float(np.mean(self.residual[self.task.split :] ** 2))
+
+    @property
+    def force(self) -> FloatArray:
+        """Modelled force, N, (T,)."""
+        return self.task.force - self.residual
+
+    def strengths_of(self, index: int) -> FloatArray:
+        counts = [len(piece.signs) for piece in self.model.pieces]
+        first = sum(counts[:index])
+        return self.strengths[first : first + counts[index]]
+
+    def values(self, index: int) -> Values:
+        """The law's own parameters of a piece."""
+        piece = self.model.pieces[index]
+        return piece.values(self.strengths_of(index), self.model.shapes[index], self.element)
+
+    def quoted(self, index: int) -> Values:
+        """What an engineer quotes of a piece."""
+        piece = self.model.pieces[index]
+        return piece.quoted(self.strengths_of(index), self.model.shapes[index], self.element)
+
+
+def bounded_solution(columns: FloatArray, target: FloatArray, signs: tuple[int, ...]) -> tuple[FloatArray, float]:
+    """Least squares with signs (1, -1, 0 for either) of the unknowns; solution and sum of squares left."""
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0] = 1.0
+    q, r = np.linalg.qr(columns / scale)
+    right = q.T @ target
+    rest = float(target @ target - right @ right)
+    solved = np.linalg.lstsq(r, right, rcond=1e-10)[0]
+    sign = np.array(signs)
+    if np.any(solved * sign < 0):
+        low = np.where(sign > 0, 0.0, -np.inf)
+        high = np.where(sign < 0, 0.0, np.inf)
+        solved = lsq_linear(r, right, (low, high), method="bvls").x
+    left = right - r @ solved
+    return solved / scale, max(rest + float(left @ left), 0.0)
+
+
+def fitted(task: Task, model: ComponentModel) -> ComponentFit:
+    """Strengths, preload, spring and damper for given shapes."""
+    base, free, force = task.linear
+    columns = np.column_stack([base, model.columns(task)])
+    signs = tuple(np.array([0, 1, 1])[free].tolist()) + model.signs
+    train = slice(0, task.split)
+    solved, _ = bounded_solution(columns[train], force[train], signs)
+    values = np.array([0.0, task.nominal.stiffness or 0.0, task.nominal.damping or 0.0])
+    values[free] = solved[: int(free.sum())]
+    residual = force - columns @ solved
+    element = SpringDamper(float(values[1]), float(values[2]))
+    return ComponentFit(task, model, float(values[0]), element, solved[int(free.sum()) :], residual)
+
+
+def refined(task: Task, model: ComponentModel) -> ComponentFit:
+    """The best shapes near a model's, all pieces together."""
+    start = np.array([value for shape in model.shapes for value in shape])
+    if not len(start):
+        return fitted(task, model)
+    limits = [limit for piece in model.pieces for limit in piece.limits(task.seen)]
+    log = np.array([low > 0 for low, _ in limits])
+    low, high = np.array(limits, dtype=float).T
+    low, high = (np.where(log, np.log(np.where(log, x, 1.0)), x) for x in (low, high))
+    inner = np.where(log, np.log(np.where(log, start, 1.0)), start)
+    inner = np.clip(inner, low + 1e-9 * (high - low), high - 1e-9 * (high - low))
+
+    def at(x: FloatArray) -> ComponentModel:
+        values = np.where(log, np.exp(np.where(log, x, 0.0)), x).tolist()
+        shapes = []
+        for piece in model.pieces:
+            shapes.append(tuple(values[: len(piece.shapes)]))
+            values = values[len(piece.shapes) :]
+        return ComponentModel(model.pieces, tuple(shapes))
+
+    size = float(np.std(task.force[: task.split])) or 1.0
+
+    def residual(x: FloatArray) -> FloatArray:
+        return fitted(task, at(x)).residual[: task.split] / size
+
+    found = least_squares(residual, inner, bounds=(low, high), diff_step=1e-3, max_nfev=_STEPS, x_scale=0.3)
+    best, first = fitted(task, at(found.x)), fitted(task, model)
+    return best if best.error <= first.error else first
+
+
+def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
+    """Covariance of preload, k, c (where free), strengths and shapes, in this order, and their names."""
+    task, model = fit.task, fit.model
+    base, free, _ = task.linear
+    columns = np.column_stack([base, model.columns(task)])[: task.split]
+    moved = []
+    for i, (piece, shape) in enumerate(zip(model.pieces, model.shapes, strict=True)):
+        for j in range(len(shape)):
+            step = _RELATIVE * max(abs(shape[j]), 1e-12) * 10
+            other = tuple(s + step * (k == j) for k, s in enumerate(shape))
+            change = (piece.columns(task.motion, other) - piece.columns(task.motion, shape)) @ fit.strengths_of(i)
+            moved.append(change[: task.split] / step)
+    jacobian = np.column_stack([columns, *moved]) if moved else columns
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale[scale == 0] = 1.0
+    jacobian = jacobian / scale
+    residual = fit.residual[: task.split]
+    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
+    of_bins = np.fft.rfft(jacobian, axis=0, norm="ortho")
+    power = 2 * np.abs(np.fft.rfft(residual, norm="ortho")) ** 2
+    middle = np.real((of_bins.conj() * power[:, None]).T @ of_bins)
+    sandwich = inverse @ middle @ inverse
+    white = inverse * float(residual @ residual) / max(1, len(residual) - jacobian.shape[1])
+    grow = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    full = sandwich * np.outer(grow, grow) / np.outer(scale, scale)
+    names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
+    return full, names
+
+
+def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations of a piece's law parameters and of what is quoted of it, by linear propagation."""
+    count = len(names)
+    at = count + sum(len(p.signs) for p in fit.model.pieces[:index])
+    own = list(range(at, at + len(fit.model.pieces[index].signs)))
+    first = count + len(fit.strengths) + sum(len(p.shapes) for p in fit.model.pieces[:index])
+    own += list(range(first, first + len(fit.model.pieces[index].shapes)))
+    linear = [names.index(name) for name in ("stiffness", "damping") if name in names]
+    block = full[np.ix_(own + linear, own + linear)]
+    piece, shape, strengths = fit.model.pieces[index], fit.model.shapes[index], fit.strengths_of(index)
+    start = np.concatenate([strengths, shape, [getattr(fit.element, names[i]) for i in linear]])
+
+    def values(x: FloatArray, what: str) -> FloatArray:
+        a, s = x[: len(strengths)], x[len(strengths) : len(strengths) + len(shape)]
+        of = dict(zip([names[i] for i in linear], x[len(strengths) + len(shape) :], strict=True))
+        element = SpringDamper(of.get("stiffness", fit.element.stiffness), of.get("damping", fit.element.damping))
+        return np.array([value for value, _ in getattr(piece, what)(a, s, element).values()])
+
+    result = []
+    for what in ("values", "quoted"):
+        centre = values(start, what)
+        gradient = np.zeros((len(centre), len(start)))
+        for j in range(len(start)):
+            step = _RELATIVE * max(abs(start[j]), 1e-9)
+            gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
+        result.append(np.sqrt(np.maximum(np.diag(gradient @ block @ gradient.T), 0.0)) if len(centre) else centre)
+    return result[0], result[1]

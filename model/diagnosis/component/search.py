@@ -1,0 +1,237 @@
+"""Which laws a component needs besides spring, damper and preload: one after the other, by evidence.
+
+The evidence of a model is its gain over the linear one, n log(mean square before / after), less log n per parameter
+(BIC) and what a search among many laws costs, with n the effective number of independent numbers in the residual: a
+test by one sine repeats itself, and a thousand repetitions of one error tell no more about it than one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, bounded_solution, fitted, refined
+from sprung.model.diagnosis.component.pieces import PIECES, Piece
+from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class ComponentRules:
+    """Deciding constants of a component's diagnosis."""
+
+    search: int = 4000  # samples that trial shapes are compared on, and
+    fit: int = 16000  # that the final fit uses: a record of a periodic test holds far fewer independent numbers
+    most: int = 3  # laws: real rigs have more imperfections than a record can name
+    alpha: float = 1e-3  # chance of a false finding per recording
+    least_share: float = 0.2  # of the power that is still left, that a further law must remove: less is imitation
+    naming_margin: float = 6.0  # evidence by which a law must beat its look-alikes: odds of 20 to 1
+    plain_cost: float = 6.0  # evidence by which a law must beat a commoner one that it contains
+    starts: int = 2  # trial shapes from which a law is refined
+    close: int = 6  # laws that are refined in every round
+
+
+RULES = ComponentRules()
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A model with what it is worth against the linear one."""
+
+    fit: ComponentFit
+    gain: float
+    evidence: float
+    count: float  # effective numbers
+
+    @property
+    def last(self) -> Piece:
+        return self.fit.model.pieces[-1]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One accepted law among its rivals."""
+
+    chosen: Ranked
+    before: Ranked
+    rivals: tuple[Ranked, ...]  # other laws in its place, best first
+    p_value: float
+
+    @property
+    def gain(self) -> float:
+        return level_gain(self.before.fit.error, self.chosen.fit.error, self.chosen.count)
+
+
+@dataclass(frozen=True)
+class Search:
+    """What was found."""
+
+    base: ComponentFit
+    final: ComponentFit
+    steps: tuple[Step, ...]
+    screened: dict[str, float]  # law -> gain of its best trial alone, as screened
+
+
+def search(
+    task: Task, pieces: tuple[Piece, ...] = PIECES, rules: ComponentRules = RULES, tell: Progress = lambda text: None
+) -> Search:
+    """Grow a model of the component until the rest is noise, or nothing explains enough of it."""
+    quick = task.every(max(1, len(task.force) // rules.search))
+    fine = task.every(max(1, len(task.force) // rules.fit))
+    base = fitted(quick, ComponentModel())
+    count = effective_count(base.residual[: quick.split])
+    current = Ranked(base, 0.0, 0.0, count)
+    steps: list[Step] = []
+    screened: dict[str, float] = {}
+    for number in range(rules.most):
+        tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
+        ranked = _next_laws(current.fit, pieces, rules)
+        if number == 0:
+            for trial in ranked:
+                screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
+        step = _accepted(current, ranked, rules)
+        if step is None:
+            break
+        steps.append(step)
+        current = _swapped(step.chosen, pieces, rules)
+        if current is not step.chosen:  # an earlier law gives way to one that suits the later better
+            steps = _renamed(steps, current)
+    final = refined(fine, current.fit.model)
+    return Search(fitted(fine, ComponentModel()), final, tuple(steps), screened)
+
+
+def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules) -> list[Ranked]:
+    """Fits by their evidence against one that all extend."""
+    if not fits:
+        return []
+    best = min(fits, key=lambda fit: fit.error)
+    count = effective_count(best.residual[: best.task.split])
+    ranked = []
+    for fit in fits:
+        gain = level_gain(before.error, fit.error, count)
+        dear = (fit.model.count - before.model.count) * float(np.log(count)) if count > 1 else 0.0
+        dear += rules.plain_cost * sum(piece.plain for piece in fit.model.pieces)
+        ranked.append(Ranked(fit, gain, gain - dear, count))
+    return sorted(ranked, key=lambda r: -r.evidence)
+
+
+def _next_laws(current: ComponentFit, pieces: tuple[Piece, ...], rules: ComponentRules) -> list[Ranked]:
+    """Models with one more law, refined, best first."""
+    used = {piece.effect for piece in current.model.pieces}
+    kinds = {piece.kind for piece in current.model.pieces} & {"hysteresis", "friction"}
+    open_pieces = [p for p in pieces if p.effect not in used and p.kind not in kinds]
+    trials = [trial for piece in open_pieces for trial in _trials(current, piece, rules)]
+    trials.sort(key=lambda t: t[0])
+    seen: dict[str, int] = {}
+    chosen = []
+    for error, model in trials:
+        name = model.pieces[-1].title
+        if name not in seen and len(seen) >= rules.close + 4:
+            continue
+        seen[name] = seen.get(name, 0) + 1
+        if seen[name] <= rules.starts:
+            chosen.append(model)
+    fits = [refined(current.task, model) for model in chosen]
+    best: dict[str, ComponentFit] = {}
+    for fit in fits:
+        name = fit.model.pieces[-1].title
+        if plausible(fit) and (name not in best or fit.error < best[name].error):
+            best[name] = fit
+    return _rank(list(best.values()), current, rules)
+
+
+def _trials(current: ComponentFit, piece: Piece, rules: ComponentRules) -> list[tuple[float, ComponentModel]]:
+    """The best trial shapes of a law beside the present ones: sum of squares left and model."""
+    task = current.task
+    base, free, force = task.linear
+    train = slice(0, task.split)
+    fixed = np.column_stack([base, current.model.columns(task)])[train]
+    signs = tuple(np.array([0, 1, 1])[free].tolist()) + current.model.signs
+    found = []
+    for row in piece.grid(task.seen):
+        shape = tuple(float(value) for value in row)
+        columns = piece.columns(task.motion, shape)[train]
+        if not np.all(np.isfinite(columns)):
+            continue
+        _, left = bounded_solution(np.column_stack([fixed, columns]), force[train], (*signs, *piece.signs))
+        found.append((left, current.model.plus(piece, shape)))
+    return sorted(found, key=lambda t: t[0])[: rules.starts]
+
+
+def plausible(fit: ComponentFit) -> bool:
+    """Whether the last law's values are ones that it can have, and that the sampling resolves."""
+    index = len(fit.model.pieces) - 1
+    piece, strengths = fit.model.pieces[index], fit.strengths_of(index)
+    if not np.any(np.abs(strengths) > 0):
+        return False
+    values = {name: value for name, (value, _) in fit.values(index).items()}
+    corner = fit.task.seen.slowest_corner(fit.task.motion)
+    if piece.effect == "damper_blowoff":
+        ratios = [values[name] for name in ("ratio", "ratio_compression") if name in values]
+        knees = [values[name] for name in ("knee", "knee_compression") if name in values]
+        return all(-0.02 <= r < 0.98 for r in ratios) and all(k > corner for k in knees)
+    if piece.effect == "damper_asymmetry":
+        return abs(values["a"]) <= 1.0
+    if piece.effect == "clearance":
+        return bool(fit.strengths_of(index)[0] <= 1.2 * fit.element.stiffness)
+    return True
+
+
+def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> Step | None:
+    """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
+    if not ranked or ranked[0].evidence <= 0:
+        return None
+    chosen, before = ranked[0], current
+    freedom = chosen.fit.model.count - before.fit.model.count
+    p_value = chance(chosen.gain, freedom, len(PIECES) * 10)
+    if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
+        return None
+    further = len(before.fit.model.pieces) > 0
+    if further and chosen.fit.held_out > (1 - rules.least_share) * before.fit.held_out:
+        return None
+    return Step(chosen, before, tuple(ranked[1:]), p_value)
+
+
+def _swapped(chosen: Ranked, pieces: tuple[Piece, ...], rules: ComponentRules) -> Ranked:
+    """The same with one earlier law exchanged for another, where that is worth the margin."""
+    model = chosen.fit.model
+    if len(model.pieces) < 2:
+        return chosen
+    best = chosen
+    for index in range(len(model.pieces) - 1):
+        rest = fitted(chosen.fit.task, model.without(index))
+        for rival in _next_laws(rest, pieces, rules)[:2]:
+            same = _rank([rival.fit, best.fit], rest, rules)
+            if same[0].fit is rival.fit and same[0].evidence > same[1].evidence + rules.naming_margin:
+                best = same[0]
+    return best
+
+
+def _renamed(steps: list[Step], current: Ranked) -> list[Step]:
+    """Steps of an exchanged model: every law against the model without it."""
+    model = current.fit.model
+    result = []
+    for index in range(len(model.pieces)):
+        without = fitted(current.fit.task, model.without(index))
+        gain = level_gain(without.error, current.fit.error, current.count)
+        ranked = Ranked(without, 0.0, 0.0, current.count)
+        piece = model.pieces[index]
+        p_value = chance(gain, len(piece.signs) + len(piece.shapes), len(PIECES) * 10)
+        known = next((s for s in steps if s.chosen.last.effect == piece.effect), None)
+        result.append(Step(current, ranked, known.rivals if known else (), p_value))
+    return result
+
+
+def residual_share(fit: ComponentFit, floor: float) -> tuple[float, float]:
+    """Held-out error over the force's deviation, and the share of its variance that floor and model leave over."""
+    held = fit.task.force[fit.task.split :]
+    size = float(np.var(held)) or 1.0
+    return float(np.sqrt(fit.held_out / size)), max(0.0, fit.held_out - floor**2) / size
+
+
+def deviation(series: FloatArray) -> float:
+    """Standard deviation, or 1 of what does not move."""
+    return float(np.std(series)) or 1.0
