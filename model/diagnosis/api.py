@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from sprung.model.diagnosis.component.diagnose import diagnose_components
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
@@ -20,6 +21,8 @@ def diagnose(
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell = progress or (lambda share, text: None)
+    if not system.bodies:
+        return diagnose_components(system, record, options or Options(), tell)
     outcome = investigate(system, record, options or Options(), tell)
     tell(0.95, "report")
     report = narrate(outcome, record)

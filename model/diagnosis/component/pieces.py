@@ -439,6 +439,33 @@ def _drift(effect: str, of: str, quantity: str) -> Piece:
     )
 
 
+# --- no name ----------------------------------------------------------------------------------------------------
+
+_REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
+_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
+
+
+def _surface(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
+    """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
+    seen = Seen.of(motion)
+    x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
+    columns = [stop_path(motion.deflection, reach * seen.travel) / (reach * seen.travel) for reach in _REACHES]
+    columns += [np.clip(motion.rate, -knee, knee) / knee for knee in _rates(seen, _RATES.tolist())]
+    columns += [np.maximum(v, 0.0), x**2, x**3, x * v, x**2 * v, v * np.abs(v)]
+    return np.column_stack(columns)
+
+
+SURFACE = Piece(
+    "unknown",
+    "a force that no law explains",
+    (),
+    lambda seen: np.zeros((1, 0)),
+    lambda seen: [],
+    _surface,
+    (0,) * (len(_REACHES) + len(_RATES) + 6),
+    lambda a, s, e: {},
+)
+
 PIECES: tuple[Piece, ...] = (
     COULOMB,
     STRIBECK,

@@ -16,12 +16,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
+from sprung.model.diagnosis.investigation.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +103,15 @@ class Finding:
     location: str  # element, body, sensor or input
     effect: str  # a word of the contract's table
     parameters: tuple[LawParameter, ...]
-    p_value: float
-    delta_bic: float  # against the model without this finding; negative: better
+    p_value: float | None  # None: nothing was tested
+    delta_bic: float | None  # against the model without this finding; negative: better; None: no likelihood was compared
     runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
     family: str | None = None  # where no single law beats its look-alikes
     advice: str | None = None  # what would separate the look-alikes
     sentence: str = ""
     parameter_covariance: NDArray[np.float64] | None = None  # of `parameters`, shape (p, p)
+    quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
 
     def to_dict(self) -> dict[str, Any]:
         result: dict[str, Any] = {
@@ -133,7 +134,25 @@ class Finding:
             result["family"] = self.family
         if self.advice is not None:
             result["advice"] = self.advice
+        if self.quoted:
+            result["quoted"] = [q.to_dict() for q in self.quoted]
         return result
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """Share of the held-out measured variance that neither the model nor bounded noise explains."""
+
+    share: float = 0.0  # mean over sensors
+    per_sensor: Mapping[str, float] = field(default_factory=dict)
+    where: str = ""  # in words: place, size and frequencies of what is left
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "share": _number(self.share),
+            "per_sensor": {k: _number(v) for k, v in self.per_sensor.items()},
+            "where": self.where,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +185,7 @@ class Report:
     candidates: tuple[Candidate, ...] = ()
     changes: tuple[str, ...] = ()  # parameters that left their nominal value, in words
     explained: float | None = None  # share of the excess error that the findings explain, held-out part
+    unexplained: Unexplained = Unexplained()
     summary: str = ""
     advice: tuple[str, ...] = ()  # what could not be decided and why
     evidence: dict[str, NDArray[Any]] = field(default_factory=dict)
@@ -190,6 +210,7 @@ class Report:
             "candidates": [c.to_dict() for c in self.candidates],
             "changes": list(self.changes),
             "explained": _number(self.explained),
+            "unexplained": self.unexplained.to_dict(),
             "summary": self.summary,
             "advice": list(self.advice),
         }

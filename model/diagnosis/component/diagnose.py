@@ -1,0 +1,283 @@
+"""The diagnosis of component tests: from a recording to a report."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, covariance, fitted, spread
+from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
+from sprung.model.diagnosis.component.pieces import SURFACE
+from sprung.model.diagnosis.component.search import RULES, ComponentRules, Search, Step, search
+from sprung.model.diagnosis.component.words import finding_of, leftover_words, preload_finding, reversed_finding
+from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
+from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, Errors, verdict_of
+from sprung.model.diagnosis.report.report import (
+    Candidate,
+    Finding,
+    FitFigures,
+    ParameterValue,
+    RecordingFacts,
+    Report,
+    Unexplained,
+)
+from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_DECLARED = 0.02  # of the force: a declared noise is believed up to this; beyond it has to be seen in the record
+_SURFACE_SERVES = 0.9  # of the held-out power that an unnamed force may leave to be worth reporting
+_NAMED = 0.5  # of the excess power: named laws that explain less than this do not carry the verdict
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One component with everything that the report says of it."""
+
+    record: ComponentRecord
+    found: Search
+    base: ComponentFit
+    final: ComponentFit
+    floor: float  # N
+    reversed: bool  # the force or the motion was measured with the other sign
+    surface: Step | None  # what no law explains, as an unnamed force
+
+    @property
+    def size(self) -> float:
+        """Deviation of the held-out force, N."""
+        return float(np.std(self.record.task.force[self.record.task.split :])) or 1.0
+
+    @property
+    def errors(self) -> Errors:
+        held = [np.sqrt(fit.held_out) / self.size for fit in (self.base, self.final)]
+        return Errors(np.array(held[:1]), np.array(held[1:]), np.array([self.floor / self.size]))
+
+
+def diagnose_components(system: System, record: Recorded, options: Options, tell: Progress) -> Report:
+    """Diagnose every component test of a system without bodies.
+
+    Errors: `DiagnosisError` when the recording cannot be used at all.
+    """
+    tell(0.05, "channels, motion and noise")
+    records = component_records(system, record.values, record.sample_rate, options.train_share)
+    judged = []
+    for number, one in enumerate(records):
+
+        def progress(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
+            tell(share, f"{name}: {text}")
+
+        judged.append(_judge(one, RULES, progress))
+    tell(0.95, "report")
+    report = _report(system, record, options, judged)
+    tell(1.0, "done")
+    return report
+
+
+def _judge(one: ComponentRecord, rules: ComponentRules, tell) -> Judged:  # type: ignore[no-untyped-def]
+    turned = _turned(one.task)
+    if turned:
+        one = replace(one, task=replace(one.task, force=-one.task.force))
+    found = search(one.task, rules=rules, tell=tell)
+    base, final = found.base, found.final
+    judged = Judged(one, found, base, final, noise_floor(one, final), turned, None)
+    left = float(np.max(judged.errors.unexplained()))
+    share = judged.errors.explained()
+    if left > 0 and (not found.steps or (share is not None and share < _NAMED)):
+        tell("what is left, as an unnamed force")
+        judged = _with_surface(judged)
+    return judged
+
+
+def _turned(task: Task) -> bool:
+    """Whether the component would feed energy into the rig, or push away from where it is: a wrong sign.
+
+    Springs and dampers take the other sign with the force; a nominal value that the file fixes says nothing here.
+    """
+    d = task.motion.deflection - np.mean(task.motion.deflection)
+    columns = np.column_stack([np.ones(len(d)), d, task.motion.rate])[: task.split]
+    force = task.force[: task.split]
+    solved = np.linalg.lstsq(columns, force, rcond=None)[0]
+    with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
+    return sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(max(with_sign), 0.0)
+
+
+def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
+    """Bounded noise of the force, N: the cell's, and that of the motion through spring and damper.
+
+    The cell's is what the record shows apart from any model, at standstill and at its highest frequencies; what was
+    declared counts where the record shows less, up to a fiftieth of the force.
+    """
+    task = one.task
+    cell = max(one.measured_noise, min(one.declared, _DECLARED * float(np.std(task.force))))
+    through = np.hypot(fit.element.stiffness * task.motion.deflection_noise, fit.element.damping * task.motion.rate_noise)
+    return float(np.hypot(cell, min(float(through), _DECLARED * float(np.std(task.force)))))
+
+
+def _with_surface(judged: Judged) -> Judged:
+    """The rest as an unnamed force, if that serves the held-out part."""
+    task, before = judged.final.task, judged.final
+    after = fitted(task, judged.final.model.plus(SURFACE, ()))
+    if after.held_out > _SURFACE_SERVES * before.held_out:
+        return judged
+    count = effective_count(after.residual[: task.split])
+    gain = level_gain(before.error, after.error, count)
+    from sprung.model.diagnosis.component.search import Ranked
+
+    step = Step(Ranked(after, gain, gain, count), Ranked(before, 0.0, 0.0, count), (), chance(gain, 16, 1))
+    return replace(judged, final=after, surface=step)
+
+
+def _report(system: System, record: Recorded, options: Options, judged: list[Judged]) -> Report:
+    errors = Errors(*(np.concatenate([getattr(j.errors, key) for j in judged]) for key in ("before", "after", "floor")))
+    findings: list[Finding] = []
+    for one in judged:
+        findings += _findings(one)
+    findings.sort(key=_rank)
+    verdict = verdict_of([f.effect for f in findings], errors)
+    explained = errors.explained() if any(f.effect not in NO_FAULTS for f in findings) else None
+    left = errors.unexplained()
+    names = [j.record.sensor for j in judged]
+    words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
+    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
+    advice = [note for j in judged for note in j.record.notes]
+    return Report(
+        system=system.name,
+        recording=RecordingFacts(
+            options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
+        ),
+        verdict=verdict,
+        baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base)),
+        baseline_validation=_figures(names, errors.before),
+        findings=tuple(findings),
+        augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final)),
+        augmented_validation=_figures(names, errors.after),
+        noise_floor=_figures(names, errors.bounded()),
+        localization={
+            j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual))
+            for j in judged
+        },
+        candidates=tuple(c for j in judged for c in _candidates(j)),
+        explained=explained,
+        unexplained=unexplained,
+        summary=_summary(verdict, findings, explained, unexplained),
+        advice=tuple(advice if verdict != "consistent" else []),
+        evidence=_arrays(judged, record.sample_rate),
+    )
+
+
+def _rank(finding: Finding) -> tuple[int, float]:
+    """Set-up faults first, laws by evidence, nuisances last."""
+    order = 0 if finding.effect in SENSOR_FAULTS else (2 if finding.effect in NO_FAULTS else 1)
+    return order, finding.delta_bic if finding.delta_bic is not None else 0.0
+
+
+def _findings(one: Judged) -> list[Finding]:
+    full, names = covariance(one.final)
+    findings = []
+    if one.reversed:
+        findings.append(reversed_finding(one.record.sensor, one.record.element))
+    for index, step in enumerate(one.found.steps):
+        findings.append(finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names)))
+    if one.surface is not None:
+        step = one.surface
+        findings.append(
+            Finding(
+                one.record.element,
+                "unknown",
+                (),
+                step.p_value,
+                bic(step.gain, len(SURFACE.signs), int(step.chosen.count)),
+                sentence=f"{one.record.element}: a force that no law of the catalogue explains; its map is reported",
+            )
+        )
+    deviation = float(np.sqrt(max(full[0, 0], 0.0)))
+    sign = -1.0 if one.reversed else 1.0
+    if abs(one.final.preload) > 5 * max(deviation, one.floor / np.sqrt(one.record.task.split)):
+        findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
+    return findings
+
+
+def _parameters(system: System, element: str, fit: ComponentFit) -> list[ParameterValue]:
+    full, names = covariance(fit)
+    sigma = dict(zip(names, np.sqrt(np.maximum(np.diag(full), 0.0)).tolist(), strict=False))
+    values = []
+    for parameter in system.parameters:
+        if parameter.element == element:
+            value = float(getattr(fit.element, parameter.quantity))
+            deviation = sigma.get(parameter.quantity, 0.0)
+            values.append(ParameterValue(parameter.name, value, deviation, parameter.nominal, parameter.unit))
+    values.append(ParameterValue(f"{element}.preload", fit.preload, sigma["preload"], 0.0, "N"))
+    return values
+
+
+def _figures(names: list[str], per_sensor: FloatArray) -> FitFigures:
+    return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
+
+
+def _candidates(one: Judged) -> list[Candidate]:
+    rows = {}
+    for step in one.found.steps:
+        for ranked in (step.chosen, *step.rivals):
+            delta = bic(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, int(ranked.count))
+            p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, 180)
+            rows.setdefault(ranked.last.effect, Candidate(one.record.element, ranked.last.effect, ranked.gain, p_value, delta))
+    for effect, gain in one.found.screened.items():
+        rows.setdefault(effect, Candidate(one.record.element, effect, gain, chance(gain, 2, 180)))
+    return list(rows.values())[:20]
+
+
+def _summary(verdict: str, findings: list[Finding], explained: float | None, left: Unexplained) -> str:
+    if verdict == "consistent":
+        text = "The nominal structure explains the recording down to the noise."
+        nuisance = "; ".join(f.sentence for f in findings)
+        return f"{text} {nuisance[:1].upper()}{nuisance[1:]}." if nuisance else text
+    text = "; ".join(f.sentence for f in findings if f.effect not in NO_FAULTS)
+    if not text:
+        text = "No law of the catalogue explains what was measured"
+    if explained is not None and explained > 0:
+        share = 100 * explained
+        exact = "100" if left.share == 0 else f"{min(share, 99):.0f}"
+        text += f"; explains {exact} % of the excess error"
+    if left.share > 0:
+        text += f"; still unexplained: {left.where}"
+    nuisance = "; ".join(f.sentence for f in findings if f.effect in NO_FAULTS)
+    return f"{text}{'; ' + nuisance if nuisance else ''}."
+
+
+def _arrays(judged: list[Judged], sample_rate: float) -> dict[str, np.ndarray]:
+    """Arrays for pictures: validation of every force, and for every law motion and force before and after."""
+    first = judged[0]
+    arrays: dict[str, np.ndarray] = {}
+    if all(len(j.record.task.force) == len(first.record.task.force) for j in judged):
+        at = {id(j): slice(_fine_split(j), None) for j in judged}
+        arrays["validation.time"] = first.final.task.motion.time[at[id(first)]]
+        for key, get in (
+            ("measured", lambda j: j.final.task.force),
+            ("baseline", lambda j: j.base.force),
+            ("augmented", lambda j: j.final.force),
+        ):
+            arrays[f"validation.{key}"] = np.column_stack([get(j)[at[id(j)]] for j in judged])
+        arrays["validation.noise"] = np.array([j.floor for j in judged])
+    arrays["localization.names"] = np.array([j.record.element for j in judged], dtype=str)
+    arrays["localization.score"] = np.array([j.found.base.error for j in judged])
+    for number, (one, index) in enumerate((j, i) for j in judged for i in range(len(j.found.steps))):
+        task = one.final.task
+        thin = slice(None, None, max(1, len(task.force) // 4000))
+        own = ComponentModel.columns(one.final.model, task)
+        counts = [len(p.signs) for p in one.final.model.pieces]
+        columns = slice(sum(counts[:index]), sum(counts[: index + 1]))
+        law = own[:, columns] @ one.final.strengths[columns]
+        key = f"finding.{number}"
+        arrays[f"{key}.time"], arrays[f"{key}.deflection"] = task.motion.time[thin], task.motion.deflection[thin]
+        arrays[f"{key}.rate"] = task.motion.rate[thin]
+        arrays[f"{key}.force_before"] = one.base.residual[thin]
+        arrays[f"{key}.force_after"] = one.final.residual[thin]
+        arrays[f"{key}.loop_x"], arrays[f"{key}.loop_y"] = task.motion.deflection[thin], law[thin]
+        arrays[f"{key}.total_measured"] = task.force[thin]
+        arrays[f"{key}.total_modelled"] = one.final.force[thin]
+    return arrays
+
+
+def _fine_split(one: Judged) -> int:
+    return one.final.task.split

@@ -1,0 +1,159 @@
+"""Which parts of a system are component tests, and their signals: an element that only supports and ground hold.
+
+Its motion is measured at both ends and its force by a cell, so that nothing has to be simulated.  A body that hardly
+moves under the measured force, such as the frame that a user invents to have one, is taken for ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import Nominal, Task
+from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
+from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES, DiagnosisError, TooLittleError
+from sprung.model.schema import ElementSensor, SupportInput
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_LONGEST_GAP = 0.05  # s, that is closed by interpolation
+_HARDLY = 0.01  # of the motion of the other end: a body that moves less is ground
+_STILL_MOTION = 3.0  # of the displacement's noise: a test that moves less tells nothing
+
+
+@dataclass(frozen=True)
+class ComponentRecord:
+    """One component on one recording."""
+
+    element: str
+    sensor: str
+    task: Task
+    declared: float  # N, noise of the force as the system file states it; 0: it states none
+    rest: float | None  # N, noise of the force at standstill
+    white: float  # N, noise of the force at the highest frequencies
+    notes: tuple[str, ...]
+
+    @property
+    def measured_noise(self) -> float:
+        """Noise of the force as the record itself shows it, apart from any model, N."""
+        return max(self.rest or 0.0, self.white)
+
+
+def component_elements(system: System) -> dict[str, str]:
+    """Force sensors by the element whose both ends are measured or fixed."""
+    held = set(system.file.bodies)
+    return {
+        sensor.element: name
+        for name, sensor in system.file.sensors.items()
+        if isinstance(sensor, ElementSensor)
+        and sensor.kind == "force"
+        and not {system.file.elements[sensor.element].upper, system.file.elements[sensor.element].lower} & held
+    }
+
+
+def component_records(system: System, values: FloatArray, sample_rate: float, share: float) -> list[ComponentRecord]:
+    """The component tests in a recording's columns (T, C), in the order of `system.channels`.
+
+    Errors: `DiagnosisError` when a channel is missing, `TooLittleError` when too little is left or nothing moves.
+    """
+    elements = component_elements(system)
+    if not elements:
+        raise DiagnosisError(
+            "a system without bodies is a component test: it needs an element between a support and ground (or two "
+            "supports) and a sensor {kind: force, element: ...} on it"
+        )
+    names = [channel.name for channel in system.channels]
+    return [_record(system, values, names, sample_rate, e, s, share) for e, s in elements.items()]
+
+
+def _record(
+    system: System,
+    values: FloatArray,
+    names: list[str],
+    sample_rate: float,
+    element: str,
+    sensor: str,
+    share: float,
+) -> ComponentRecord:
+    ends = system.file.elements[element]
+    notes: list[str] = []
+    count = len(values)
+    displacement, velocity, has_velocity = np.zeros(count), np.zeros(count), True
+    for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
+        if end == "ground":
+            continue
+        source = system.file.inputs[end]
+        assert isinstance(source, SupportInput)
+        displacement += sign * _column(values, names, f"{end}.displacement")
+        if source.velocity is not None and np.isfinite(values[:, names.index(f"{end}.velocity")]).mean() > 0.5:
+            velocity += sign * _column(values, names, f"{end}.velocity")
+        else:
+            has_velocity = False
+    force = _column(values, names, sensor)
+    good = np.isfinite(displacement) & np.isfinite(force) & (np.isfinite(velocity) | (not has_velocity))
+    first, last = _longest(good, max(1, int(_LONGEST_GAP * sample_rate)))
+    if last - first < MINIMUM_SAMPLES:
+        raise TooLittleError(
+            f"too short to decide anything: {element} has {last - first} usable samples in a row; "
+            f"at least {MINIMUM_SAMPLES} are needed"
+        )
+    if last - first < count:
+        notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
+    part = slice(first, last)
+    d, f, v = (_closed(series[part]) for series in (displacement, force, velocity))
+    if np.ptp(d) <= _STILL_MOTION * white_noise(d) or np.ptp(d) == 0:
+        raise TooLittleError(f"too still to decide anything: {element} is not moved")
+    if np.ptp(f) == 0:
+        raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; nothing can be told without it")
+    rests = still_stretches(d, sample_rate)
+    rest = noise_at_rest(f, rests)
+    start = rests[0].stop if rests and rests[0].start == 0 else 0
+    stop = rests[-1].start if rests and rests[-1].stop == len(d) else len(d)
+    if stop - start < MINIMUM_SAMPLES:
+        start, stop = 0, len(d)
+    if (start, stop) != (0, len(d)):
+        notes.append(
+            f"{element} stands still before {start / sample_rate:.2f} s and after {stop / sample_rate:.2f} s: "
+            "cut out; the force's noise was measured there"
+        )
+    run = slice(start, stop)
+    motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
+    nominal = Nominal(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
+    task = Task(motion, f[run], int(share * (stop - start)), nominal)
+    declared = system.file.sensors[sensor].noise
+    return ComponentRecord(element, sensor, task, declared, rest, white_noise(f[run]), tuple(notes))
+
+
+def _fixed(system: System, element: str, quantity: str) -> float | None:
+    """The value that the file fixes; None: to be estimated."""
+    value = getattr(system.file.elements[element], quantity)
+    free = quantity in system.file.estimate and not value.fixed
+    return None if free else float(value.value)
+
+
+def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
+    series = np.array(values[:, names.index(name)], dtype=float)
+    if not np.isfinite(series).any():
+        raise DiagnosisError(f"channel {name} has no data in the recording")
+    return series
+
+
+def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:
+    """The longest run of samples without a gap longer than `gap`."""
+    at = np.flatnonzero(good)
+    if not len(at):
+        return 0, 0
+    breaks = np.flatnonzero(np.diff(at) > gap + 1)
+    starts, ends = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(at) - 1]])
+    best = int(np.argmax(at[ends] - at[starts]))
+    return int(at[starts[best]]), int(at[ends[best]]) + 1
+
+
+def _closed(series: FloatArray) -> FloatArray:
+    """Short gaps closed by linear interpolation."""
+    good = np.isfinite(series)
+    if good.all():
+        return series
+    at = np.arange(len(series))
+    return np.interp(at, at[good], series[good])

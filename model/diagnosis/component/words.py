@@ -1,0 +1,152 @@
+"""Findings of a component test as values and sentences."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit
+from sprung.model.diagnosis.component.pieces import Values
+from sprung.model.diagnosis.component.search import RULES, Step
+from sprung.model.diagnosis.report.report import Finding, LawParameter
+from sprung.model.diagnosis.selection.evidence import bic
+from sprung.model.signals import FloatArray
+
+_DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
+_NEAR_RATE = 0.05  # of a rate: samples this close to it tell the force there
+_BAND = 0.8  # of the power of what is left, for the frequencies where it lies
+
+
+def finding_of(
+    element: str, fit: ComponentFit, base: ComponentFit, index: int, step: Step, sigma: tuple[FloatArray, FloatArray]
+) -> Finding:
+    """The finding of one law."""
+    piece = fit.model.pieces[index]
+    values, quoted = _parameters(fit.values(index), sigma[0]), _parameters(fit.quoted(index), sigma[1])
+    if piece.kind in ("hysteresis", "friction"):
+        quoted += (_loop_area(fit),)
+    quoted += _forces_at_rates(fit)
+    family = _family(step)
+    rival = step.rivals[0] if step.rivals else None
+    freedom = len(piece.signs) + len(piece.shapes)
+    shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
+    told = ", ".join(f"{q.name.replace('_', ' ')} {value_words(q)}" for q in shown[:3])
+    sentence = f"{element}: {piece.title}, {told}"
+    if family is not None:
+        sentence += f" ({family.replace('_', ' ')} fit almost equally well)"
+    if base.element.damping > 0 and fit.element.damping < 0.1 * base.element.damping:
+        sentence += f"; {element}.damping is then no longer needed"
+    return Finding(
+        location=element,
+        effect=piece.effect,
+        parameters=values,
+        p_value=step.p_value,
+        delta_bic=bic(step.gain, freedom, int(step.chosen.count)),
+        runner_up=None
+        if rival is None
+        else (rival.last.effect, bic(rival.gain, rival.fit.model.count - step.before.fit.model.count, int(rival.count))),
+        runner_up_location=None if rival is None else element,
+        family=family,
+        advice=None
+        if family is None
+        else "a test at other amplitudes and other rates, so that the same deflections come at other rates, "
+        "would tell them apart",
+        sentence=sentence,
+        quoted=quoted,
+    )
+
+
+_SPOKEN = frozenset(
+    {"yield_force", "yield_displacement", "slip_force", "lost_motion", "breakaway_force", "force_at_knee"}
+)
+
+
+def _parameters(values: Values, sigma: FloatArray) -> tuple[LawParameter, ...]:
+    return tuple(
+        LawParameter(name, float(value), float(s), unit)
+        for (name, (value, unit)), s in zip(values.items(), sigma, strict=True)
+    )
+
+
+def _family(step: Step) -> str | None:
+    """Laws that the recording cannot tell from the chosen one."""
+    best = step.chosen
+    near = [
+        r.last.effect
+        for r in step.rivals
+        if r.evidence > best.evidence - RULES.naming_margin and r.last.effect != best.last.effect
+    ]
+    return " or ".join([best.last.effect, *dict.fromkeys(near)]) if near else None
+
+
+def _loop_area(fit: ComponentFit) -> LawParameter:
+    """Energy of the largest loop, J: the mean over the cycles of most travel, with their scatter."""
+    motion = fit.task.motion
+    middle = motion.deflection - motion.middle
+    starts = np.flatnonzero((middle[1:] > 0) & (middle[:-1] <= 0))
+    work = np.concatenate([[0.0], np.cumsum(0.5 * (fit.force[1:] + fit.force[:-1]) * np.diff(motion.deflection))])
+    if len(starts) < 2:
+        return LawParameter("loop_area", float(abs(work[-1])), float("nan"), "J")
+    areas = np.diff(work[starts])
+    travel = np.array([np.ptp(middle[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    large = areas[travel > 0.9 * travel.max()]
+    scatter = float(np.std(large, ddof=1) / np.sqrt(len(large))) if len(large) > 1 else float("nan")
+    return LawParameter("loop_area", float(np.mean(large)), scatter, "J")
+
+
+def _forces_at_rates(fit: ComponentFit) -> tuple[LawParameter, ...]:
+    """Total force less preload at data-sheet rates that the test reached, extension then compression."""
+    motion, rows = fit.task.motion, []
+    error = np.sqrt(fit.error)
+    for rate in _DATA_SHEET_RATES:
+        for side, word in ((1.0, "extension"), (-1.0, "compression")):
+            near = np.abs(motion.rate - side * rate) < _NEAR_RATE * rate
+            if near.sum() >= 5:
+                value = float(np.mean(fit.force[near]) - fit.preload)
+                scatter = float(np.hypot(np.std(fit.force[near]), error))
+                rows.append(LawParameter(f"force_{word}_{rate:g}", value, scatter, "N"))
+    return tuple(rows)
+
+
+def value_words(parameter: LawParameter) -> str:
+    """61.2 +- 0.8 N, to the digits that the deviation supports."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    if not np.isfinite(parameter.std) or parameter.std <= 0:
+        return f"{parameter.value:.4g}{unit}"
+    digits = max(2, int(np.ceil(np.log10(max(abs(parameter.value), parameter.std) / parameter.std))) + 1)
+    return f"{parameter.value:.{min(digits, 6)}g} +- {parameter.std:.2g}{unit}"
+
+
+def preload_finding(element: str, value: float, sigma: float) -> Finding:
+    """A static force: gas, weight or setting of the rig.  Never a fault."""
+    parameter = LawParameter("force", value, sigma, "N")
+    return Finding(
+        element, "preload", (parameter,), None, None, sentence=f"{element}: a static preload of {value_words(parameter)}"
+    )
+
+
+def reversed_finding(sensor: str, element: str) -> Finding:
+    """A force or a motion with the other sign."""
+    return Finding(
+        sensor,
+        "sign_reversed",
+        (),
+        None,
+        None,
+        sentence=f"{sensor}: the force has the wrong sign against the motion of {element}, which would feed energy into "
+        "the rig; it was turned for the rest of this diagnosis",
+    )
+
+
+def leftover_words(element: str, fit: ComponentFit, size: float) -> str:
+    """Place, size and frequencies of what is left of a force."""
+    held = fit.residual[fit.task.split :]
+    power = np.abs(np.fft.rfft(held - held.mean())) ** 2
+    frequency = np.fft.rfftfreq(len(held), fit.task.motion.step)
+    order = np.argsort(power)[::-1]
+    count = int(np.searchsorted(np.cumsum(power[order]), _BAND * power.sum())) + 1
+    among = frequency[order[:count]]
+    rms = float(np.sqrt(np.mean(held**2)))
+    return (
+        f"{rms:.3g} N at {element}, {100 * rms / size:.1f} % of the force, "
+        f"most of it at {among.min():.2g} to {among.max():.2g} Hz"
+    )

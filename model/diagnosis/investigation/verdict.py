@@ -1,0 +1,93 @@
+"""The verdict: one pure function of errors, bounded noise and findings, decided before anything is written.
+
+Three errors are told apart on the held-out part, as shares of every sensor's measured power:
+
+    before - after          explained by the findings
+    floor                   noise, bounded by what was declared or measured independently of the model
+    after - floor           unexplained
+
+`consistent` needs an unexplained share of nothing.  A floor that only the misfit itself suggests is no bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sprung.model.signals import FloatArray
+
+Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
+SENSOR_FAULTS = frozenset(
+    {"sensor_gain", "sensor_lag", "sensor_bias", "sensor_noise", "sensor_stuck", "axle_delay"}
+    | {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position"}
+)
+NO_FAULTS = frozenset({"preload"})  # nuisances: reported, and no reason for any verdict
+
+
+@dataclass(frozen=True)
+class VerdictRules:
+    """Deciding constants of the verdict."""
+
+    clear: float = 1.5  # error over the floor, pooled, up to which nothing is left: parameters' errors and chance
+    clear_sensor: float = 2.0  # the same of a single sensor
+    carried: float = 0.5  # of the excess error that findings must explain to carry the verdict
+    strange: float = 0.6  # error over the signal from which the system file does not describe the recording
+    least: float = 2e-3  # error over the signal that sampling and differentiation leave of a perfect model
+
+
+RULES = VerdictRules()
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Held-out errors over the measured signal, rms over rms, per sensor (S,)."""
+
+    before: FloatArray  # of the nominal structure identified again
+    after: FloatArray  # with the findings
+    floor: FloatArray  # bounded noise
+
+    def bounded(self, rules: VerdictRules = RULES) -> FloatArray:
+        """The floor with what sampling leaves of a perfect model, (S,)."""
+        return np.hypot(self.floor, rules.least)
+
+    def unexplained(self, rules: VerdictRules = RULES) -> FloatArray:
+        """Share of every sensor's power that neither the model nor bounded noise explains; 0 where that is nothing."""
+        floor = self.bounded(rules)
+        pooled = np.sqrt(np.mean(self.after**2)) > rules.clear * np.sqrt(np.mean(floor**2))
+        left = (self.after > rules.clear_sensor * floor) | (pooled & (self.after > rules.clear * floor))
+        return np.where(left, np.maximum(self.after**2 - floor**2, 0.0), 0.0)
+
+    def explained(self, rules: VerdictRules = RULES) -> float | None:
+        """Share of the error power beyond the bounded floor that the findings remove; None: there was none."""
+        floor = float(np.mean(self.bounded(rules) ** 2))
+        excess = float(np.mean(self.before**2)) - floor
+        left = max(0.0, float(np.mean(self.after**2)) - floor)
+        return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
+
+
+def verdict_of(effects: Sequence[str], errors: Errors, rules: VerdictRules = RULES) -> Verdict:
+    """The verdict for findings of the given effects, best first, and the errors that they leave."""
+    left = bool(np.any(errors.unexplained(rules) > 0))
+    named = [effect for effect in effects if effect not in NO_FAULTS]
+    if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and left:
+        return "unknown_physics"
+    if not named:
+        return "unknown_physics" if left else "consistent"
+    share = errors.explained(rules)
+    if left and share is not None and share < rules.carried:
+        return "unknown_physics"
+    physics = [effect for effect in named if effect not in SENSOR_FAULTS]
+    if not physics:
+        return "sensor_fault"
+    return "unknown_physics" if physics[0] == "unknown" else "missing_physics"
+
+
+def bounded_noise(learnt: FloatArray, declared: FloatArray, measured: FloatArray, slack: float = 1.5) -> FloatArray:
+    """Noise levels that a floor may use: what was learnt, but no more than was declared or independently measured.
+
+    slack: a declaration is a round number.
+    """
+    return np.minimum(learnt, slack * np.maximum(declared, measured))
