@@ -220,7 +220,7 @@ def checked(system: System, source: str) -> System:
     refused = [*placed_laws(system.file, system.catalogue)[1], *unsupported(system.file)]
     if refused:
         raise SystemFileError(f"{source}: {'; '.join(refused)}", tuple(f"{source}: {line}" for line in refused))
-    if not system.parameters:
+    if not system.parameters or not system.bodies:
         return system
     hidden = system.mechanics.unobservable_mode(system.bodies)
     if hidden is not None:
@@ -234,8 +234,6 @@ def checked(system: System, source: str) -> System:
 def unsupported(file: SystemFile) -> list[str]:
     """What the format can say and identification cannot use yet, one line each."""
     found = []
-    if not file.bodies:
-        found.append("bodies: a component test without bodies is not supported by identification yet")
     for name, source in file.inputs.items():
         if isinstance(source, TrackInput):
             found.append(f"inputs.{name}: kind track is not supported by identification yet")

@@ -96,6 +96,11 @@ def load_engine(settings: Settings) -> Engine:
     path = settings.system or MANCHESTER
     system = load_system(path)
     dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
+    if not system.bodies:
+        raise UserError(
+            f"{path}: a component test has no bodies, so nothing to follow from window to window; "
+            f"`sprung diagnose FILE --system {path}` identifies it from a whole recording"
+        )
     if not system.parameters:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
     return Engine(

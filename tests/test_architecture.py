@@ -31,7 +31,7 @@ ORDER = [
     "tracking",
 ]
 BESIDE = {"diagnosis": ORDER[: ORDER.index("identification")], "alps": ORDER}
-STAGES = ("record", "response", "fit", "screening", "selection", "investigation", "report", "api")
+STAGES = ("record", "response", "fit", "screening", "selection", "investigation", "report", "component", "api")
 # Imports inside functions of `model`, each with its reason
 LATE: dict[str, str] = {}
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from sprung.model.diagnosis.component.diagnose import diagnose_components
+from sprung.model.diagnosis.component.measured import is_component_test
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
@@ -21,7 +22,7 @@ def diagnose(
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell = progress or (lambda share, text: None)
-    if not system.bodies:
+    if is_component_test(system, record.values):
         return diagnose_components(system, record, options or Options(), tell)
     outcome = investigate(system, record, options or Options(), tell)
     tell(0.95, "report")

@@ -25,6 +25,8 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     from sprung.model.identification.training import TrainingSettings, train
 
     system = load_system(system_file or MANCHESTER)
+    if not system.bodies:
+        raise UserError(f"{system_file}: a component test has no bodies, so no estimator to train; use sprung diagnose")
     database = dbc or (MANCHESTER_DBC if system_file is None else None)
     windows = whole_windows(system, recordings, database) if recordings else None
     given = {name: value for name, value in changes.items() if value is not None}

@@ -9,7 +9,17 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, covariance, fitted, spread
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.pieces import SURFACE
-from sprung.model.diagnosis.component.search import RULES, ComponentRules, Search, Step, search
+from sprung.model.diagnosis.component.search import (
+    RULES,
+    ComponentRules,
+    Ranked,
+    Search,
+    Step,
+    search,
+)
+from sprung.model.diagnosis.component.search import (
+    Progress as Told,
+)
 from sprung.model.diagnosis.component.words import finding_of, leftover_words, preload_finding, reversed_finding
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, Errors, verdict_of
@@ -74,7 +84,7 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     return report
 
 
-def _judge(one: ComponentRecord, rules: ComponentRules, tell) -> Judged:  # type: ignore[no-untyped-def]
+def _judge(one: ComponentRecord, rules: ComponentRules, tell: Told) -> Judged:
     turned = _turned(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
@@ -99,7 +109,7 @@ def _turned(task: Task) -> bool:
     force = task.force[: task.split]
     solved = np.linalg.lstsq(columns, force, rcond=None)[0]
     with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
-    return sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(max(with_sign), 0.0)
+    return sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(*with_sign, 0.0)
 
 
 def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
@@ -110,7 +120,9 @@ def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
     """
     task = one.task
     cell = max(one.measured_noise, min(one.declared, _DECLARED * float(np.std(task.force))))
-    through = np.hypot(fit.element.stiffness * task.motion.deflection_noise, fit.element.damping * task.motion.rate_noise)
+    through = np.hypot(
+        fit.element.stiffness * task.motion.deflection_noise, fit.element.damping * task.motion.rate_noise
+    )
     return float(np.hypot(cell, min(float(through), _DECLARED * float(np.std(task.force)))))
 
 
@@ -122,8 +134,6 @@ def _with_surface(judged: Judged) -> Judged:
         return judged
     count = effective_count(after.residual[: task.split])
     gain = level_gain(before.error, after.error, count)
-    from sprung.model.diagnosis.component.search import Ranked
-
     step = Step(Ranked(after, gain, gain, count), Ranked(before, 0.0, 0.0, count), (), chance(gain, 16, 1))
     return replace(judged, final=after, surface=step)
 
@@ -154,8 +164,7 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
         augmented_validation=_figures(names, errors.after),
         noise_floor=_figures(names, errors.bounded()),
         localization={
-            j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual))
-            for j in judged
+            j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual)) for j in judged
         },
         candidates=tuple(c for j in judged for c in _candidates(j)),
         explained=explained,
@@ -178,7 +187,9 @@ def _findings(one: Judged) -> list[Finding]:
     if one.reversed:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
     for index, step in enumerate(one.found.steps):
-        findings.append(finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names)))
+        findings.append(
+            finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names))
+        )
     if one.surface is not None:
         step = one.surface
         findings.append(
@@ -221,7 +232,9 @@ def _candidates(one: Judged) -> list[Candidate]:
         for ranked in (step.chosen, *step.rivals):
             delta = bic(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, int(ranked.count))
             p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, 180)
-            rows.setdefault(ranked.last.effect, Candidate(one.record.element, ranked.last.effect, ranked.gain, p_value, delta))
+            rows.setdefault(
+                ranked.last.effect, Candidate(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
+            )
     for effect, gain in one.found.screened.items():
         rows.setdefault(effect, Candidate(one.record.element, effect, gain, chance(gain, 2, 180)))
     return list(rows.values())[:20]

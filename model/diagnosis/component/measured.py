@@ -19,7 +19,7 @@ from sprung.model.system import System
 
 _LONGEST_GAP = 0.05  # s, that is closed by interpolation
 _HARDLY = 0.01  # of the motion of the other end: a body that moves less is ground
-_STILL_MOTION = 3.0  # of the displacement's noise: a test that moves less tells nothing
+_STILL_MOTION = 2.0  # deviation over that of the displacement's noise: a test that moves less tells nothing
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,40 @@ class ComponentRecord:
         return max(self.rest or 0.0, self.white)
 
 
-def component_elements(system: System) -> dict[str, str]:
-    """Force sensors by the element whose both ends are measured or fixed."""
-    held = set(system.file.bodies)
+def is_component_test(system: System, values: FloatArray) -> bool:
+    """Whether nothing has to be simulated: no bodies, or only ones that the measured forces hardly move.
+
+    values (T, C): a recording's columns.  A foundation that a user invents for a damper on a test bench is one: its
+    motion under the measured force, by its stiffness to ground and its mass, is nothing beside that of the rod.
+    """
+    if not system.bodies:
+        return True
+    names = [channel.name for channel in system.channels]
+    if any(not isinstance(source, SupportInput) for source in system.file.inputs.values()):
+        return False
+    weighed = component_elements(system, set())
+    if set(system.sensors) - set(weighed.values()) or not weighed:
+        return False
+    moved = [
+        np.nanstd(values[:, names.index(f"{n}.displacement")])
+        for n in system.file.inputs
+        if f"{n}.displacement" in names
+    ]
+    if not moved or min(moved) == 0:
+        return False
+    force = sum(float(np.nanstd(values[:, names.index(sensor)])) for sensor in weighed.values())
+    held: dict[str, float] = dict.fromkeys(system.bodies, 0.0)
+    for name, element in system.file.elements.items():
+        ends = {element.upper, element.lower}
+        if name not in weighed and "ground" in ends:
+            for body in ends & held.keys():
+                held[body] += element.stiffness.value
+    least = min(held.values())
+    return least > 0 and force / least < _HARDLY * float(min(moved))
+
+
+def component_elements(system: System, held: set[str]) -> dict[str, str]:
+    """Force sensors by the element whose ends are not among the given bodies."""
     return {
         sensor.element: name
         for name, sensor in system.file.sensors.items()
@@ -57,7 +88,7 @@ def component_records(system: System, values: FloatArray, sample_rate: float, sh
 
     Errors: `DiagnosisError` when a channel is missing, `TooLittleError` when too little is left or nothing moves.
     """
-    elements = component_elements(system)
+    elements = component_elements(system, set())
     if not elements:
         raise DiagnosisError(
             "a system without bodies is a component test: it needs an element between a support and ground (or two "
@@ -81,15 +112,26 @@ def _record(
     count = len(values)
     displacement, velocity, has_velocity = np.zeros(count), np.zeros(count), True
     for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
-        if end == "ground":
+        if end not in system.file.inputs:
+            if end != "ground":
+                notes.append(f"{end} hardly moves under the measured force: taken for ground")
             continue
         source = system.file.inputs[end]
-        assert isinstance(source, SupportInput)
-        displacement += sign * _column(values, names, f"{end}.displacement")
-        if source.velocity is not None and np.isfinite(values[:, names.index(f"{end}.velocity")]).mean() > 0.5:
-            velocity += sign * _column(values, names, f"{end}.velocity")
+        if not isinstance(source, SupportInput) or not {"displacement", "velocity"} & source.measured.keys():
+            raise DiagnosisError(f"input {end}: a component test needs its displacement or its velocity measured")
+        rate: FloatArray | None = None
+        if "velocity" in source.measured:
+            rate = _column(values, names, f"{end}.velocity")
+        if "displacement" in source.measured:
+            displacement += sign * _column(values, names, f"{end}.displacement")
         else:
+            assert rate is not None
+            displacement += sign * _integral(rate, sample_rate)
+            notes.append(f"{end}.displacement was integrated from its velocity")
+        if rate is None:
             has_velocity = False
+        else:
+            velocity += sign * rate
     force = _column(values, names, sensor)
     good = np.isfinite(displacement) & np.isfinite(force) & (np.isfinite(velocity) | (not has_velocity))
     first, last = _longest(good, max(1, int(_LONGEST_GAP * sample_rate)))
@@ -102,7 +144,7 @@ def _record(
         notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
     part = slice(first, last)
     d, f, v = (_closed(series[part]) for series in (displacement, force, velocity))
-    if np.ptp(d) <= _STILL_MOTION * white_noise(d) or np.ptp(d) == 0:
+    if np.std(d) <= _STILL_MOTION * white_noise(d) or np.ptp(d) == 0:
         raise TooLittleError(f"too still to decide anything: {element} is not moved")
     if np.ptp(f) == 0:
         raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; nothing can be told without it")
@@ -137,6 +179,14 @@ def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
     if not np.isfinite(series).any():
         raise DiagnosisError(f"channel {name} has no data in the recording")
     return series
+
+
+def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
+    """A position from its rate, about its mean; gaps stay gaps."""
+    good = np.isfinite(rate)
+    filled = np.interp(np.arange(len(rate)), np.flatnonzero(good), rate[good])
+    position = np.concatenate([[0.0], np.cumsum(0.5 * (filled[1:] + filled[:-1]))]) / sample_rate
+    return np.where(good, position - position.mean(), np.nan)
 
 
 def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:

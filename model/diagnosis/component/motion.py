@@ -114,9 +114,7 @@ def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> F
     return series[0] + slope * np.arange(count) / sample_rate
 
 
-def _continued(
-    series: FloatArray, sample_rate: float, odd: bool = True
-) -> tuple[FloatArray, FloatArray, float]:
+def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tuple[FloatArray, FloatArray, float]:
     """Spectrum of a series continued at both ends without a jump, three times as long; w; the slope taken out.
 
     Positions are continued as odd functions about their ends, so that their slope goes on; rates as even ones.

@@ -74,7 +74,7 @@ def _yields(seen: Seen) -> FloatArray:
 
 
 def _yield_limits(seen: Seen) -> tuple[float, float]:
-    return (2e-4 * seen.travel, 2.0 * seen.travel)
+    return (2e-4 * seen.travel, 0.8 * seen.travel)  # beyond it nothing yields: a spring that softens
 
 
 # --- friction and hysteresis ------------------------------------------------------------------------------------

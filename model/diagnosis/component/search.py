@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, bounded_solution, fitted, refined
+from sprung.model.diagnosis.component.paths import stop_path
 from sprung.model.diagnosis.component.pieces import PIECES, Piece
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
-from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
@@ -34,6 +34,8 @@ class ComponentRules:
 
 
 RULES = ComponentRules()
+_LOST = 0.15  # of the stiffness: a spring that keeps less within its gap has lost it
+_SLIPS = 0.05  # of the time: what slips less has shown its gap only
 Progress = Callable[[str], None]
 
 
@@ -127,7 +129,7 @@ def _next_laws(current: ComponentFit, pieces: tuple[Piece, ...], rules: Componen
     trials.sort(key=lambda t: t[0])
     seen: dict[str, int] = {}
     chosen = []
-    for error, model in trials:
+    for _error, model in trials:
         name = model.pieces[-1].title
         if name not in seen and len(seen) >= rules.close + 4:
             continue
@@ -175,16 +177,25 @@ def plausible(fit: ComponentFit) -> bool:
         return all(-0.02 <= r < 0.98 for r in ratios) and all(k > corner for k in knees)
     if piece.effect == "damper_asymmetry":
         return abs(values["a"]) <= 1.0
+    if piece.effect == "friction_backlash":  # what never slips is a spring with a gap
+        gap, reach = fit.model.shapes[index]
+        u = np.abs(stop_path(fit.task.motion.deflection, 0.5 * gap + reach))
+        return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > _SLIPS)
     if piece.effect == "clearance":
-        return bool(fit.strengths_of(index)[0] <= 1.2 * fit.element.stiffness)
+        return bool(np.abs(strengths[0] / max(fit.element.stiffness, 1e-300) - 1) < _LOST)  # no force within the gap
+    if piece.effect == "bump_stop":  # and with none, the stop is the spring, and has a clearance
+        return bool(fit.element.stiffness > _LOST * strengths[0])
     return True
 
 
 def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> Step | None:
     """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
-    if not ranked or ranked[0].evidence <= 0:
+    near = [r for r in ranked if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin)]
+    if not near:
         return None
-    chosen, before = ranked[0], current
+    # what the fitted part does not tell apart, the held-out part may
+    chosen, before = min(near, key=lambda r: r.fit.held_out), current
+    rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
     p_value = chance(chosen.gain, freedom, len(PIECES) * 10)
     if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
@@ -192,7 +203,7 @@ def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> S
     further = len(before.fit.model.pieces) > 0
     if further and chosen.fit.held_out > (1 - rules.least_share) * before.fit.held_out:
         return None
-    return Step(chosen, before, tuple(ranked[1:]), p_value)
+    return Step(chosen, before, rivals, p_value)
 
 
 def _swapped(chosen: Ranked, pieces: tuple[Piece, ...], rules: ComponentRules) -> Ranked:
@@ -223,15 +234,3 @@ def _renamed(steps: list[Step], current: Ranked) -> list[Step]:
         known = next((s for s in steps if s.chosen.last.effect == piece.effect), None)
         result.append(Step(current, ranked, known.rivals if known else (), p_value))
     return result
-
-
-def residual_share(fit: ComponentFit, floor: float) -> tuple[float, float]:
-    """Held-out error over the force's deviation, and the share of its variance that floor and model leave over."""
-    held = fit.task.force[fit.task.split :]
-    size = float(np.var(held)) or 1.0
-    return float(np.sqrt(fit.held_out / size)), max(0.0, fit.held_out - floor**2) / size
-
-
-def deviation(series: FloatArray) -> float:
-    """Standard deviation, or 1 of what does not move."""
-    return float(np.std(series)) or 1.0

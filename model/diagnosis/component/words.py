@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
@@ -43,7 +45,10 @@ def finding_of(
         delta_bic=bic(step.gain, freedom, int(step.chosen.count)),
         runner_up=None
         if rival is None
-        else (rival.last.effect, bic(rival.gain, rival.fit.model.count - step.before.fit.model.count, int(rival.count))),
+        else (
+            rival.last.effect,
+            bic(rival.gain, rival.fit.model.count - step.before.fit.model.count, int(rival.count)),
+        ),
         runner_up_location=None if rival is None else element,
         family=family,
         advice=None
@@ -87,7 +92,7 @@ def _loop_area(fit: ComponentFit) -> LawParameter:
     if len(starts) < 2:
         return LawParameter("loop_area", float(abs(work[-1])), float("nan"), "J")
     areas = np.diff(work[starts])
-    travel = np.array([np.ptp(middle[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)])
+    travel = np.array([np.ptp(middle[a:b]) for a, b in itertools.pairwise(starts)])
     large = areas[travel > 0.9 * travel.max()]
     scatter = float(np.std(large, ddof=1) / np.sqrt(len(large))) if len(large) > 1 else float("nan")
     return LawParameter("loop_area", float(np.mean(large)), scatter, "J")
@@ -120,7 +125,12 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
     """A static force: gas, weight or setting of the rig.  Never a fault."""
     parameter = LawParameter("force", value, sigma, "N")
     return Finding(
-        element, "preload", (parameter,), None, None, sentence=f"{element}: a static preload of {value_words(parameter)}"
+        element,
+        "preload",
+        (parameter,),
+        None,
+        None,
+        sentence=f"{element}: a static preload of {value_words(parameter)}",
     )
 
 
@@ -132,8 +142,8 @@ def reversed_finding(sensor: str, element: str) -> Finding:
         (),
         None,
         None,
-        sentence=f"{sensor}: the force has the wrong sign against the motion of {element}, which would feed energy into "
-        "the rig; it was turned for the rest of this diagnosis",
+        sentence=f"{sensor}: the force has the wrong sign against the motion of {element}, which would feed energy "
+        "into the rig; it was turned for the rest of this diagnosis",
     )
 
 

@@ -104,7 +104,7 @@ class Finding:
     effect: str  # a word of the contract's table
     parameters: tuple[LawParameter, ...]
     p_value: float | None  # None: nothing was tested
-    delta_bic: float | None  # against the model without this finding; negative: better; None: no likelihood was compared
+    delta_bic: float | None  # against the model without this finding; negative: better; None: nothing compared
     runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
     family: str | None = None  # where no single law beats its look-alikes

@@ -1,0 +1,250 @@
+"""Component tests: an element between a measured motion and ground, with its force; truth from independent code."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
+from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
+from sprung.model.diagnosis.component.paths import bouc_wen_path, maxwell_path, presliding_path, stop_path
+from sprung.model.system import System, parse_system
+
+RATE = 200.0
+K, C = 4.0e4, 1.5e3
+
+
+@dataclass
+class Recording:
+    values: np.ndarray
+    sample_rate: float = RATE
+    lost: int = 0
+
+
+def system(noise: float = 1.0, more: str = "", stiffness: str = "4.0e4") -> System:
+    return parse_system(f"""
+name: damper on a test bench
+sample_rate: {RATE}
+window: 64
+inputs:
+  rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}
+elements:
+  damper: {{upper: rod, lower: ground, stiffness: {stiffness}, damping: 1.5e3}}
+sensors:
+  cell: {{kind: force, element: damper, csv: F, noise: {noise}}}
+{more}""")
+
+
+def sweep(seconds: float = 40.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Time, deflection and exact rate of several sines of two amplitudes."""
+    t = np.arange(int(seconds * RATE)) / RATE
+    swell = 0.6 + 0.4 * np.sin(2 * np.pi * 0.07 * t)
+    slope = 0.4 * 2 * np.pi * 0.07 * np.cos(2 * np.pi * 0.07 * t)
+    d, v = np.zeros_like(t), np.zeros_like(t)
+    for size, f, phase in ((0.012, 0.7, 0.3), (0.004, 1.9, 1.0)):
+        angle = 2 * np.pi * f * t + phase
+        d += size * swell * np.sin(angle)
+        v += size * (slope * np.sin(angle) + swell * 2 * np.pi * f * np.cos(angle))
+    return t, d, v
+
+
+def report(force: np.ndarray, d: np.ndarray, noise: float = 1.0, declared: float = 1.0, seed: int = 0) -> Report:
+    random = np.random.default_rng(seed)
+    measured = force + noise * random.standard_normal(len(force))
+    shown = d + 1e-6 * random.standard_normal(len(d))
+    return diagnose(system(declared), Recording(np.column_stack([shown, measured])))
+
+
+def laws(found: Report) -> list[str]:
+    return [f.effect for f in found.findings if f.effect != "preload"]
+
+
+def test_a_spring_and_damper_with_preload_is_consistent_and_the_preload_no_fault() -> None:
+    _, d, v = sweep()
+    found = report(K * d + C * v + 120.0, d)
+    assert found.verdict == "consistent"
+    (preload,) = [f for f in found.findings if f.effect == "preload"]
+    assert preload.parameters[0].value == pytest.approx(120.0, abs=5 * preload.parameters[0].std)
+    values = {p.name: p for p in found.baseline}
+    for name, truth in (("damper.stiffness", K), ("damper.damping", C), ("damper.preload", 120.0)):
+        assert abs(values[name].value - truth) < 5 * values[name].std
+    assert found.unexplained.share == 0.0
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
+def test_the_verdict_does_not_hang_on_the_declared_noise(factor: float) -> None:
+    _, d, v = sweep()
+    assert report(K * d + C * v, d, declared=factor).verdict == "consistent"
+    assert report(K * d + C * v + 60 * np.tanh(v / 1e-3), d, declared=factor).verdict == "missing_physics"
+
+
+def test_dry_friction_is_named_with_its_force() -> None:
+    _, d, v = sweep()
+    found = report(K * d + C * v + 60 * np.tanh(v / 1e-3), d)
+    first = found.findings[0]
+    assert "coulomb_friction" in (first.family or first.effect)
+    quoted = {q.name: q.value for q in first.quoted}
+    force = quoted.get("breakaway_force", quoted.get("yield_force"))
+    assert force == pytest.approx(60, rel=0.1)
+
+
+def test_bouc_wen_is_named_and_its_values_are_right() -> None:
+    t, d, v = sweep()
+    alpha, beta, n = 2.0e5, 2000.0, 1.0
+
+    def rate(at: float, z: np.ndarray) -> np.ndarray:
+        now = np.interp(at, t, v)
+        return now - beta * (abs(now) * abs(z) ** (n - 1) * z + 0.5 * now * abs(z) ** n)
+
+    z = solve_ivp(rate, (0, t[-1]), [0.0], t_eval=t, max_step=1e-3, rtol=1e-6).y[0]
+    found = report(K * d + C * v + alpha * z, d)
+    assert "bouc_wen" in (found.findings[0].family or found.findings[0].effect)
+    quoted = {q.name: q for q in found.findings[0].quoted}
+    assert quoted["yield_force"].value == pytest.approx(alpha / (1.5 * beta), rel=0.1)
+    assert found.augmented_validation.nrmse < 3 * found.noise_floor.nrmse
+
+
+def test_friction_with_backlash_is_named_with_slip_gap_and_stiffness() -> None:
+    _, d, _ = sweep()
+    u, force, truth = 0.0, [], (900.0, 0.006, 4.0e5)
+    reach = truth[1] / 2 + truth[0] / truth[2]
+    for way in np.diff(d, prepend=d[0]):
+        u = float(np.clip(u + way, -reach, reach))
+        force.append(truth[2] * np.sign(u) * max(abs(u) - truth[1] / 2, 0.0))
+    found = report(np.array(force), d)
+    assert laws(found)[0] == "friction_backlash"
+    values = {p.name: p.value for p in found.findings[0].parameters}
+    assert values["force"] == pytest.approx(truth[0], rel=0.03)
+    assert values["gap"] == pytest.approx(truth[1], rel=0.05)
+    assert values["stiffness"] == pytest.approx(truth[2], rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("effect", "force"),
+    [
+        ("damper_blowoff", lambda d, v: K * d + C * np.clip(v, -0.03, 0.03) + 0.1 * C * (v - np.clip(v, -0.03, 0.03))),
+        ("damper_asymmetry", lambda d, v: K * d + C * v + 0.2 * C * np.abs(v)),
+        ("quadratic_damping", lambda d, v: K * d + C * v + 8e3 * v * np.abs(v)),
+        ("cubic_stiffness", lambda d, v: K * d + C * v + 1e8 * d**3),
+        ("bump_stop", lambda d, v: K * d + C * v + 3e5 * (d - np.clip(d, -0.009, 0.009))),
+        ("clearance", lambda d, v: K * (d - np.clip(d, -0.003, 0.003)) + C * v),
+    ],
+)
+def test_springs_and_dampers_that_are_not_linear_are_named(effect: str, force) -> None:
+    _, d, v = sweep()
+    found = report(force(d, v), d)
+    assert found.verdict == "missing_physics"
+    assert laws(found) == [effect]
+
+
+def test_what_no_law_explains_is_unknown_and_no_all_clear() -> None:
+    _, d, v = sweep()
+    found = report(K * d + C * v + 200 * np.sin(d / 0.0006) * np.sign(v), d)
+    assert found.verdict == "unknown_physics"
+    assert found.unexplained.share > 0.05
+    assert "Hz" in found.unexplained.where
+
+
+def test_a_force_of_the_wrong_sign_is_a_wrong_sign_and_no_physics() -> None:
+    _, d, v = sweep()
+    found = report(-(K * d + C * v), d)
+    assert found.verdict == "sensor_fault"
+    assert laws(found) == ["sign_reversed"]
+    assert found.findings[0].location == "cell"
+
+
+def test_standstill_is_cut_out_and_tells_the_noise() -> None:
+    _, d, v = sweep()
+    still = int(3 * RATE)
+    d, v = np.concatenate([np.full(still, d[0]), d]), np.concatenate([np.zeros(still), v])
+    found = report(K * d + C * v, d, noise=2.0)
+    assert found.verdict == "consistent"
+    assert found.noise_floor.nrmse * np.std(K * d[still:] + C * v[still:]) == pytest.approx(2.0, rel=0.4)
+
+
+def test_a_rod_that_does_not_move_is_too_still_to_decide() -> None:
+    random = np.random.default_rng(1)
+    values = np.column_stack([1e-6 * random.standard_normal(2000), random.standard_normal(2000)])
+    with pytest.raises(TooLittleError, match="damper is not moved"):
+        diagnose(system(), Recording(values))
+
+
+def test_a_foundation_that_hardly_moves_is_taken_for_ground() -> None:
+    _, d, v = sweep()
+    random = np.random.default_rng(2)
+    force = K * d + C * v + 60 * np.tanh(v / 1e-3) + random.standard_normal(len(d))
+    framed = parse_system(f"""
+name: damper in a frame
+sample_rate: {RATE}
+window: 64
+bodies: {{frame: {{mass: 1.0e6}}}}
+inputs:
+  rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}
+elements:
+  damper: {{upper: rod, lower: frame, stiffness: 4.0e4, damping: 1.5e3}}
+  foundation:
+    upper: frame
+    lower: ground
+    stiffness: {{value: 1.0e+9, fixed: true}}
+    damping: {{value: 1.0e+6, fixed: true}}
+sensors:
+  cell: {{kind: force, element: damper, csv: F, noise: 1.0}}
+""")
+    found = diagnose(framed, Recording(np.column_stack([d, force])))
+    assert found.verdict == "missing_physics"
+    assert any("taken for ground" in note for note in found.advice)
+
+
+def test_the_deviations_cover_the_truth() -> None:
+    _, d, v = sweep(20.0)
+    outside = []
+    for seed in range(12):
+        found = report(K * d + C * v + 40.0, d, noise=20.0, seed=seed)
+        truth = {"damper.stiffness": K, "damper.damping": C, "damper.preload": 40.0}
+        outside += [abs(p.value - truth[p.name]) / p.std for p in found.baseline]
+    assert 0.5 < np.sqrt(np.mean(np.square(outside))) < 1.6
+
+
+def test_paths_of_memories_follow_their_differential_equations() -> None:
+    t = np.linspace(0, 3, 3001)
+    d = 0.01 * np.sin(2 * np.pi * t) * (1 + 0.3 * np.sin(2.7 * t))
+    rate = np.gradient(d, t)
+
+    def solved(slope) -> np.ndarray:
+        return solve_ivp(lambda x, z: slope(np.interp(x, t, rate), z), (0, 3), [0.0], t_eval=t, max_step=5e-4).y[0]
+
+    reach = 0.004
+    np.testing.assert_allclose(presliding_path(d, reach), solved(lambda v, z: (v - abs(v) * z) / reach), atol=3e-3)
+    np.testing.assert_allclose(maxwell_path(d, 0.2, t[1]), solved(lambda v, z: v - z / 0.2), atol=2e-5)
+    beta = 1 / (1.5 * reach**2)
+    memory = solved(lambda v, z: v - beta * (abs(v) * abs(z) * z + 0.5 * v * z**2))
+    np.testing.assert_allclose(bouc_wen_path(d, reach, 2.0), memory / reach, atol=3e-3)
+    stop = stop_path(d, reach)
+    assert np.max(np.abs(stop)) == reach
+    inside = np.abs(stop[1:]) < reach
+    np.testing.assert_allclose(np.diff(stop)[inside], np.diff(d)[inside], atol=1e-12)
+
+
+def test_a_displacement_is_differentiated_with_its_noise_known() -> None:
+    _, d, v = sweep()
+    noise = 2e-5
+    shown = d + noise * np.random.default_rng(3).standard_normal(len(d))
+    motion = element_motion(shown, None, RATE)
+    assert white_noise(shown) == pytest.approx(noise, rel=0.1)
+    inner = slice(400, -400)
+    error = float(np.std((motion.rate - v)[inner]))
+    assert error < 0.1 * noise * RATE  # far less than differences of the samples would have
+    assert error < 2.5 * motion.rate_noise
+
+
+def test_standstill_is_found_and_its_noise_measured() -> None:
+    _, d, _ = sweep()
+    series = np.concatenate([np.full(600, d[0]), d])
+    (stretch, *_) = still_stretches(series, RATE)
+    assert stretch.start == 0
+    assert 560 <= stretch.stop <= 620
+    force = np.random.default_rng(4).standard_normal(len(series)) * 3.0
+    assert noise_at_rest(force, [stretch]) == pytest.approx(3.0, rel=0.1)

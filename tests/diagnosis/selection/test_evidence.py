@@ -1,0 +1,84 @@
+"""The deciding arithmetic, on its own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.selection.evidence import (
+    bic,
+    block_edges,
+    bounded_gain,
+    chance,
+    effective_count,
+    level_gain,
+    occam_cost,
+    profile_gain,
+    unusual_cost,
+)
+
+
+def packed(bins: int, sensors: int, level: np.ndarray, seed: int = 0) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return (random.standard_normal((2, bins, sensors)) * level[None, :, None]).ravel()
+
+
+@pytest.mark.parametrize("bins", [1, 5, 23, 24, 25, 60, 1000])
+def test_blocks_cover_short_records_too(bins: int) -> None:
+    edges = block_edges(bins)
+    assert edges[0] == 0
+    assert np.all(np.diff(edges) > 0)
+    assert edges[-1] < bins
+    r = packed(bins, 2, np.ones(bins))
+    assert profile_gain(r, r, 2, quiet=0.5) == 0.0
+
+
+def test_the_gain_of_a_small_effect_in_white_noise_is_the_fall_of_chi_square() -> None:
+    bins = 4000
+    after = packed(bins, 3, np.ones(bins))
+    before = after + 0.1 * packed(bins, 3, np.ones(bins), seed=1)
+    fall = float(before @ before - after @ after)
+    assert profile_gain(before, after, 3, quiet=0.5) == pytest.approx(fall, rel=0.05)
+
+
+def test_a_threefold_fall_of_chi_square_in_few_bins_is_never_evidence_against() -> None:
+    bins = 2000
+    line = np.zeros(bins)
+    line[5] = 600.0
+    loud = np.full(bins, 1.4)  # a law that makes every other bin a little louder
+    before = packed(bins, 1, np.ones(bins) + line)
+    after = packed(bins, 1, loud + line / np.sqrt(4.0), seed=1)
+    assert float(before @ before) > 2 * float(after @ after)
+    assert profile_gain(before, after, 1, quiet=0.5) > 0
+
+
+def test_gain_is_antisymmetric_so_that_a_better_fit_cannot_lose_to_a_worse_one() -> None:
+    random = np.random.default_rng(2)
+    for _ in range(50):
+        logs, falls = random.standard_normal(10), None
+        falls = np.sign(logs) * random.exponential(5.0, 10)
+        assert bounded_gain(logs, falls) == pytest.approx(-bounded_gain(-logs, -falls))
+        assert np.sign(bounded_gain(logs, falls)) in (0, np.sign(np.sum(falls)))
+
+
+def test_a_parameter_costs_what_the_recording_tells_about_it() -> None:
+    assert occam_cost([True], [1.0], np.array([10.0])) == 0.0
+    assert occam_cost([False], [2.0], np.array([1e-3])) > occam_cost([False], [2.0], np.array([1e-2])) > 0
+    assert unusual_cost(1.0, (0.1, 10.0)) == 0.0
+    assert unusual_cost(np.e * 10, (0.1, 10.0)) == pytest.approx(4.0)
+
+
+def test_chance_is_uniform_for_noise() -> None:
+    random = np.random.default_rng(3)
+    values = [chance(float(x), 2, 1) for x in random.chisquare(2, 4000)]
+    assert np.mean(np.array(values) < 0.1) == pytest.approx(0.1, abs=0.02)
+    assert chance(-5.0, 1, 100) == 1.0
+
+
+def test_what_repeats_itself_counts_once() -> None:
+    t = np.arange(4000)
+    noise = np.random.default_rng(4).standard_normal(4000)
+    assert effective_count(noise) > 3000
+    assert effective_count(np.sin(2 * np.pi * t / 100)) == pytest.approx(4, rel=0.1)
+    assert level_gain(2.0, 1.0, 10) == pytest.approx(10 * np.log(2))
+    assert bic(50.0, 3, 100) == pytest.approx(-50 + 3 * np.log(100))
