@@ -227,7 +227,7 @@ def _figures(names: list[str], per_sensor: FloatArray) -> FitFigures:
 
 
 def _candidates(one: Judged) -> list[Candidate]:
-    rows = {}
+    rows: dict[str, Candidate] = {}
     for step in one.found.steps:
         for ranked in (step.chosen, *step.rivals):
             delta = bic(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, int(ranked.count))
@@ -265,12 +265,10 @@ def _arrays(judged: list[Judged], sample_rate: float) -> dict[str, np.ndarray]:
     if all(len(j.record.task.force) == len(first.record.task.force) for j in judged):
         at = {id(j): slice(_fine_split(j), None) for j in judged}
         arrays["validation.time"] = first.final.task.motion.time[at[id(first)]]
-        for key, get in (
-            ("measured", lambda j: j.final.task.force),
-            ("baseline", lambda j: j.base.force),
-            ("augmented", lambda j: j.final.force),
-        ):
-            arrays[f"validation.{key}"] = np.column_stack([get(j)[at[id(j)]] for j in judged])
+        parts = [(j.final.task.force, j.base.force, j.final.force) for j in judged]
+        for number, key in enumerate(("measured", "baseline", "augmented")):
+            held = [series[number][at[id(j)]] for j, series in zip(judged, parts, strict=True)]
+            arrays[f"validation.{key}"] = np.column_stack(held)
         arrays["validation.noise"] = np.array([j.floor for j in judged])
     arrays["localization.names"] = np.array([j.record.element for j in judged], dtype=str)
     arrays["localization.score"] = np.array([j.found.base.error for j in judged])

@@ -11,9 +11,12 @@ from dataclasses import dataclass
 from math import comb
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.signals import FloatArray
+
+ComplexArray = NDArray[np.complexfloating]
 
 _ORDER = 6  # of the differences that tell white noise
 _BLOCKS = 40  # of them, the median counts: bursts are no noise
@@ -88,7 +91,7 @@ def element_motion(
 ) -> ElementMotion:
     """Motion from a measured displacement (T,) and, where there is one, a measured velocity (T,)."""
     count, step = len(displacement), 1 / sample_rate
-    time = start + step * np.arange(count)
+    time = start + step * np.arange(count, dtype=np.float64)
     spectrum, omega, line = _continued(displacement, sample_rate)
     noise = white_noise(displacement)
     passed = _wiener(spectrum, noise)
@@ -104,17 +107,18 @@ def element_motion(
         rate_spectrum = _wiener(rate_spectrum, level) * rate_spectrum
         rate_power = share * level**2
     here = slice(count, 2 * count)
-    rate = np.fft.irfft(rate_spectrum, 3 * count)[here] + line
-    smooth = np.fft.irfft(passed * spectrum, 3 * count)[here] + _line(displacement, sample_rate, count, line)
+    rate = np.asarray(np.fft.irfft(rate_spectrum, 3 * count)[here] + line, dtype=np.float64)
+    periodic = np.asarray(np.fft.irfft(passed * spectrum, 3 * count)[here], dtype=np.float64)
+    smooth = np.add(periodic, _line(displacement, sample_rate, count, line), dtype=np.float64)
     left = float(np.sqrt(np.mean(passed**2)) * noise)
     return ElementMotion(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
 
 
 def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> FloatArray:
-    return series[0] + slope * np.arange(count) / sample_rate
+    return np.asarray(series[0] + slope * np.arange(count) / sample_rate, dtype=np.float64)
 
 
-def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tuple[FloatArray, FloatArray, float]:
+def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tuple[ComplexArray, FloatArray, float]:
     """Spectrum of a series continued at both ends without a jump, three times as long; w; the slope taken out.
 
     Positions are continued as odd functions about their ends, so that their slope goes on; rates as even ones.
@@ -125,11 +129,11 @@ def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tupl
     sign = -1.0 if odd else 1.0
     # the line joins the two ends, so that both are zero and the odd continuation passes through them
     whole = np.concatenate([sign * rest[::-1], rest, sign * rest[::-1]])
-    omega = 2 * np.pi * np.fft.rfftfreq(3 * count, 1 / sample_rate)
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(3 * count, 1 / sample_rate), dtype=np.float64)
     return np.fft.rfft(whole), omega, slope
 
 
-def _wiener(spectrum: FloatArray, noise: float) -> FloatArray:
+def _wiener(spectrum: ComplexArray, noise: float) -> FloatArray:
     """Filter that passes what stands out of white noise, up to the highest such frequency."""
     count = 2 * (len(spectrum) - 1)
     power = np.abs(spectrum) ** 2 / max(count, 1)

@@ -34,7 +34,7 @@ class ComponentRules:
 
 
 RULES = ComponentRules()
-_LOST = 0.15  # of the stiffness: a spring that keeps less within its gap has lost it
+_LOST = 0.05  # of the stiffness: a spring that keeps less within its gap has lost it
 _SLIPS = 0.05  # of the time: what slips less has shown its gap only
 Progress = Callable[[str], None]
 

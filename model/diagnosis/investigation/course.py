@@ -8,6 +8,7 @@ from typing import Protocol
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.investigation.verdict import Errors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
@@ -115,6 +116,20 @@ class Investigation:
 
 
 @dataclass(frozen=True)
+class Judgement:
+    """What an investigation comes to."""
+
+    errors: Errors  # of the held-out part, per sensor
+    verdict: Verdict
+    floor: FloatArray  # bounded noise, in the sensors' units, (S,)
+    strange: float | None  # error over the signal of a model that does not describe the recording
+    lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
+    carried: bool  # the findings carry the verdict: what they explain outweighs what they leave
+    place: str  # where most of what is left is seen
+    where: str  # the same in words, with size and frequencies; empty where nothing is left
+
+
+@dataclass(frozen=True)
 class Outcome:
     """A finished investigation, with everything that the report is made from."""
 
@@ -123,3 +138,4 @@ class Outcome:
     before: FreeRun  # held-out part without the findings
     after: FreeRun  # held-out part with the findings
     noise_faults: tuple[NoiseFault, ...]
+    judgement: Judgement

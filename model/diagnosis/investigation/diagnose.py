@@ -21,6 +21,7 @@ from sprung.model.diagnosis.investigation.course import (
 )
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
+from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
@@ -55,7 +56,8 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
     before, after = state.held.runs(state.base.point, state.fit.point)
-    return Outcome(state, final, before, after, noise_faults(state, before, after))
+    noisy = noise_faults(state, before, after)
+    return Outcome(state, final, before, after, noisy, judged(state, before, after, noisy))
 
 
 def _begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:

@@ -72,8 +72,9 @@ def verdict_of(effects: Sequence[str], errors: Errors, rules: VerdictRules = RUL
     """The verdict for findings of the given effects, best first, and the errors that they leave."""
     left = bool(np.any(errors.unexplained(rules) > 0))
     named = [effect for effect in effects if effect not in NO_FAULTS]
-    if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and left:
-        return "unknown_physics"
+    faults_only = bool(named) and all(effect in SENSOR_FAULTS for effect in named)
+    if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and (left or not faults_only):
+        return "unknown_physics"  # no model of the vehicle, whatever the noise
     if not named:
         return "unknown_physics" if left else "consistent"
     share = errors.explained(rules)

@@ -24,10 +24,9 @@ from sprung.model.diagnosis.report.report import (
     ParameterValue,
     RecordingFacts,
     Report,
-    Verdict,
+    Unexplained,
 )
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
@@ -35,64 +34,124 @@ from sprung.model.system import System
 
 _NAMING_MARGIN = 6.0  # evidence by which a law must beat its look-alikes to be named alone (odds of 20 to 1)
 _CHANGED = 0.25  # a parameter this far from nominal, and surely so, is listed as changed
-_STRANGE = 0.6  # nrmse of the final model from which the system file does not describe this recording
+_ALIKE = 0.5  # correlation of measured and simulated from which a sign or a scale is a likely reason
+_SCALE = 3.0  # ratio of sizes that no parameter explains
+_FAR = 1.6  # log-ratio to nominal, a factor of 5: no rebuilt vehicle is as far off
 _NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
+_NO_LONGER = 900.0  # %, of a value that stood for something else
 _LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts as undecided
 
 
 def narrate(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
     course, before, after = outcome.investigation, outcome.before, outcome.after
-    names = course.signals.sensor_names
-    size = np.sqrt(np.mean(before.measured**2, axis=0))
-    floor = course.held.noise_rms(course.fit, course.problem.noise)
-    floor_figures = realised_floor(floor / np.where(size > 0, size, 1.0), after)
-    findings = [_input_finding(f) for f in course.input_faults]
-    findings += [_stuck_finding(name, at) for name, at in course.prepared.stuck]
-    findings += [_noise_finding(f) for f in outcome.noise_faults]
-    findings += _physics(outcome)
-    findings.sort(key=lambda f: f.delta_bic)
+    said, names = outcome.judgement, course.signals.sensor_names
+    findings = _findings(outcome)
     advice = [*course.prepared.notes, *course.notes, *_undecided(course)]
-    verdict = _verdict(findings)
-    strange = _blamed(course) if course.problem.follows else after.nrmse
-    if strange > _STRANGE and verdict != "sensor_fault":
-        verdict, findings = "unknown_physics", []
-        advice.insert(
-            0,
-            f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; "
-            "the system file does not seem to belong to this recording",
-        )
-    elif course.problem.follows and after.nrmse > _STRANGE and not course.held.still:
+    if said.strange is not None:
+        advice.insert(0, _nothing_fits(outcome, said.strange))
+    elif said.lost_phase and not course.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
-    explained = _explained(before, after, floor_figures) if course.found else None
+    explained = said.errors.explained() if course.found else None
+    left = said.errors.unexplained()
+    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), said.where)
     return Report(
         system=course.system.name,
         recording=RecordingFacts(
             course.options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
         ),
-        verdict=verdict,
+        verdict=said.verdict,
         baseline=_parameters(course.system, course.base),
         baseline_validation=_figures(names, before.per_sensor),
         findings=tuple(findings),
         augmented=_parameters(course.system, outcome.final),
         augmented_validation=_figures(names, after.per_sensor),
-        noise_floor=_figures(names, floor_figures),
+        noise_floor=_figures(names, said.errors.floor),
         localization=course.first.localization(),
         candidates=_candidates(course),
         changes=_changes(outcome),
         explained=explained,
-        summary=_summary(verdict, findings, explained),
+        unexplained=unexplained,
+        summary=_summary(outcome, findings, explained),
         advice=tuple(advice),
-        evidence=evidence_arrays(course, before, after, floor, [(f.location, f.effect) for f in findings]),
+        evidence=evidence_arrays(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
     )
 
 
-def _blamed(course: Investigation) -> float:
-    """Forces that nobody measured, as the noise of the measured ones, over the inertia forces, rms over rms."""
-    fit = course.fit
-    structure = fit.forward.plant.structure
-    inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
-    return float(np.sqrt(np.sum(structure.F**2 @ fit.noise.force**2) / np.sum(np.mean(inertia**2, axis=0))))
+def _findings(outcome: Outcome) -> list[Finding]:
+    """Findings, the strongest first: a channel that is dead, then by what each explains of chi-square."""
+    course, said = outcome.investigation, outcome.judgement
+    if said.strange is not None:
+        return []
+    ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
+    ranked += [(f.score, _input_finding(f)) for f in course.input_faults]
+    ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
+    if said.carried:
+        ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
+    ranked.sort(key=lambda pair: -pair[0])
+    findings = [finding for _, finding in ranked]
+    if said.verdict == "unknown_physics" and not any(f.effect == UNKNOWN for f in findings):
+        findings.insert(0, _unknown_finding(outcome))
+    return findings
+
+
+def _unknown_finding(outcome: Outcome) -> Finding:
+    """What is left above the noise, at the place where it is seen best, without a name."""
+    course, said = outcome.investigation, outcome.judgement
+    here = [hit for hit in course.last.hits if hit.location == said.place]
+    best = max(here, key=lambda hit: hit.score, default=None)
+    tried = ""
+    if course.found:
+        names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in course.found)
+        tried = f"; {names} would explain too little of it"
+    return Finding(
+        location=said.place,
+        effect=UNKNOWN,
+        parameters=(),
+        p_value=None if best is None else course.last.p_value(best),
+        delta_bic=None,
+        sentence=f"a misfit that no law explains: {said.where}{tried}",
+    )
+
+
+def _nothing_fits(outcome: Outcome, strange: float) -> str:
+    """That the system file does not describe the recording, and the likeliest reasons."""
+    return (
+        f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; the system file does not "
+        f"seem to belong to this recording. Likeliest: {'; '.join(likely_reasons(outcome))}"
+    )
+
+
+def likely_reasons(outcome: Outcome) -> list[str]:
+    """Two or three reasons for which nothing fits, by what the record shows."""
+    course, before = outcome.investigation, outcome.before
+    names = course.signals.sensor_names
+    turned, scales = [], []
+    for i, name in enumerate(names):
+        measured, simulated = before.measured[:, i], before.simulated[:, i]
+        power = float(np.sum(measured**2) * np.sum(simulated**2))
+        alike = float(measured @ simulated) / np.sqrt(power) if power > 0 else 0.0
+        if alike < -_ALIKE:
+            turned.append(name)
+        elif alike > _ALIKE:
+            scale = float(np.sqrt(np.sum(measured**2) / np.sum(simulated**2)))
+            if not 1 / _SCALE < scale < _SCALE:
+                scales.append(f"{name} is {scale:.3g} times what it should show (a unit or a scale?)")
+    reasons = [f"the sign of {', '.join(turned)}"] if turned else []
+    reasons += scales[:1]
+    sigma = np.sqrt(np.maximum(np.diag(course.base.covariance), 0))[: len(course.base.point.theta)]
+    far = [
+        i
+        for i in np.argsort(-np.abs(course.base.point.theta))
+        if abs(course.base.point.theta[i]) > _FAR * (1 + sigma[i])
+    ]
+    if far:
+        parameter = course.system.parameters[int(far[0])]
+        factor = float(np.exp(course.base.point.theta[int(far[0])]))
+        reasons.append(f"{parameter.name} came out {factor:.2g} times nominal, which is not plausible: units, masses")
+    reasons.append("an excitation that nobody measured")
+    reasons.append("channels swapped, sensors elsewhere than stated, or bodies that the file does not have")
+    return reasons[:3]
 
 
 def _figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
@@ -129,25 +188,6 @@ def _parameters(system: System, fit: Fit) -> tuple[ParameterValue, ...]:
         value = parameter.nominal * float(np.exp(fit.point.theta[i]))
         values.append(ParameterValue(parameter.name, value, value * float(sigma[i]), parameter.nominal, parameter.unit))
     return tuple(values)
-
-
-def _explained(before: FreeRun, after: FreeRun, floor: FloatArray) -> float | None:
-    """Share of the error power beyond the noise floor that the findings remove."""
-    excess = float(np.mean(before.per_sensor**2) - np.mean(floor**2))
-    left = float(np.mean(after.per_sensor**2) - np.mean(floor**2))
-    if excess <= 0:
-        return None
-    return float(np.clip(1 - left / excess, -1.0, 1.0))
-
-
-def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
-    """Noise floor of each sensor on the held-out samples themselves.
-
-    The estimated noise would give `expected` on average; these samples had their own.  Where the free run errs by
-    no more than that within sampling error, its error is noise, and is the floor.
-    """
-    spread = 4 * np.sqrt(1 / (2 * len(after.measured)))
-    return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
 
 
 def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
@@ -251,7 +291,7 @@ def _sentence(outcome: Outcome, term: Term, finding: Finding) -> str:
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
     bias = _worst_bias(outcome)
     if bias is not None:
-        sentence += f"; without it {bias}"
+        sentence += f"; {bias}"
     return sentence
 
 
@@ -268,7 +308,9 @@ def _worst_bias(outcome: Outcome) -> str | None:
         return None
     change = 100 * (np.exp(shift[worst]) - 1)
     side = "high" if change > 0 else "low"
-    return f"{course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"
+    if change > _NO_LONGER:
+        return f"{course.system.parameters[worst].name} is then no longer needed"
+    return f"without it {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"
 
 
 def _input_finding(fault: InputFault) -> Finding:
@@ -280,7 +322,7 @@ def _input_finding(fault: InputFault) -> Finding:
         effect=fault.term.law.name,
         parameters=(parameter,),
         p_value=fault.p_value,
-        delta_bic=-fault.score,
+        delta_bic=None,
         runner_up=fault.runner_up,
         sentence=f"{fault.term.location}: {words}",
     )
@@ -292,7 +334,7 @@ def _noise_finding(fault: NoiseFault) -> Finding:
         effect="sensor_noise",
         parameters=(LawParameter("ratio", fault.ratio, fault.std, "1"),),
         p_value=fault.p_value,
-        delta_bic=-(fault.sigmas**2),
+        delta_bic=None,
         sentence=f"{fault.location}: {fault.ratio:.3g} times the noise declared, its peers {fault.usual:.3g} times",
     )
 
@@ -302,20 +344,10 @@ def _stuck_finding(name: str, at: float) -> Finding:
         location=name,
         effect="sensor_stuck",
         parameters=(),
-        p_value=0.0,
-        delta_bic=-1e6,
+        p_value=None,
+        delta_bic=None,
         sentence=f"{name}: repeats one value from {at:.2f} s on; it was left out of the diagnosis",
     )
-
-
-def _verdict(findings: list[Finding]) -> Verdict:
-    if not findings:
-        return "consistent"
-    faults = {"sensor_gain", "sensor_lag", "sensor_bias", "sensor_noise", "sensor_stuck", "axle_delay"}
-    physics = [f for f in findings if f.effect not in faults]
-    if not physics:
-        return "sensor_fault"
-    return "unknown_physics" if physics[0].effect == UNKNOWN else "missing_physics"
 
 
 def _undecided(course: Investigation) -> list[str]:
@@ -364,10 +396,14 @@ def _candidates(course: Investigation) -> tuple[Candidate, ...]:
     return tuple([*fitted, *screened][:20])
 
 
-def _summary(verdict: Verdict, findings: list[Finding], explained: float | None) -> str:
-    if verdict == "consistent":
+def _summary(outcome: Outcome, findings: list[Finding], explained: float | None) -> str:
+    said = outcome.judgement
+    if said.verdict == "consistent":
         return "The nominal structure explains the recording down to the noise."
     text = "; ".join(f.sentence for f in findings) or "Nothing in the system file fits this recording"
-    if explained is not None and explained > 0:
-        text += f"; explains {100 * explained:.0f} % of the excess error"
+    if said.carried and said.strange is None and explained is not None and explained > 0:
+        share = "100" if not said.where else f"{min(100 * explained, 99):.0f}"
+        text += f"; explains {share} % of the excess error"
+        if said.where:
+            text += f"; still unexplained: {said.where}"
     return text + "."

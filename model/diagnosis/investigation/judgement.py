@@ -1,0 +1,118 @@
+"""An investigation judged: its errors on the held-out part, what of them is noise, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
+from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
+from sprung.model.diagnosis.investigation.verdict import RULES, Errors, bounded_noise, verdict_of
+from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.signals import FloatArray
+
+_SPREAD = 4.0  # standard deviations by which the noise of so many samples may leave its mean
+_BAND = 0.8  # of the power of what is left, for the frequencies where it lies
+
+
+def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> Judgement:
+    """Errors and verdict of an investigation.
+
+    Where laws follow the sensors' motion and the free run loses its phase, errors of the run say little: then the
+    forces that nobody measured are judged, over the inertia forces.
+    """
+    noise = bounded(state)
+    floor = state.held.noise_rms(state.fit, noise)
+    size = np.sqrt(np.mean(before.measured**2, axis=0))
+    expected = floor / np.where(size > 0, size, 1.0)
+    errors = Errors(before.per_sensor, after.per_sensor, realised_floor(expected, after))
+    lost = state.problem.follows and after.nrmse > RULES.strange
+    deciding = errors
+    if lost:
+        shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]
+        deciding = Errors(*(np.array([share]) for share in shares))
+    effects = [fault.term.law.name for fault in state.input_faults]
+    effects += ["sensor_stuck"] * len(state.prepared.stuck) + ["sensor_noise"] * len(noisy)
+    effects += [found.trial.term.law.name for found in state.found]
+    verdict = verdict_of(effects, deciding)
+    strange = float(np.sqrt(np.mean(deciding.after**2)))
+    carried = verdict != "unknown_physics" or not state.found or state.found[0].trial.term.law.name == "unknown"
+    return Judgement(
+        errors=errors,
+        verdict=verdict,
+        floor=floor,
+        strange=strange if verdict == "unknown_physics" and strange > RULES.strange else None,
+        lost_phase=lost,
+        carried=carried,
+        place=_place(state),
+        where=_words(state, errors, after),
+    )
+
+
+def bounded(state: Investigation) -> Noise:
+    """Noise levels that the floor may use: learnt ones, no higher than declared or seen above the compared band."""
+    prepared = state.prepared.signals
+    declared = declared_noise(state.system, prepared)
+    present = np.isin(prepared.sensor_index, state.signals.sensor_index)
+    known = declared.sensors[present]
+    seen = upper_ratio(state, known) * known
+    noise = state.problem.noise
+    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0))
+    force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)))
+    return replace(noise, sensors=sensors, force=force)
+
+
+def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
+    """Noise floor of each sensor on the held-out samples themselves.
+
+    The estimated noise would give `expected` on average; these samples had their own.  Where the free run errs by
+    no more than that within sampling error, its error is noise, and is the floor.
+    """
+    spread = _SPREAD * np.sqrt(1 / (2 * len(after.measured)))
+    return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
+
+
+def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ...]:
+    """Fits and force noise before, after, and as far as bounded."""
+    return (state.base, state.base.noise), (state.fit, state.fit.noise), (state.fit, noise)
+
+
+def _unmeasured(state: Investigation, fit: Fit, force: FloatArray) -> float:
+    """Forces that nobody measured, as noise of the measured ones, over the inertia forces, rms over rms."""
+    structure = fit.forward.plant.structure
+    inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)
+    return float(np.sqrt(np.sum(structure.F**2 @ force**2) / np.sum(np.mean(inertia**2, axis=0))))
+
+
+def _place(state: Investigation) -> str:
+    """Where the screening sees most of what is left."""
+    here = [hit for hit in state.last.hits if hit.family in ("law", "unnamed")] or list(state.last.hits)
+    return max(here, key=lambda hit: hit.score).location if here else next(iter(state.system.elements), "")
+
+
+def _words(state: Investigation, errors: Errors, after: FreeRun) -> str:
+    """Place, size and frequencies of what is left, empty where nothing is."""
+    left = errors.unexplained()
+    if not np.any(left > 0):
+        return ""
+    worst = int(np.argmax(left))
+    error = after.measured[:, worst] - after.simulated[:, worst]
+    low, high = main_band(error, state.signals.sample_rate)
+    return (
+        f"{100 * errors.after[worst]:.0f} % of {state.signals.sensor_names[worst]} "
+        f"({100 * errors.floor[worst]:.1f} % is noise), most of it at {low:.2g} to {high:.2g} Hz; "
+        f"most suspicious is {_place(state).replace('|', ' and ')}"
+    )
+
+
+def main_band(error: FloatArray, sample_rate: float) -> tuple[float, float]:
+    """The frequencies between which most of the power of an error (T,) lies, Hz."""
+    power = np.abs(np.fft.rfft(error - np.mean(error))) ** 2
+    share = np.cumsum(power) / max(float(np.sum(power)), 1e-300)
+    frequency = np.fft.rfftfreq(len(error), 1 / sample_rate)
+    ends = [(1 - _BAND) / 2, (1 + _BAND) / 2]
+    low, high = (float(frequency[min(int(np.searchsorted(share, end)), len(frequency) - 1)]) for end in ends)
+    return low, high
