@@ -65,7 +65,8 @@ nrmse is rms(error) / rms(measured), pooled over the sensors.</p></section>
 {% for f in report.findings %}<tr><td><b>{{ f.location }}</b></td>
 <td>{{ effect(f.effect) }}{% if f.family %} ({{ f.family }}){% endif %}</td>
 <td>{% for p in f.parameters %}{{ p.name }} {{ quantity(p) }}{{ ', ' if not loop.last }}{% endfor %}</td>
-<td class="n">{{ probability(f.p_value) }}</td><td class="n">{{ '%.0f' % f.delta_bic }}</td>
+<td class="n">{{ probability(f.p_value) if f.p_value is not none else '-' }}</td>
+<td class="n">{{ '%.0f' % f.delta_bic if f.delta_bic is not none else '-' }}</td>
 {% if f.runner_up %}<td>{{ effect(f.runner_up[0]) }}{% if f.runner_up_location %} at {{ f.runner_up_location }}
 {% endif %}</td><td class="n">{{ '%.0f' % f.runner_up[1] }}</td>{% else %}<td>-</td><td></td>{% endif %}</tr>
 {% endfor %}</table></div>
