@@ -22,6 +22,7 @@ from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
 from sprung.service.live import LiveFeed
 from sprung.service.metrics import Metrics
+from sprung.service.operations import Operations
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
 from sprung.service.ring import Rings
@@ -51,6 +52,7 @@ class Core:
     housekeeping: Housekeeping
     hub: Hub
     condition: Condition
+    operations: Operations
     stopping: threading.Event
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
 
@@ -116,6 +118,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         housekeeping,
         hub,
         Condition(settings, store),
+        Operations(settings, pipeline, board),
         stopping,
     )
     waiting = {"windows": lambda: compute.waiting, "jobs": lambda: jobs.waiting}

@@ -14,7 +14,7 @@ from sprung.service.errors import Busy, UserError
 from sprung.service.jobs import Jobs, Progress
 from sprung.service.pipeline import Batch
 from sprung.service.recordings import stored_file
-from sprung.service.ring import Rings
+from sprung.service.ring import Excerpt, Rings
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
@@ -54,6 +54,10 @@ class Diagnoses:
         else:
             with self._lock:
                 self._started[batch.vehicle] = job.id
+
+    def excerpt(self, vehicle: str) -> Excerpt | None:
+        """The samples that are held of a vehicle."""
+        return self._rings.excerpt(vehicle)
 
     def from_excerpt(self, vehicle: str) -> JobRow:
         """Accept a diagnosis of a vehicle's last minute.  Raises UserError when nothing is held of it, or Busy."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Annotated, TypeVar
 
 from fastapi import Depends, Request
@@ -24,6 +25,22 @@ def get_core(request: Request) -> Core:
 
 
 CoreOf = Annotated[Core, Depends(get_core)]
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """Who sends a request."""
+
+    name: str = "local"
+
+
+def get_actor(request: Request) -> Actor:
+    """Whom the guard found; `local` where nobody needs to sign in."""
+    found: Actor = request.scope.get("sprung.actor") or Actor()
+    return found
+
+
+ActorOf = Annotated[Actor, Depends(get_actor)]
 
 
 async def read(core: Core, query: Callable[[Connection], T]) -> T:

@@ -9,13 +9,27 @@ from fastapi import Depends, FastAPI
 from fastapi.concurrency import run_in_threadpool
 
 from sprung import __version__
-from sprung.service.api import diagnose, docs, events, fleet, health, history, identify, problems, recordings
+from sprung.service.api import (
+    actions,
+    diagnose,
+    docs,
+    events,
+    fleet,
+    health,
+    history,
+    identify,
+    lists,
+    problems,
+    recordings,
+    signals,
+)
 from sprung.service.api.description import PROBLEMS, describe
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
 from sprung.service.core import Core
 from sprung.service.pages import routes as fleet_page
 from sprung.service.pages import vehicle as vehicle_page
+from sprung.service.pages import work as work_pages
 from sprung.service.pages.static import assets
 
 DESCRIPTION = (
@@ -50,7 +64,8 @@ def create_app(
     app.state.core = core
     problems.install(app)
     describe(app)
-    for part in (identify, fleet, history, events, recordings, diagnose, health, docs, fleet_page, vehicle_page):
+    parts = (identify, fleet, history, signals, actions, lists, events, recordings, diagnose, health, docs)
+    for part in (*parts, fleet_page, vehicle_page, work_pages):
         app.include_router(part.router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
     app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes

@@ -1,71 +1,131 @@
-"""`GET /pages/vehicles/{id}`: one vehicle."""
+"""`GET /pages/vehicles/{id}`: one vehicle as a person who must decide about it needs to see it."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 from fastapi import APIRouter
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
+from sprung.model.system import System
 from sprung.service.api.access import CoreOf, known_vehicle, read
-from sprung.service.api.fleet import load_view
-from sprung.service.core import Core
-from sprung.service.pages.plot import Trace, drift_svg
-from sprung.service.pages.render import render
+from sprung.service.api.actions import mark_dict
+from sprung.service.api.fleet import load_view, silent_before
+from sprung.service.api.lists import report_dict
+from sprung.service.pages.drawing import Mark, plan_view, side_view
+from sprung.service.pages.render import percent, render
 from sprung.service.pages.routes import HEALTH
-from sprung.service.store import fleet, history, status, work
+from sprung.service.pages.states import hints
+from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
-from sprung.service.times import to_iso
-from sprung.service.views import VehicleView, alarm_dict
+from sprung.service.views import ParameterView, VehicleView, alarm_dict
 
 router = APIRouter(include_in_schema=False)
-
-SHOWN_ALARMS = 50
-PLOT_POINTS = 180
-FOREVER = 2**63 - 1
+SHOWN = 50  # alarms, marks, reports
 
 
 @router.get("/pages/vehicles/{id}")
 async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
-    """One vehicle: parameters, drift, alarms, reports."""
+    """One vehicle: drawing, history, alarms, sensors, what was done to it."""
+    system = core.engine.system
 
     def query(connection: Connection) -> dict[str, Any]:
         row = status.fleet_row(connection, id)
         known_vehicle(row is not None, id)
-        view = load_view(core, connection, id)
+        assert row is not None
         return {
-            "view": view,
-            "plots": _plots(core, connection, view),
-            "alarms": [alarm_dict(a) for a in fleet.list_alarms(connection, WantedAlarms(id), SHOWN_ALARMS)],
-            "reports": work.list_reports(connection, id, SHOWN_ALARMS),
-            "windows": row.windows if row is not None else {},
+            "row": row,
+            "view": load_view(core, connection, id),
+            "alarms": [alarm_dict(a) for a in fleet.list_alarms(connection, WantedAlarms(id), SHOWN)],
+            "active": fleet.list_alarms(connection, WantedAlarms(id, active=True), SHOWN),
+            "marks": [mark_dict(mark) for mark in marks.list_marks(connection, id, SHOWN)],
+            "reports": [report_dict(r) for r in lists.list_reports(connection, SHOWN, vehicle_id=id)],
+            "reasons": status.reasons_of(connection, id, core.pipeline.model_id),
         }
 
     values = await read(core, query)
-    return HTMLResponse(render("vehicle.html", **values, health=HEALTH, to_iso=to_iso))
-
-
-def _plots(core: Core, connection: Connection, view: VehicleView) -> list[str]:
-    key = (view.vehicle, core.pipeline.model_id)
-    resolution = history.fitting_resolution(connection, *key, 0, FOREVER, PLOT_POINTS)
-    points = history.history(connection, *key, 0, FOREVER, resolution, 2 * PLOT_POINTS)
-    if not points:
-        return []
-    ratio = np.exp(np.stack([p.mean for p in points]))  # shape (n, P)
-    std = ratio * np.stack([p.std for p in points])
-    times = [p.time for p in points]
-    return [
-        drift_svg(
-            Trace(
-                p.name,
-                times,
-                ratio[:, i],
-                std[:, i],
-                None if p.baseline is None else p.baseline / p.nominal,
-                p.alarm,
-            )
+    view, row = values["view"], values["row"]
+    silent = row.received_ns < silent_before(core)
+    parameters = {p.name: parameter_mark(p) for p in view.parameters}
+    sensors = sensor_marks(system, view)
+    return HTMLResponse(
+        render(
+            "vehicle.html",
+            **values,
+            health=HEALTH,
+            silent=silent,
+            hints=hints(row, view, values["active"], values["reasons"], silent, sensors),
+            side=side_view(system, parameters, sensors),
+            plan=plan_view(system, parameters),
+            sensors=sensors,
+            data=page_data(system, view, values["alarms"], values["marks"]),
         )
-        for i, p in enumerate(view.parameters)
-    ]
+    )
+
+
+def parameter_mark(p: ParameterView) -> Mark:
+    """How a parameter is shown in the drawing."""
+    text = percent(p.drift, 0).replace(" ", "") if p.alarm is not None else ""
+    return Mark(p.state, {"learning": "…", "not_identifiable": "?"}.get(p.state, text))
+
+
+def sensor_marks(system: System, view: VehicleView) -> dict[str, Mark]:
+    """How sensors are shown: suspect where an alarm says so, absent where the newest window had no samples."""
+    suspects = {getattr(a, "channel", None) or a.parameter for a in view.active if a.kind == "sensor"}
+    found = {}
+    for name in system.sensors:
+        if name in suspects:
+            found[name] = Mark("suspect")
+        elif name in view.per_sensor:
+            found[name] = Mark("ok")
+        else:
+            found[name] = Mark("absent" if view.per_sensor else "learning")
+    return found
+
+
+def page_data(
+    system: System, view: VehicleView, alarms: list[dict[str, Any]], made: list[dict[str, Any]]
+) -> dict[str, Any]:
+    """What the page's script needs."""
+    first = max(view.parameters, key=_attention, default=None)
+    return {
+        "vehicle": view.vehicle,
+        "hop": system.hop / system.sample_rate,
+        "first": None if first is None else first.name,
+        "parameters": {p.name: {"unit": p.unit, "nominal": p.nominal, "baseline": p.baseline} for p in view.parameters},
+        "twins": twins(system, view.parameters),
+        "alarms": [{key: a[key] for key in ("parameter", "kind", "onset", "recovered", "severity")} for a in alarms],
+        "marks": [{key: m[key] for key in ("kind", "time", "text")} for m in made],
+        "last": view.last_window_ns and view.last_window_ns // 1_000_000,
+    }
+
+
+def twins(system: System, parameters: tuple[ParameterView, ...]) -> dict[str, dict[str, list[str]]]:
+    """For every parameter those of the same kind: on the other side, at the other end, all."""
+    places = {name: item.position for name, item in system.file.elements.items()}
+    found: dict[str, dict[str, list[str]]] = {}
+    for p in parameters:
+        same = [q for q in parameters if q.quantity == p.quantity and q.unit == p.unit and q.name != p.name]
+        alike = [q for q in same if _head(q.element) == _head(p.element)]
+        side = [q.name for q in alike if _mirrored(places, p, q, x=1, y=-1)]
+        end = [q.name for q in alike if _mirrored(places, p, q, x=-1, y=1)]
+        found[p.name] = {"side": side, "end": end, "all": [q.name for q in alike]}
+    return found
+
+
+def _mirrored(places: Mapping[str, Any], p: ParameterView, q: ParameterView, x: int, y: int) -> bool:
+    one, other = places.get(p.element), places.get(q.element)
+    if one is None or other is None:
+        return False
+    return math.isclose(other[0], x * one[0], abs_tol=0.05) and math.isclose(other[1], y * one[1], abs_tol=0.05)
+
+
+def _head(element: str) -> str:
+    return element.split("_", 1)[0]
+
+
+def _attention(p: ParameterView) -> tuple[int, float]:
+    return ("not_identifiable", "learning", "ok", "warning", "alarm").index(p.state), abs(p.drift or 0.0)

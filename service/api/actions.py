@@ -1,0 +1,160 @@
+"""What operators do: acknowledge, note, mark a maintenance, rename, retire, delete."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+from pydantic import Field
+
+from sprung.model.tracking.tracker import TrackerStateError
+from sprung.service.api import models
+from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
+from sprung.service.api.bodies import Strict
+from sprung.service.api.fleet import vehicle_answer
+from sprung.service.api.idempotency import Once, OnceOf
+from sprung.service.api.problems import Problem
+from sprung.service.api.queries import Id, Limit
+from sprung.service.store import fleet, marks
+from sprung.service.store.marks import MarkRow
+from sprung.service.times import from_iso, to_iso
+
+router = APIRouter(tags=["operation"])
+Text = Annotated[str, Field(min_length=1, max_length=2000, examples=["damper 2l replaced, order 4711"])]
+
+
+class AcknowledgeBody(Strict):
+    """Which alarm was seen."""
+
+    alarm: int | None = Field(default=None, ge=1, le=2**63 - 1, description="its id; left out: all that are active")
+
+
+class NoteBody(Strict):
+    """A note on the time line."""
+
+    text: Text
+    time: str | None = Field(default=None, max_length=40, description="RFC 3339; now where left out")
+
+
+class MaintenanceBody(NoteBody):
+    """A repair or an overhaul, after which healthy values are other ones."""
+
+    parameters: list[Annotated[str, Field(max_length=160)]] | None = Field(
+        default=None,
+        max_length=1000,
+        description="whose baselines are learned anew: left out or null for all, [] for none",
+        examples=[["secondary_2l.damping"]],
+    )
+
+
+class VehicleBody(Strict):
+    """What is to be changed; what is left out stays."""
+
+    label: str | None = Field(default=None, max_length=128, description="what people call it; empty takes it away")
+    retired: bool | None = Field(default=None, description="out of service: not listed, data kept")
+
+
+@router.post("/vehicles/{id}/acknowledge", summary="Acknowledge alarms", response_model=models.Vehicle)
+async def acknowledge(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: AcknowledgeBody) -> Response:
+    """Somebody has seen them; they stay active until the vehicle is well again."""
+
+    async def act() -> Response:
+        await run_in_threadpool(core.operations.acknowledge, actor.name, id_, body.alarm)
+        return json_response(await read(core, lambda connection: vehicle_answer(core, connection, id_)))
+
+    return await _once(once, act)
+
+
+@router.get("/vehicles/{id}/marks", summary="Notes and maintenance", response_model=models.Marks)
+async def list_marks(core: CoreOf, id_: Id, limit: Limit = 100) -> Response:
+    """Marks on the vehicle's time line, newest first."""
+
+    def query(connection: Any) -> list[MarkRow]:
+        known_vehicle(fleet.vehicle_exists(connection, id_), id_)
+        return marks.list_marks(connection, id_, limit)
+
+    return json_response({"vehicle": id_, "marks": [mark_dict(row) for row in await read(core, query)]})
+
+
+@router.post("/vehicles/{id}/notes", status_code=201, summary="Write a note", response_model=models.Mark)
+async def note(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: NoteBody) -> Response:
+    """A line on the vehicle's time line."""
+
+    async def act() -> Response:
+        kept = await run_in_threadpool(core.operations.note, actor.name, id_, body.text, _time(body.time))
+        return json_response(mark_dict(kept), 201)
+
+    return await _once(once, act)
+
+
+@router.post("/vehicles/{id}/maintenance", status_code=201, summary="Mark a maintenance", response_model=models.Mark)
+async def maintenance(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: MaintenanceBody) -> Response:
+    """Closes the alarms of the parameters that were worked on and learns their baselines anew."""
+
+    async def act() -> Response:
+        time = _time(body.time)
+        try:
+            kept = await run_in_threadpool(
+                core.operations.maintenance, actor.name, id_, body.text, time, body.parameters
+            )
+        except TrackerStateError as error:
+            raise Problem(422, str(error), [{"field": "parameters", "detail": str(error)}]) from error
+        return json_response(mark_dict(kept), 201)
+
+    return await _once(once, act)
+
+
+@router.patch("/vehicles/{id}", summary="Rename or retire a vehicle", response_model=models.Vehicle)
+async def change(core: CoreOf, actor: ActorOf, id_: Id, body: VehicleBody) -> Response:
+    """What is left out stays as it is."""
+    if "label" in body.model_fields_set:
+        await run_in_threadpool(core.operations.rename, actor.name, id_, (body.label or "").strip() or None)
+    if body.retired is not None:
+        await run_in_threadpool(core.operations.retire, actor.name, id_, body.retired)
+    return json_response(await read(core, lambda connection: vehicle_answer(core, connection, id_)))
+
+
+@router.delete("/vehicles/{id}", status_code=204, summary="Delete a vehicle and its data")
+async def remove(
+    core: CoreOf,
+    actor: ActorOf,
+    id_: Id,
+    confirm: Annotated[str, Query(max_length=128, description="the vehicle's id once more")],
+) -> Response:
+    """Windows, alarms, marks, reports and uploaded files go; the audit log keeps that they did."""
+    if confirm != id_:
+        raise Problem(422, "confirm must repeat the vehicle's id", [{"field": "confirm", "detail": "is another id"}])
+    await run_in_threadpool(core.operations.remove, actor.name, id_)
+    return Response(status_code=204)
+
+
+def mark_dict(row: MarkRow) -> dict[str, Any]:
+    """JSON of a mark."""
+    return {
+        "id": row.id,
+        "kind": row.kind,
+        "time": to_iso(row.time_ns),
+        "text": row.text,
+        "parameters": row.parameters,
+        "author": row.author,
+        "created": to_iso(row.created_ns),
+    }
+
+
+async def _once(once: Once, act: Any) -> Response:
+    answer: Response = await once.answer(act)
+    return answer
+
+
+def _time(text: str | None) -> int | None:
+    if text is None:
+        return None
+    try:
+        time = from_iso(text)
+    except (ValueError, OverflowError):
+        time = -1
+    if not 0 <= time < 2**63:
+        raise Problem(422, "time is no RFC 3339 time", [{"field": "time", "detail": "is no RFC 3339 time"}])
+    return time

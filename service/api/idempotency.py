@@ -1,0 +1,96 @@
+"""`Idempotency-Key`: a request that is sent twice is carried out once.
+
+As in the draft of the IETF (draft-ietf-httpapi-idempotency-key-header): the first answer is kept for a day and given
+again; the same key for another request is refused, and so is one whose first request is still being worked on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import threading
+from collections.abc import Awaitable, Callable
+from typing import Annotated
+
+from fastapi import Depends, Header, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+from sqlalchemy import delete, select
+
+from sprung.service.api.access import ActorOf, CoreOf, json_response
+from sprung.service.api.problems import Problem
+from sprung.service.core import Core
+from sprung.service.store.engine import insert_or_ignore
+from sprung.service.store.schema import idempotency
+from sprung.service.times import NANOSECONDS, now_ns
+
+KEPT = 86_400 * NANOSECONDS
+Key = Annotated[str | None, Header(alias="Idempotency-Key", max_length=200, description="sent twice, carried out once")]
+_running: set[str] = set()
+_lock = threading.Lock()
+
+
+class Once:
+    """Carries a request out unless an answer to its key is there."""
+
+    def __init__(self, core: Core, key: str | None, request: str) -> None:
+        self._core = core
+        self._key = key
+        self._request = request
+
+    async def answer(self, act: Callable[[], Awaitable[Response]]) -> Response:
+        """The answer of `act`, or the one that was given before.  Errors are not kept."""
+        if self._key is None:
+            return await act()
+        with _lock:
+            if self._key in _running:
+                raise Problem(
+                    409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"}
+                )
+            _running.add(self._key)
+        try:
+            kept = await run_in_threadpool(self._find)
+            if kept is not None:
+                return kept
+            response = await act()
+            await run_in_threadpool(self._keep, response)
+            return response
+        finally:
+            with _lock:
+                _running.discard(self._key)
+
+    def _find(self) -> Response | None:
+        table = idempotency
+        with self._core.store.write() as connection:
+            connection.execute(delete(table).where(table.c.created_ns < now_ns() - KEPT))
+            row = connection.execute(select(table).where(table.c.key == self._key)).first()
+        if row is None:
+            return None
+        if row.request != self._request:
+            detail = "was used for another request"
+            raise Problem(422, f"Idempotency-Key {detail}", [{"field": "Idempotency-Key", "detail": detail}])
+        headers = {"Idempotency-Replayed": "true"} | ({"Location": row.location} if row.location else {})
+        return json_response(row.body, row.status, headers)
+
+    def _keep(self, response: Response) -> None:
+        row = {
+            "key": self._key,
+            "request": self._request,
+            "status": response.status_code,
+            "body": json.loads(bytes(response.body)),
+            "location": response.headers.get("location"),
+            "created_ns": now_ns(),
+        }
+        with self._core.store.write() as connection:
+            insert_or_ignore(connection, idempotency, [row])
+
+
+async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> Once:
+    """What a route needs to be carried out once; JSON bodies count as part of the request."""
+    kind = request.headers.get("content-type", "").split(";")[0]
+    body = await request.body() if key is not None and kind == "application/json" else b""
+    parts = [request.method.encode(), request.url.path.encode(), actor.name.encode(), body]
+    return Once(core, key, hashlib.sha256(b"\n".join(parts)).hexdigest())
+
+
+OnceOf = Annotated[Once, Depends(once)]

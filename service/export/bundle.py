@@ -1,0 +1,84 @@
+"""An alarm as one file: raw signals, simulation, residuals, estimates and events, for Foxglove and its like."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.service.engine import Engine
+from sprung.service.export.messages import COMPARED, ESTIMATE, FIT, SIGNAL, McapFile
+from sprung.service.export.tables import estimate, values_of
+from sprung.service.ring import Excerpt
+from sprung.service.simulated import Compared
+from sprung.service.store.fleet import AlarmRow
+from sprung.service.store.history import Series
+from sprung.service.store.marks import MarkRow
+from sprung.service.times import NANOSECONDS
+
+BUNDLE_MEDIA = "application/octet-stream"
+INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """What the store knows of a vehicle."""
+
+    vehicle: str
+    series: Series
+    alarms: Sequence[AlarmRow]
+    marks: Sequence[MarkRow]
+
+
+def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> bytes:
+    """The file.  Topics: /signals/CHANNEL, /compared/SENSOR, /fit, /estimate/ELEMENT/QUANTITY, /events."""
+    sink = io.BytesIO()
+    about = {"vehicle": found.vehicle, "model": engine.digest, "system": engine.system.name}
+    with McapFile(sink, about) as file:
+        if excerpt is not None:
+            _signals(file, engine, excerpt)
+        for window in windows:
+            _compared(file, engine, window)
+        for parameter in engine.system.parameters:
+            value, std = values_of(engine, parameter.name, found.series)
+            topic = f"/estimate/{parameter.element}/{parameter.quantity}"
+            for i in np.flatnonzero(np.isfinite(value)).tolist():
+                file.write(topic, ESTIMATE, int(found.series.time[i]), estimate(value[i], std[i], parameter.nominal))
+        for alarm in found.alarms:
+            _alarm(file, alarm)
+        for mark in found.marks:
+            file.event(mark.time_ns, INFO, mark.kind, f"{mark.text} ({mark.author})")
+    return sink.getvalue()
+
+
+def _signals(file: McapFile, engine: Engine, excerpt: Excerpt) -> None:
+    for column, channel in enumerate(engine.system.channels):
+        for row in np.flatnonzero(np.isfinite(excerpt.values[:, column])).tolist():
+            time = excerpt.start + round(row * NANOSECONDS / excerpt.sample_rate)
+            file.write(f"/signals/{channel.name}", SIGNAL, time, {"value": float(excerpt.values[row, column])})
+
+
+def _compared(file: McapFile, engine: Engine, window: Compared) -> None:
+    step = NANOSECONDS / window.sample_rate
+    for i, name in enumerate(engine.system.sensors):
+        for row in range(len(window.simulated)):
+            measured, simulated = float(window.measured[row, i]), float(window.simulated[row, i])
+            message = {"simulated": simulated}
+            if np.isfinite(measured):
+                message |= {"measured": measured, "residual": measured - simulated}
+            file.write(f"/compared/{name}", COMPARED, window.start + round(row * step), message)
+    if np.isfinite(window.estimate.nrmse):
+        message = {"nrmse": float(window.estimate.nrmse), "adequate": bool(window.estimate.adequate)}
+        file.write("/fit", FIT, window.start, message)
+
+
+def _alarm(file: McapFile, alarm: AlarmRow) -> None:
+    level = ERROR if alarm.severity == "alarm" else WARNING
+    what = alarm.parameter or "windows no longer fit the model"
+    change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
+    file.event(alarm.onset, level, alarm.kind, f"{alarm.severity}: {what}{change}: begins here")
+    file.event(alarm.opened, level, alarm.kind, f"{alarm.severity}: {what}{change}: raised")
+    if alarm.closed is not None:
+        file.event(alarm.closed, INFO, alarm.kind, f"{what}: recovered")

@@ -1,0 +1,264 @@
+// History of one vehicle's parameters, its newest window, and what is new about it.
+"use strict";
+(() => {
+  const data = JSON.parse(document.getElementById("data").textContent);
+  const base = `/vehicles/${encodeURIComponent(data.vehicle)}`;
+  const at = (id) => document.getElementById(id);
+  const utc = (seconds) => uPlot.tzDate(new Date(seconds * 1e3), "Etc/UTC");
+  const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const COLOURS = ["--blue", "--alarm", "--good", "--warning", "--learning"];
+  const BAND = 1.96;
+  let range = null; // [from, to] in s; null: all
+  let plots = [];
+  let request = 0;
+
+  function chosen() {
+    const name = at("parameter").value;
+    const twins = data.twins[name]?.[at("overlay").value] || [];
+    return [name, ...twins].slice(0, 8);
+  }
+
+  function scaled(name, column) {
+    const percent = at("scale").value === "percent";
+    const reference = column.baseline ?? column.nominal;
+    const value = (v) => (v === null ? null : percent ? 100 * (v / reference - 1) : v);
+    return {
+      mean: column.value.map(value),
+      high: column.value.map((v, i) => (v === null ? null : value(v + BAND * column.std[i]))),
+      low: column.value.map((v, i) => (v === null ? null : value(v - BAND * column.std[i]))),
+      baseline: column.baseline === null ? null : value(column.baseline),
+      nominal: value(column.nominal),
+      unit: percent ? "%" : column.unit,
+    };
+  }
+
+  // a hole in time is a hole in the line
+  function withGaps(time, step, rows) {
+    const xs = [];
+    const out = rows.map(() => []);
+    const longest = 3 * Math.max(step, data.hop);
+    time.forEach((t, i) => {
+      if (i && t - time[i - 1] > longest) {
+        xs.push(time[i - 1] + longest / 2);
+        out.forEach((row) => row.push(null));
+      }
+      xs.push(t);
+      rows.forEach((row, r) => out[r].push(row[i]));
+    });
+    return [xs, ...out];
+  }
+
+  function lines(u, levels) {
+    const { ctx } = u;
+    ctx.save();
+    ctx.beginPath();
+    ctx.rect(u.bbox.left, u.bbox.top, u.bbox.width, u.bbox.height);
+    ctx.clip();
+    for (const { y, dash } of levels) {
+      if (y === null) continue;
+      const py = u.valToPos(y, "y", true);
+      ctx.strokeStyle = style("--soft");
+      ctx.setLineDash(dash);
+      ctx.beginPath();
+      ctx.moveTo(u.bbox.left, py);
+      ctx.lineTo(u.bbox.left + u.bbox.width, py);
+      ctx.stroke();
+    }
+    const name = at("parameter").value;
+    const moments = [
+      ...data.alarms.filter((a) => a.parameter === name || a.parameter === null)
+        .map((a) => ({ time: a.onset, text: a.parameter ? a.severity : a.kind, colour: style("--alarm") })),
+      ...data.marks.map((m) => ({ time: m.time, text: m.kind, colour: style("--good") })),
+    ];
+    ctx.font = `${11 * devicePixelRatio}px system-ui`;
+    moments.forEach(({ time, text, colour }, i) => {
+      const px = u.valToPos(Date.parse(time) / 1e3, "x", true);
+      if (px < u.bbox.left || px > u.bbox.left + u.bbox.width) return;
+      ctx.strokeStyle = ctx.fillStyle = colour;
+      ctx.setLineDash([]);
+      ctx.beginPath();
+      ctx.moveTo(px, u.bbox.top);
+      ctx.lineTo(px, u.bbox.top + u.bbox.height);
+      ctx.stroke();
+      ctx.fillText(text, px + 4, u.bbox.top + (12 + 13 * (i % 4)) * devicePixelRatio);
+    });
+    ctx.restore();
+  }
+
+  const axes = () => {
+    const grid = { stroke: style("--line"), width: 1 };
+    return [{ stroke: style("--soft"), grid, ticks: grid }, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
+  };
+
+  function draw(names, answer) {
+    plots.forEach((plot) => plot.destroy());
+    const shown = names.map((name) => ({ name, ...scaled(name, answer.parameters[name]) }));
+    const rows = shown.flatMap((s) => [s.mean, s.high, s.low]);
+    const time = answer.time.map((t) => t / 1e3);
+    const columns = withGaps(time, answer.resolution, [...rows, answer.windows]);
+    const width = at("plot").clientWidth;
+    const sync = { key: "history" };
+    const series = [{ label: "time", value: (_, v) => (v === null ? "–" : new Date(v * 1e3).toISOString().slice(0, 19).replace("T", " ")) }];
+    const bands = [];
+    shown.forEach((s, i) => {
+      const colour = style(COLOURS[i % COLOURS.length]);
+      const text = (_, v) => (v === null || v === undefined ? "–" : `${Number(v).toPrecision(4)} ${s.unit}`);
+      series.push({ label: s.name, stroke: colour, width: 2, value: text, points: { show: time.length < 60 } });
+      series.push({ label: "upper", stroke: "transparent", points: { show: false }, value: text });
+      series.push({ label: "lower", stroke: "transparent", points: { show: false }, value: text });
+      bands.push({ series: [3 * i + 2, 3 * i + 3], fill: i ? "transparent" : style("--band") });
+    });
+    const hooks = {
+      draw: [(u) => lines(u, [{ y: shown[0].baseline, dash: [6, 4] }, { y: shown[0].nominal, dash: [2, 3] }])],
+      setSelect: [(u) => {
+        if (u.select.width < 5) return;
+        range = [u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")];
+        load();
+      }],
+    };
+    const cursor = { sync, drag: { x: true, y: false, setScale: false } };
+    const scales = range ? { x: { min: range[0], max: range[1] } } : {};
+    plots = [new uPlot({ width, height: 320, series, bands, hooks, cursor, scales, tzDate: utc, axes: axes() }, columns.slice(0, -1), at("plot"))];
+    const lower = { label: "windows a point", stroke: style("--soft"), fill: style("--band"), paths: uPlot.paths.bars({ size: [1, 30] }) };
+    plots.push(new uPlot({ width, height: 130, series: [series[0], lower], cursor, scales, tzDate: utc, axes: axes() }, [columns[0], columns.at(-1)], at("lower")));
+    plots.forEach((plot) => plot.over.addEventListener("dblclick", () => { range = null; load(); }));
+    const step = answer.resolution ? `one point is ${answer.resolution} s` : "single windows";
+    at("shown").textContent = `${time.length} points, ${step}`;
+    table(shown, answer);
+  }
+
+  function table(shown, answer) {
+    const made = document.createElement("table");
+    const head = made.createTHead().insertRow();
+    for (const text of ["Time (UTC)", ...shown.flatMap((s) => [`${s.name} [${s.unit}]`, "95 % band"])]) {
+      const cell = document.createElement("th");
+      cell.scope = "col";
+      cell.textContent = text;
+      head.append(cell);
+    }
+    const body = made.createTBody();
+    for (let i = Math.max(0, answer.time.length - 20); i < answer.time.length; i++) {
+      const row = body.insertRow();
+      row.insertCell().textContent = new Date(answer.time[i]).toISOString().slice(0, 19).replace("T", " ");
+      for (const s of shown) {
+        row.insertCell().textContent = s.mean[i] === null ? "–" : s.mean[i].toPrecision(5);
+        row.insertCell().textContent = s.mean[i] === null ? "–" : `${s.low[i].toPrecision(5)} … ${s.high[i].toPrecision(5)}`;
+      }
+    }
+    at("table").replaceChildren(made);
+  }
+
+  async function load() {
+    const number = ++request;
+    const names = chosen();
+    const query = new URLSearchParams({ format: "columns" });
+    names.forEach((name) => query.append("parameter", name));
+    if (range) {
+      query.set("since", Math.max(0, range[0]).toFixed(3));
+      query.set("until", range[1].toFixed(3));
+    }
+    const answer = await fetch(`${base}/history?${query}`);
+    if (number !== request) return;
+    if (!answer.ok) { at("shown").textContent = "the history could not be read"; return; }
+    draw(names, await answer.json());
+    document.querySelectorAll("a[data-element]").forEach((a) =>
+      a.classList.toggle("current", at("parameter").value.startsWith(`${a.dataset.element}.`)));
+  }
+
+  function choose(name) {
+    at("parameter").value = name;
+    load();
+    at("history").scrollIntoView({ block: "start" });
+  }
+
+  // of an element the quantity that needs attention most
+  function ofElement(element) {
+    const names = Object.keys(data.parameters).filter((name) => name.startsWith(`${element}.`));
+    const bad = names.filter((name) => data.alarms.some((a) => a.parameter === name && !a.recovered));
+    return bad[0] || names[0];
+  }
+
+  document.addEventListener("click", (event) => {
+    const link = event.target.closest("a[data-element], a[data-parameter], a[data-sensor]");
+    if (link) {
+      event.preventDefault();
+      if (link.dataset.sensor) { at("sensor").value = link.dataset.sensor; newest(); at("sensors").scrollIntoView(); return; }
+      const name = link.dataset.parameter || ofElement(link.dataset.element);
+      if (name) choose(name);
+      return;
+    }
+    const button = event.target.closest("button");
+    if (!button) return;
+    const [first, last] = range || (plots[0] ? [plots[0].data[0][0], plots[0].data[0].at(-1)] : [0, 0]);
+    if (button.dataset.range !== undefined) {
+      const seconds = Number(button.dataset.range);
+      const end = data.last ? data.last / 1e3 + data.hop : last;
+      range = seconds ? [end - seconds, end] : null;
+      document.querySelectorAll("[data-range]").forEach((b) => b.setAttribute("aria-pressed", String(b === button)));
+      load();
+    } else if (button.dataset.move) {
+      const by = Number(button.dataset.move) * (last - first);
+      range = [first + by, last + by];
+      load();
+    } else if (button.dataset.zoom) {
+      const middle = (first + last) / 2;
+      const half = (Number(button.dataset.zoom) * (last - first)) / 2;
+      range = [middle - half, middle + half];
+      load();
+    } else if (button.id === "fetchwindow") newest();
+  });
+  ["parameter", "overlay", "scale"].forEach((id) => at(id).addEventListener("change", load));
+
+  let pair = [];
+  async function newest() {
+    at("windowstatus").textContent = "simulating …";
+    const answer = await fetch(`${base}/window`);
+    const found = await answer.json();
+    if (!answer.ok) { at("windowstatus").textContent = found.detail; return; }
+    const sensor = found.sensors[at("sensor").value];
+    at("windowstatus").textContent = `window of ${found.start.slice(0, 19).replace("T", " ")}, ${found.adequate ? "fits" : "does not fit"}`;
+    pair.forEach((plot) => plot.destroy());
+    at("compared").replaceChildren();
+    const time = sensor.simulated.map((_, i) => i / found.sample_rate);
+    const options = (series) => {
+      const box = document.createElement("div");
+      at("compared").append(box);
+      return [{ width: box.clientWidth, height: 230, series, axes: axes(), scales: { x: { time: false } } }, box];
+    };
+    const line = (label, colour) => ({ label: `${label} [${sensor.unit}]`, stroke: style(colour), width: 1.5, points: { show: false } });
+    const [one, left] = options([{ label: "s" }, line("measured", "--ink"), line("simulated", "--blue")]);
+    pair = [new uPlot(one, [time, sensor.measured, sensor.simulated], left)];
+    const [two, right] = options([{ label: "s" }, line("residual", "--alarm")]);
+    pair.push(new uPlot(two, [time, sensor.residual], right));
+  }
+  at("sensor").addEventListener("change", newest);
+
+  let waiting = false;
+  async function redraw() {
+    waiting = false;
+    const answer = await fetch(location.href, { headers: { accept: "text/html" } });
+    if (!answer.ok) return;
+    const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+    for (const part of document.querySelectorAll("[data-live]")) {
+      const fresh = page.getElementById(part.id);
+      if (fresh && !part.contains(document.activeElement)) part.replaceChildren(...fresh.childNodes);
+    }
+    Object.assign(data, JSON.parse(page.getElementById("data").textContent));
+    if (!document.querySelector("dialog[open]")) load();
+    at("status").textContent = `Live; ${new Date().toLocaleTimeString()}`;
+  }
+  const news = new EventSource(`/events?vehicle=${encodeURIComponent(data.vehicle)}`);
+  news.addEventListener("vehicle", () => {
+    if (waiting) return;
+    waiting = true;
+    setTimeout(() => redraw().catch(() => {}), 2000);
+  });
+  news.onopen = () => { at("status").textContent = "Live"; };
+  news.onerror = () => { at("status").textContent = "Not connected; trying again"; };
+  window.addEventListener("resize", () => plots.forEach((plot) => plot.setSize({ width: at("plot").clientWidth, height: plot.height })));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", load);
+  const wanted = decodeURIComponent(location.hash.slice(1));
+  if (data.parameters[wanted]) at("parameter").value = wanted;
+  else if (data.first) at("parameter").value = data.first;
+  load();
+})();
