@@ -53,6 +53,11 @@ class System:
     file: SystemFile
     catalogue: tuple[Law, ...] = CATALOGUE
 
+    def __reduce__(self) -> tuple[type[System], tuple[object, ...]]:
+        """To another process goes the file: the bundled laws are there already, and functions do not travel."""
+        own = () if self.catalogue is CATALOGUE else (self.catalogue,)
+        return System, (self.file, *own)
+
     @cached_property
     def laws(self) -> tuple[PlacedLaw, ...]:
         """What is in place beyond the nominal structure."""

@@ -46,11 +46,6 @@ class Board:
         self._entries: OrderedDict[str, Entry] = OrderedDict()
         self._lock = threading.Lock()
 
-    @property
-    def engine(self) -> Engine:
-        """What the views are made with."""
-        return self._engine
-
     def on_batch(self, batch: Batch) -> None:
         """Take the outcome of a batch."""
         last = next((r for r in reversed(batch.records) if r.solved is not None), None)

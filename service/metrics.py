@@ -8,7 +8,6 @@ from prometheus_client import CollectorRegistry, Counter, Histogram, generate_la
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from sprung import __version__
 from sprung.model.signals import Tally
 from sprung.service.board import Board, Entry
 from sprung.service.store.status import HEALTHS
@@ -74,7 +73,6 @@ class FleetCollector(Collector):
     def collect(self) -> Iterator[Metric]:
         """Families of the service, of all vehicles, then of those within the budget."""
         entries = self._board.entries()
-        yield _build(self._board)
         counts = GaugeMetricFamily("sprung_fleet_vehicles", "Vehicles in service by health", labels=["health"])
         for health, count in self._fleet().items():
             counts.add_metric([health], count)
@@ -85,13 +83,6 @@ class FleetCollector(Collector):
     def describe(self) -> Iterator[Metric]:
         """Nothing is collected at registration."""
         return iter(())
-
-
-def _build(board: Board) -> Metric:
-    engine = board.engine
-    info = GaugeMetricFamily("sprung_build_info", "Always 1; what runs", labels=["version", "system", "model"])
-    info.add_metric([__version__, engine.system.name, engine.digest], 1)
-    return info
 
 
 def _vehicle_families(entries: list[Entry]) -> Iterator[Metric]:

@@ -1,5 +1,6 @@
 """System files: what they give and how they are refused."""
 
+import pickle
 import re
 
 import numpy as np
@@ -140,3 +141,9 @@ def test_sensors_that_miss_a_body_are_refused_by_its_name():
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(SystemFileError, match=r"nowhere.yaml: cannot read"):
         load_system(tmp_path / "nowhere.yaml")
+
+
+def test_a_system_goes_to_another_process() -> None:
+    system = load_system()
+    copy = pickle.loads(pickle.dumps(system))
+    assert copy.digest == system.digest and copy.catalogue is system.catalogue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, RedirectResponse, Response
@@ -9,8 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 from starlette.datastructures import UploadFile
 
+from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody, VehicleId
+from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import Problem, from_validation
 from sprung.service.api.recordings import job_dict, keep_upload
 from sprung.service.core import Core
@@ -42,23 +46,29 @@ BODY = {
 }
 
 
-@router.post("/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics")
-async def diagnose(request: Request, core: CoreOf) -> Response:
+@router.post(
+    "/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics", response_model=models.Job
+)
+async def diagnose(request: Request, core: CoreOf, once: OnceOf) -> Response:
     """Accepts a job: of an uploaded file (multipart, as in `POST /recordings`), of a recording that was uploaded
     before (`{"recording": id}`), or of the last minute of a vehicle (`{"vehicle": id}`).  The job's result names
     the report."""
-    core.jobs.reserve()
-    kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
-    if kind == "multipart/form-data":
-        job = await _of_upload(request, core)
-    elif kind == "application/json":
-        job = await _of_reference(request, core)
-    else:
-        raise Problem(415, "send multipart/form-data with a file, or application/json")
-    return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+
+    async def act() -> Response:
+        core.jobs.reserve()
+        kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
+        if kind == "multipart/form-data":
+            job = await _of_upload(request, core)
+        elif kind == "application/json":
+            job = await _of_reference(request, core)
+        else:
+            raise Problem(415, "send multipart/form-data with a file, or application/json")
+        return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+
+    return await once.answer(act)
 
 
-@router.get("/reports/{id}", summary="A mismatch report")
+@router.get("/reports/{id}", summary="A mismatch report", response_model=dict[str, Any])
 async def report(request: Request, core: CoreOf, id: str) -> Response:
     """The report as JSON, or its page where the client prefers `text/html`."""
     row = await _report(core, id)

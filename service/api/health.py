@@ -9,19 +9,20 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response
 from sprung.service.api.problems import Problem
 
 router = APIRouter(tags=["health"])
 
 
-@router.get("/health/live", summary="The process runs")
+@router.get("/health/live", summary="The process runs", response_model=models.Live)
 async def live() -> Response:
     """Answers as long as the event loop turns."""
     return json_response({"status": "ok"})
 
 
-@router.get("/health/ready", summary="The service can work")
+@router.get("/health/ready", summary="The service can work", response_model=models.Ready)
 async def ready(core: CoreOf) -> Response:
     """503 with the reason while the store cannot be written, a live feed does not work, or the service is stopping."""
     if core.stopping.is_set():
@@ -41,7 +42,12 @@ async def ready(core: CoreOf) -> Response:
     )
 
 
-@router.get("/metrics", summary="Prometheus metrics")
+@router.get(
+    "/metrics",
+    summary="Prometheus metrics",
+    response_class=Response,
+    responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
+)
 async def metrics(core: CoreOf) -> Response:
     """The text exposition format."""
     return Response(await run_in_threadpool(core.metrics.render), media_type=CONTENT_TYPE_LATEST)

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 
 from sprung.model.identification.identify import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response
 from sprung.service.api.bodies import WindowBody, start_of, window_values
 from sprung.service.api.problems import Problem, from_validation
@@ -33,7 +34,7 @@ BODY = {
 }
 
 
-@router.post("/identify", openapi_extra=BODY, summary="Identify one window")
+@router.post("/identify", openapi_extra=BODY, summary="Identify one window", response_model=models.Identified)
 async def identify(request: Request, core: CoreOf, states: bool = False, track: bool = False) -> Response:
     """Parameters of one window, with standard deviations and how well the model fits.
 

@@ -359,6 +359,7 @@ class Ready(BaseModel):
     status: Literal["ok"]
     model: str
     waiting: int
+    feeds: list[dict[str, Any]] = Field(default_factory=list, description="live buses and how they are")
 
 
 class SystemPart(BaseModel):

@@ -11,8 +11,10 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.replay.recording import EXTENSIONS
+from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, read
 from sprung.service.api.bodies import VehicleId
+from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import Problem
 from sprung.service.errors import NotFound
 from sprung.service.settings import Settings
@@ -24,9 +26,10 @@ router = APIRouter(tags=["recordings"])
 CHUNK = 1 << 20
 
 
-@router.post("/recordings", status_code=202, summary="Upload a recording")
+@router.post("/recordings", status_code=202, summary="Upload a recording", response_model=models.Job)
 async def upload(
     core: CoreOf,
+    once: OnceOf,
     file: Annotated[UploadFile, File(description="MCAP, BLF, ASC, candump log, MF4 or CSV")],
     vehicle: Annotated[VehicleId | None, Form()] = None,
 ) -> Response:
@@ -34,13 +37,17 @@ async def upload(
 
     `vehicle` names whose it is; without it the recording's own metadata or the file's name does.
     """
-    core.jobs.reserve()
-    row = await run_in_threadpool(keep_upload, core.settings, file.filename or "", file.file)
-    job = await run_in_threadpool(core.jobs.submit, "recording", row, vehicle)
-    return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+
+    async def act() -> Response:
+        core.jobs.reserve()
+        row = await run_in_threadpool(keep_upload, core.settings, file.filename or "", file.file)
+        job = await run_in_threadpool(core.jobs.submit, "recording", row, vehicle)
+        return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
+
+    return await once.answer(act)
 
 
-@router.get("/jobs/{id}", summary="A job")
+@router.get("/jobs/{id}", summary="A job", response_model=models.Job)
 async def job(core: CoreOf, id: str) -> Response:
     """Where a job stands; `state` is queued, running, done or failed."""
 
@@ -53,7 +60,7 @@ async def job(core: CoreOf, id: str) -> Response:
     return json_response(job_dict(await read(core, query)))
 
 
-@router.delete("/jobs/{id}", summary="Cancel a job")
+@router.delete("/jobs/{id}", summary="Cancel a job", response_model=models.Job)
 async def cancel(core: CoreOf, id: str) -> Response:
     """A job that waits or runs is given up; it is then `failed`, and its error says that it was cancelled.  What it
     stored before stays."""

@@ -85,9 +85,19 @@
     ctx.restore();
   }
 
-  const axes = () => {
+  const DAY = "\n{YYYY}-{MM}-{DD}";
+  const DATES = [ // how ticks are written by their distance in s: dates with their year, 24 hours
+    [31536000, "{YYYY}", null, null, null, null, null, null, 1],
+    [2419200, "{MMM}", "\n{YYYY}", null, null, null, null, null, 1],
+    [86400, "{MM}-{DD}", "\n{YYYY}", null, null, null, null, null, 1],
+    [60, "{HH}:{mm}", DAY, null, DAY, null, null, null, 1],
+    [1, ":{ss}", `${DAY} {HH}:{mm}`, null, `${DAY} {HH}:{mm}`, null, "\n{HH}:{mm}", null, 1],
+    [0.001, ":{ss}.{fff}", `${DAY} {HH}:{mm}`, null, `${DAY} {HH}:{mm}`, null, "\n{HH}:{mm}", null, 1],
+  ];
+  const axes = (dates = true) => {
     const grid = { stroke: style("--line"), width: 1 };
-    return [{ stroke: style("--soft"), grid, ticks: grid }, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
+    const across = { stroke: style("--soft"), grid, ticks: grid };
+    return [dates ? { ...across, values: DATES } : across, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
   };
 
   function draw(names, answer) {
@@ -223,7 +233,7 @@
     const options = (series) => {
       const box = document.createElement("div");
       at("compared").append(box);
-      return [{ width: box.clientWidth, height: 230, series, axes: axes(), scales: { x: { time: false } } }, box];
+      return [{ width: box.clientWidth, height: 230, series, axes: axes(false), scales: { x: { time: false } } }, box];
     };
     const line = (label, colour) => ({ label: `${label} [${sensor.unit}]`, stroke: style(colour), width: 1.5, points: { show: false } });
     const [one, left] = options([{ label: "s" }, line("measured", "--ink"), line("simulated", "--blue")]);
