@@ -6,6 +6,11 @@ from datetime import UTC, datetime
 
 from sprung.replay.windowing import Windower
 
+STRAY = {  # what `Windower.reasons` calls samples that belong to no window, and what a user is told
+    "late": "too late",
+    "stray time stamp": "at times of which no others are",
+    "too many samples for their time": "at nearly the same time",
+}
 LONGEST_PAUSE = 30 * 86_400.0  # s; a longer pause within one recording is a clock that was wrong
 
 
@@ -28,14 +33,13 @@ def _none(windower: Windower) -> str:
     needed = windower.window / windower.sample_rate
     stretches = len(windower.jumps) + 1
     among = "" if stretches == 1 else f" without a jump of the clock, among {stretches},"
-    lost = ", ".join(f"{count} samples {reason}" for reason, count in windower.reasons.items() if reason in STRAY)
-    return (
-        f"no window can be made: the longest stretch of samples{among} is {windower.longest:.3g} s, "
-        f"a window needs {needed:.3g} s{'; ' + lost if lost else ''}"
+    lost = ", ".join(
+        f"{windower.reasons[name]} samples {words}" for name, words in STRAY.items() if windower.reasons[name]
     )
-
-
-STRAY = ("late", "stray time stamp", "too many samples for their time")
+    return (
+        f"no window can be made of {windower.samples} samples: a window needs {needed:.3g} s, "
+        f"their longest stretch{among} is {windower.longest:.3g} s{', ' + lost if lost else ''}"
+    )
 
 
 def _span(seconds: float) -> str:
@@ -43,7 +47,8 @@ def _span(seconds: float) -> str:
     for limit, unit, name in ((120.0, 1.0, "s"), (7_200.0, 60.0, "min"), (172_800.0, 3600.0, "h")):
         if size < limit:
             return f"{size / unit:.3g} {name}"
-    return f"{size / 86_400.0:.4g} days"
+    days = size / 86_400.0
+    return f"{days:.4g} days" if days < 1000.0 else f"{days / 365.25:.4g} years"
 
 
 def _iso(time: int) -> str:

@@ -9,7 +9,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from sprung.model.tracking.state import Health
 from sprung.service.cli.console import parameter_table, print_table, progress
 from sprung.service.cli.starts import start_time
 from sprung.service.compute import Compute
@@ -19,7 +18,7 @@ from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
-from sprung.service.times import to_iso
+from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.views import VehicleView, alarm_dict, vehicle_view, window_dict
 
 
@@ -127,7 +126,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
         "fitting": fed.fitting,
         "frames": fed.tally.as_dict(),
         "samples": {"expected": fed.expected, "lost": fed.lost},
-        "problems": fed.problems,
+        "problems": fed.problems[:20],
         "parameters": [p.as_dict() for p in view.parameters],
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
         "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
@@ -135,7 +134,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
     }
 
 
-def health(view: VehicleView, fed: Fed) -> Health:
+def health(view: VehicleView, fed: Fed) -> str:
     """The vehicle's health; a recording that hardly tells of it calls for a check of the function."""
     return view.health if fed.monitored or view.health == "failure" else "check_function"
 
@@ -148,6 +147,8 @@ def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
     lines = [f"{recorded:.1f} s recorded in {fed.wall_seconds:.1f} s ({pace:.0f} x real time); windows: {counts}"]
     if fed.adequate < fed.windows["used"] + fed.windows["repaired"]:
         lines.append(f"{fed.adequate} of {fed.windows['used'] + fed.windows['repaired']} windows fit the model")
+    if fed.last_ns is not None and fed.last_ns > now_ns() + AHEAD:
+        lines.append(f"the recording ends on {to_iso(fed.last_ns)}, which is in the future by this host's clock")
     if fed.stored_before:
         lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:
