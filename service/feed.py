@@ -54,7 +54,7 @@ class Fed:
     @property
     def fitting(self) -> dict[str, int]:
         """What became of the windows beyond being read."""
-        return {"adequate": self.adequate, "untracked": self.late, "stored_before": self.stored_before}
+        return {"adequate": self.adequate, "untracked": self.late}
 
     @property
     def monitored(self) -> bool:
@@ -151,6 +151,6 @@ def _count(fed: Fed, batch: Batch) -> Batch:
     fed.reasons.update(r.reason or "" for r in batch.records if r.outcome == "dropped")
     fed.adequate += sum(record.solved is not None and record.solved.adequate for record in batch.records)
     fed.stored_before += len(batch.records) - len(batch.fresh)
-    fed.late += batch.late
+    fed.late += sum(record.solved is not None and not record.tracked for record in batch.records)
     fed.state = batch.state
     return batch

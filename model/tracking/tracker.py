@@ -14,9 +14,8 @@ from scipy.linalg.lapack import dpotrf
 
 from sprung.model.signals import BoolArray, Estimate, FloatArray
 from sprung.model.tracking import changes as change_test
-from sprung.model.tracking import coverage
+from sprung.model.tracking import coverage, misfit, scatter, surprise
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, Severity, TrackerState, TrackerStateError
 
