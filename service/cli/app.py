@@ -210,11 +210,15 @@ def system(
     schema: Annotated[
         bool, typer.Option("--schema", help="Print the JSON Schema of system files, for editors.")
     ] = False,
+    export: Annotated[
+        Path | None,
+        typer.Option("--export", help="Write the model: .fmu .mo .mat .npz, or a folder for force tables."),
+    ] = None,
 ) -> int:
-    """Check a system file; print bodies, elements, modes, and what the sensors can identify."""
+    """Check a system file; print bodies, elements, modes, and what the sensors can identify; or export the model."""
     from sprung.service.cli.system import run
 
-    return run(file, json_lines, schema)
+    return run(file, json_lines, schema, export)
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

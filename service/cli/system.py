@@ -16,12 +16,13 @@ from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.schema import SystemFileError
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.model.systemfile import json_schema
+from sprung.service.cli.export import export
 from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
 
 
-def run(file: Path | None, json_lines: bool, schema: bool) -> int:
+def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = None) -> int:
     """Check the file and print what it says, or one line for each problem; or print the JSON Schema of the format."""
     if schema:
         print(json.dumps(json_schema(), indent=2))
@@ -32,6 +33,10 @@ def run(file: Path | None, json_lines: bool, schema: bool) -> int:
         for line in error.problems:
             print(f"sprung: {' '.join(line.split())}", file=sys.stderr)
         return 2
+    if out is not None:
+        for path in export(system, out):
+            print(path)
+        return 0
     told = identifiability(system)
     if json_lines:
         print(json.dumps(_as_dict(system, told), indent=None))

@@ -1,0 +1,84 @@
+"""The equations of a system as text in C or Modelica: what FMU and Modelica exports share.
+
+m q'' = sum of F_e h_e + forces,   F_e = -(k d + c v + laws),   d = H q + G z,   v = H q' + G z'
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.exchange.statespace import ExchangeError
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.expression import MOTION, Expression, parse
+from sprung.model.laws.placed import PlacedLaw
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """One law along one combination of elements."""
+
+    placed: PlacedLaw
+    law: ElementLaw
+    weights: FloatArray  # over the elements, (E,)
+    element: int  # whose k and c the law sees
+    force: Expression
+    memory: Expression | None
+
+
+def sites(system: System) -> list[Site]:
+    """The laws of a system's elements, with formulas.  Errors: `ExchangeError` for laws that no formula describes."""
+    found = []
+    for placed in system.laws:
+        law = placed.law
+        if not isinstance(law, ElementLaw):
+            continue
+        if not law.formula:
+            raise ExchangeError(f"{placed.location}: {law.name} has no formula and cannot be exported")
+        known = {*law.names, *MOTION}
+        memory = parse(law.memory_formula, known) if law.memory_formula else None
+        at = [system.elements.index(name) for name in placed.places]
+        for group in [at] if law.where == "pair" else [[e] for e in at]:
+            weights = np.zeros(len(system.elements))
+            weights[group[0]] = 1.0
+            if len(group) == 2:
+                weights[group[1]] = -1.0
+            found.append(Site(placed, law, weights, group[0], parse(law.formula, known), memory))
+    return found
+
+
+def linear(row: FloatArray, names: Callable[[int], str]) -> str:
+    """A linear combination as text: `0.5*a - b`."""
+    terms = [f"{weight!r}*{names(i)}" for i, weight in enumerate(row.tolist()) if weight != 0]
+    return " + ".join(terms) if terms else "0.0"
+
+
+def output(
+    system: System,
+    sensor: int,
+    q: Callable[[int], str],
+    rate: Callable[[int], str],
+    acceleration: Callable[[int], str],
+    deflection: Callable[[int], str],
+    force: Callable[[int], str],
+) -> str:
+    """What a sensor shows, in names of motions and forces."""
+    m = system.mechanics
+    row = {
+        ACCELERATION: (m.S[sensor], acceleration),
+        VELOCITY: (m.S[sensor], rate),
+        DISPLACEMENT: (m.S[sensor], q),
+        DEFLECTION: (m.L[sensor], deflection),
+        FORCE: (m.L[sensor], force),
+    }[int(m.sensor_kind[sensor])]
+    return linear(*row)
+
+
+def identifier(name: str) -> str:
+    """A name that C and Modelica admit."""
+    return "".join(ch if ch.isalnum() else "_" for ch in name)

@@ -1,0 +1,129 @@
+"""The linear system as matrices with names: x' = A x + B u, y = C x + D u, and their derivatives by the parameters.
+
+Laws are left out: they act as the force of `laws_input` columns where a program can supply it (docs/exchange.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from sprung.model.mechanics import Mechanics
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.ride import with_values
+from sprung.model.system import System
+
+
+class ExchangeError(ValueError):
+    """A system that cannot be written in, or read from, a format; one line."""
+
+
+@dataclass(frozen=True, slots=True)
+class StateSpace:
+    """Matrices of one system; N states, U drives, S sensors, P parameters."""
+
+    A: FloatArray  # (N, N)
+    B: FloatArray  # (N, U)
+    C: FloatArray  # (S, N)
+    D: FloatArray  # (S, U)
+    dA: FloatArray  # by the parameters, (P, N, N)
+    dB: FloatArray  # (P, N, U)
+    dC: FloatArray  # (P, S, N)
+    dD: FloatArray  # (P, S, U)
+    states: tuple[str, ...]  # "car.z", ..., "car.z'", ...
+    inputs: tuple[str, ...]  # "wheel_11l.displacement", "wheel_11l.velocity", ...
+    outputs: tuple[str, ...]
+    parameters: tuple[str, ...]
+    values: FloatArray  # of the parameters, (P,)
+    sample_rate: float  # Hz, of the recordings; the matrices are of continuous time
+
+
+def state_space(system: System, values: Mapping[str, float] | None = None) -> StateSpace:
+    """The system at its nominal values, or others by name."""
+    mechanics = with_values(system, values or {})
+    A, B, C, D = mechanics.matrices()
+    slopes = [_derivative(system, mechanics, p.element, p.quantity) for p in system.parameters]
+    dA, dB, dC, dD = (
+        np.array([slope[i] for slope in slopes]).reshape(-1, *matrix.shape) for i, matrix in enumerate((A, B, C, D))
+    )
+    return StateSpace(
+        A=A,
+        B=B,
+        C=C,
+        D=D,
+        dA=dA,
+        dB=dB,
+        dC=dC,
+        dD=dD,
+        states=(*mechanics.dofs, *(f"{dof}'" for dof in mechanics.dofs)),
+        inputs=_drive_names(system),
+        outputs=system.sensors,
+        parameters=tuple(p.name for p in system.parameters),
+        values=np.array([_value(system, mechanics, p.element, p.quantity) for p in system.parameters]),
+        sample_rate=system.sample_rate,
+    )
+
+
+def _derivative(system: System, mechanics: Mechanics, part: str, quantity: str) -> tuple[FloatArray, ...]:
+    """dA, dB, dC, dD by one parameter; the matrices are linear in stiffness and damping, and in 1 / mass."""
+    if quantity == "mass":  # mass and inertias of a body scale together
+        own = mechanics.body_of_dof == system.bodies.index(part)
+        return _scaled_rows(mechanics, np.where(own, -1 / _value(system, mechanics, part, quantity), 0.0))
+    k, c = (np.zeros_like(mechanics.stiffness) for _ in range(2))
+    (k if quantity == "stiffness" else c)[system.elements.index(part)] = 1.0
+    none = np.zeros_like(k)
+    unit, zero = mechanics.matrices(k, c), mechanics.matrices(none, none)
+    return tuple(a - b for a, b in zip(unit, zero, strict=True))
+
+
+def _scaled_rows(mechanics: Mechanics, rows: FloatArray) -> tuple[FloatArray, ...]:
+    """Changes when the acceleration of every degree of freedom grows by its entry of `rows`."""
+    A, B, *_ = mechanics.matrices()
+    n = mechanics.n
+    dA, dB = np.zeros_like(A), np.zeros_like(B)
+    dA[n:], dB[n:] = rows[:, None] * A[n:], rows[:, None] * B[n:]
+    accelerates = mechanics.sensor_kind[:, None] == 0
+    dC = np.where(accelerates, mechanics.S @ dA[n:], 0.0)
+    dD = np.where(accelerates, mechanics.S @ dB[n:], 0.0)
+    return dA, dB, dC, dD
+
+
+def _value(system: System, mechanics: Mechanics, part: str, quantity: str) -> float:
+    if quantity == "mass":
+        at = np.flatnonzero(mechanics.body_of_dof == system.bodies.index(part))[0]
+        return float(system.file.bodies[part].mass.value * mechanics.mass[at] / system.mechanics.mass[at])
+    values: FloatArray = getattr(mechanics, quantity)
+    return float(values[system.elements.index(part)])
+
+
+def _drive_names(system: System) -> tuple[str, ...]:
+    names: list[str] = []
+    for name, source in system.file.inputs.items():
+        names += [f"{name}.force"] if source.kind == "force" else [f"{name}.displacement", f"{name}.velocity"]
+    return tuple(names)
+
+
+def write_npz(path: Path, space: StateSpace) -> None:
+    """NumPy archive; names are arrays of text."""
+    np.savez(path, **_arrays(space))
+
+
+def write_mat(path: Path, space: StateSpace) -> None:
+    """MATLAB file (v5) with one variable per matrix; names are cell arrays of text."""
+    arrays = _arrays(space)
+    for name in ("states", "inputs", "outputs", "parameters"):
+        arrays[name] = np.array(list(getattr(space, name)), dtype=object)
+    scipy.io.savemat(path, arrays, do_compression=True, oned_as="column")
+
+
+def _arrays(space: StateSpace) -> dict[str, Any]:
+    names = ("A", "B", "C", "D", "dA", "dB", "dC", "dD", "values")
+    found: dict[str, Any] = {name: getattr(space, name) for name in names}
+    found |= {name: np.array(getattr(space, name)) for name in ("states", "inputs", "outputs", "parameters")}
+    found["sample_rate"] = np.array(space.sample_rate)
+    return found
