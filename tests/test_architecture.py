@@ -30,7 +30,8 @@ ORDER = [
     "identification",
     "tracking",
 ]
-BESIDE = {"diagnosis": ORDER[: ORDER.index("identification")], "alps": ORDER}
+_BELOW = ORDER[: ORDER.index("identification")]
+BESIDE = {"diagnosis": _BELOW, "exchange": _BELOW, "alps": ORDER}
 STAGES = ("record", "response", "fit", "screening", "selection", "investigation", "report", "component", "api")
 # Imports inside functions of `model`, each with its reason
 LATE: dict[str, str] = {}
