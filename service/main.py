@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import signal
 import socket
+import ssl
 import sys
 import threading
 from collections.abc import Callable
@@ -15,12 +16,11 @@ from pathlib import Path
 from types import FrameType
 from typing import NoReturn
 
-import uvicorn
-
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
+from sprung.service.api.server import make_server
 from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
@@ -77,18 +77,15 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
             core.close()
 
         host, port = listening.getsockname()[:2]
-        announce(f"http://{f'[{host}]' if ':' in host else host}:{port}")
-        config = uvicorn.Config(
-            create_app(core, start, stop),
-            log_level="warning",
-            access_log=False,
-            timeout_graceful_shutdown=settings.shutdown_seconds,
-            timeout_keep_alive=30,
-            lifespan="on",
-        )
+        scheme = "http" if settings.tls_certificate is None else "https"
+        announce(f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}")
+        try:
+            server = make_server(create_app(core, start, stop), settings, core.stopping.set)
+        except (OSError, ssl.SSLError) as error:
+            raise UserError(f"TLS: {settings.tls_certificate}: {error.strerror or error}") from error
         # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
         stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _exit))
-        uvicorn.Server(config).run(sockets=[listening])
+        server.run(sockets=[listening])
 
 
 def _exit(_number: int, _frame: FrameType | None) -> NoReturn:

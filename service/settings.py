@@ -43,6 +43,14 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535)
     max_body_bytes: int = Field(default=2_000_000, gt=0)  # one window of 28 channels is about 60 kB
     max_upload_bytes: int = Field(default=2_000_000_000, gt=0)
+    connections: int = Field(default=1000, gt=0)  # in all; fewer where the system allows fewer open files
+    client_connections: int = Field(default=256, gt=0)  # of one address
+    header_seconds: float = Field(default=10.0, gt=0)  # in which a request's header must come
+    body_idle_seconds: float = Field(default=10.0, gt=0)  # without a byte of a body
+    client_requests_per_second: float = Field(default=500.0, gt=0)  # of one address or token; more are 429
+    tls_certificate: Path | None = None  # PEM; with it, HTTPS
+    tls_key: Path | None = None  # PEM; where it is not in the certificate's file
+    tls_client_ca: Path | None = None  # PEM; with it, clients must show a certificate of this authority
     shutdown_seconds: int = Field(default=20, gt=0)
 
     compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import torch
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
@@ -18,7 +18,7 @@ class Vitals(Collector):
     """Reads what it is given at every scrape."""
 
     def __init__(
-        self, version: str, model: str, feeds: Callable[[], list[FeedStatus]], gauges: dict[str, Callable[[], float]]
+        self, version: str, model: str, feeds: Callable[[], list[FeedStatus]], gauges: Mapping[str, Callable[[], float]]
     ) -> None:
         """gauges: by what waits, as in `windows`, `jobs`."""
         self._build = {
