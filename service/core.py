@@ -11,6 +11,7 @@ from functools import partial
 
 from sprung import __version__
 from sprung.model.signals import Tally
+from sprung.service.batching import Batcher
 from sprung.service.board import Board
 from sprung.service.compute import Compute
 from sprung.service.condition import Condition
@@ -53,6 +54,7 @@ class Core:
     hub: Hub
     condition: Condition
     operations: Operations
+    batcher: Batcher
     stopping: threading.Event
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
 
@@ -104,6 +106,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     diagnoses = Diagnoses(settings, store, rings, jobs)
     listeners += [diagnoses.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
+    batcher = Batcher(engine, compute, settings.compute_queue, metrics.observe)
     core = Core(
         settings,
         engine,
@@ -119,9 +122,10 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         hub,
         Condition(settings, store),
         Operations(settings, pipeline, board),
+        batcher,
         stopping,
     )
-    waiting = {"windows": lambda: compute.waiting, "jobs": lambda: jobs.waiting}
+    waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}
     vitals = Vitals(__version__, engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
     metrics.registry.register(vitals)
     return core

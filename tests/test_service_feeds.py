@@ -142,7 +142,7 @@ def test_no_name_of_a_client_reaches_the_file_system(
 def test_unknown_kinds_of_files_are_refused(client: TestClient, recording: Path) -> None:
     for name in ("virus.exe", "noextension", ".csv"):
         response = upload(client, recording, name)
-        assert response.status_code == 422
+        assert response.status_code == 415
         assert response.headers["content-type"] == "application/problem+json"
 
 

@@ -5,15 +5,20 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic_core import from_json
 
 from sprung.model.signals import FloatArray
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import SHOWN_ERRORS, Problem, from_validation
 from sprung.service.engine import Engine
-from sprung.service.times import from_iso
+from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
+LARGEST = 1e12  # of a sample, in SI units
+MOST_CHANNELS = 1000
+MOST_KEYS = 20  # beside the channels
+FUTURE_SECONDS = 300  # by which a client's clock may be ahead
 RATE_TOLERANCE = 1e-3  # relative; a clock that is off by more would shift stiffnesses by more than their bound
 
 
@@ -43,49 +48,115 @@ class DiagnoseBody(Strict):
     vehicle: VehicleId | None = None
 
 
-def window_values(body: WindowBody, engine: Engine) -> FloatArray:
-    """The body as values of shape (T, C), NaN for absent sensors.
+class WindowHead(Strict):
+    """A window's body without its samples, which are looked at by themselves."""
 
-    Raises a 422 Problem that names the field: unknown channel, missing input, wrong length, wrong rate.
+    vehicle: VehicleId | None = None
+    sample_rate: Annotated[Number, Field(gt=0)]
+    start: str | None = Field(default=None, max_length=40)
+
+
+def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]:
+    """The head of a `WindowBody` and its samples, shape (T, C), NaN for absent sensors.
+
+    Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
+    Raises a 422 Problem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
     """
-    system = engine.system
+    if max(content.count(mark) for mark in (b'"', b"[", b"{")) > 4 * MOST_CHANNELS:  # before they are made into anything
+        detail = "holds too many strings or lists: a window has a list of plain numbers a channel"
+        raise Problem(422, f"body {detail}", [_wrong("body", detail)])
+    try:
+        raw = from_json(content, allow_inf_nan=False)
+    except ValueError as error:
+        raise Problem(422, f"body: {error}", [_wrong("body", str(error))]) from None
+    if not isinstance(raw, dict):
+        raise Problem(422, "body: should be an object", [_wrong("body", "should be an object")])
+    channels = raw.pop("channels", None)
     wrong: list[dict[str, str]] = []
-    if abs(body.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
-        wrong.append(
-            _wrong("sample_rate", f"is {body.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz")
-        )
+    head = _head(raw, wrong)
+    system = engine.system
+    if head is not None and abs(head.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
+        detail = f"is {head.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz"
+        wrong.append(_wrong("sample_rate", detail))
+    values = _samples(channels, engine, wrong)
+    if wrong or head is None:
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        raise Problem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
+    return head, values
+
+
+def _head(raw: dict[str, object], wrong: list[dict[str, str]]) -> WindowHead | None:
+    if len(raw) > MOST_KEYS:
+        wrong.append(_wrong("body", f"has {len(raw) + 1} keys; a window has four"))
+        return None
+    try:
+        return WindowHead.model_validate(raw)
+    except ValidationError as error:
+        wrong += [dict(fault) for fault in from_validation(error).errors]
+        return None
+
+
+def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]]) -> FloatArray:
+    """Samples of all channels, shape (T, C); adds to `wrong`, at most a few more than are shown."""
+    system = engine.system
+    values = np.full((system.window, len(system.channels)), np.nan)
+    if not isinstance(channels, dict):
+        wrong.append(_wrong("channels", "should be an object of samples by channel"))
+        return values
+    if len(channels) > MOST_CHANNELS:
+        wrong.append(_wrong("channels", f"are {len(channels)}; more than {MOST_CHANNELS} are not looked at"))
+        return values
     names = {channel.name: i for i, channel in enumerate(system.channels)}
-    for name, samples in body.channels.items():
+    for name, samples in channels.items():
+        if len(wrong) >= SHOWN_ERRORS:
+            return values
         if name not in names:
             wrong.append(_wrong(f"channels.{name[:160]}", f"is no channel of {system.name}"))
-        elif len(samples) != system.window:
-            wrong.append(_wrong(f"channels.{name}", f"has {len(samples)} samples, a window has {system.window}"))
+        elif fault := _not_numbers(samples, system.window):
+            wrong.append(_wrong(f"channels.{name}{fault[0]}", fault[1]))
+        else:
+            values[:, names[name]] = samples
     wrong += [
         _wrong(f"channels.{channel.name}", "is missing; without every input nothing can be identified")
         for channel in system.inputs
-        if channel.name not in body.channels
-    ]
-    if not any(sensor in body.channels for sensor in system.sensors):
+        if channel.name not in channels
+    ][:SHOWN_ERRORS]
+    if not any(sensor in channels for sensor in system.sensors):
         wrong.append(_wrong("channels", "hold no sensor; without any nothing can be identified"))
-    if wrong:
-        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-        raise Problem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:20])
-    values = np.full((system.window, len(names)), np.nan)
-    for name, samples in body.channels.items():
-        values[:, names[name]] = samples
     return values
 
 
-def start_of(body: WindowBody) -> int | None:
-    """The window's start, ns since epoch, or None where the body has none; a 422 Problem when it is no time."""
-    if body.start is None:
+def _not_numbers(samples: object, length: int) -> tuple[str, str] | None:
+    """Place and fault of samples that are no list of `length` finite numbers; None where they are."""
+    if not isinstance(samples, list):
+        return "", "should be a list of numbers"
+    if len(samples) != length:
+        return "", f"has {len(samples)} samples, a window has {length}"
+    for index, value in enumerate(samples):
+        if type(value) not in (float, int):
+            return f".{index}", "should be a number"
+        if not abs(value) <= LARGEST:
+            return f".{index}", f"should be a finite number within +-{LARGEST:g}"
+    return None
+
+
+def start_of(head: WindowHead, now: int) -> int | None:
+    """The window's start, ns since epoch, or None where the body has none.
+
+    A 422 Problem when it is no time, or one that is still to come: the vehicle's tracker would take nothing that
+    comes before it any more.
+    """
+    if head.start is None:
         return None
     try:
-        start = from_iso(body.start)
+        start = from_iso(head.start)
     except ValueError:
         start = -1
     if not 0 <= start < 2**63:
         raise Problem(422, "start is no RFC 3339 time", [_wrong("start", "is no RFC 3339 time")])
+    if start > now + FUTURE_SECONDS * NANOSECONDS:
+        detail = f"is more than {FUTURE_SECONDS // 60} minutes after {to_iso(now)}, the service's time"
+        raise Problem(422, f"start {detail}", [_wrong("start", detail)])
     return start
 
 

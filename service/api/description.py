@@ -14,6 +14,12 @@ ERRORS = {
     404: ("Not Found", "No such thing.", "nothing is known of vehicle 'car-99'"),
     413: ("Content Too Large", "The body is past the limit.", "the body is longer than 2000000 bytes"),
     415: ("Unsupported Media Type", "Another kind of body is needed.", "send multipart/form-data or JSON"),
+    400: ("Bad Request", "What came is no HTTP that can be understood.", "invalid request"),
+    401: ("Unauthorized", "A token is needed, or the one that was sent is wrong or expired.", "a token is needed"),
+    403: ("Forbidden", "The token does not allow this.", "the token has no scope `operate`"),
+    405: ("Method Not Allowed", "The path takes other methods.", "Method Not Allowed"),
+    429: ("Too Many Requests", "More than the limit of one client; `Retry-After` says when.", "too many requests"),
+    507: ("Insufficient Storage", "No room is left for uploads or on the disk.", "no room for this upload"),
     422: ("Unprocessable Content", "The body or the query is wrong; the fields are named.", "parameter: is needed"),
     503: ("Service Unavailable", "A queue is full, or the service stops; `Retry-After` says when.", "try again"),
 }
@@ -53,5 +59,5 @@ def _complete(path: str, operation: dict[str, Any]) -> None:
         answers.setdefault("404", _problem(404))
     if "requestBody" in operation:
         answers.setdefault("413", _problem(413))
-    if path == "/diagnose":
+        answers.setdefault("507", _problem(507))
         answers.setdefault("415", _problem(415))

@@ -7,16 +7,17 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import FileResponse, RedirectResponse, Response
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ValidationError
 from sqlalchemy import Connection
-from starlette.datastructures import UploadFile
 
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
-from sprung.service.api.bodies import DiagnoseBody, VehicleId
+from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import Problem, from_validation
-from sprung.service.api.recordings import job_dict, keep_upload
+from sprung.service.api.recordings import job_dict
+from sprung.service.api.uploads import BODY as UPLOAD
+from sprung.service.api.uploads import discard, receive
 from sprung.service.core import Core
 from sprung.service.errors import NotFound
 from sprung.service.store import fleet, work
@@ -24,24 +25,14 @@ from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 
 router = APIRouter(tags=["diagnosis"])
 PAGE = "report.html"
-_VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
 
 BODY = {
     "requestBody": {
         "required": True,
         "content": {
             "application/json": {"schema": DiagnoseBody.model_json_schema()},
-            "multipart/form-data": {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {"type": "string", "format": "binary"},
-                        "vehicle": {"type": "string"},
-                    },
-                }
-            },
-        },
+        }
+        | UPLOAD["content"],
     }
 }
 
@@ -89,17 +80,12 @@ async def report_page(core: CoreOf, id: str) -> Response:
 
 
 async def _of_upload(request: Request, core: Core) -> JobRow:
-    async with request.form(max_files=1, max_fields=4) as form:
-        file, vehicle = form.get("file"), form.get("vehicle")
-        if not isinstance(file, UploadFile):
-            raise Problem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
-        if vehicle is not None:
-            try:
-                vehicle = _VEHICLE.validate_python(vehicle)
-            except ValidationError as error:
-                raise from_validation(error, "vehicle.") from None
-        row = await run_in_threadpool(keep_upload, core.settings, file.filename or "", file.file)
-    return await run_in_threadpool(core.diagnoses.from_recording, row, vehicle)
+    found = await receive(request, core.settings, core.store)
+    try:
+        return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)
+    except BaseException:
+        discard(core.settings, found.row)
+        raise
 
 
 async def _of_reference(request: Request, core: Core) -> JobRow:

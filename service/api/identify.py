@@ -9,15 +9,13 @@ import numpy as np
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
-from pydantic import ValidationError
 
 from sprung.model.identification.identify import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response
-from sprung.service.api.bodies import WindowBody, start_of, window_values
-from sprung.service.api.problems import Problem, from_validation
-from sprung.service.compute import Priority
+from sprung.service.api.bodies import WindowBody, read_window, start_of
+from sprung.service.api.problems import Problem
 from sprung.service.engine import Engine
 from sprung.service.store.windows import Solved
 from sprung.service.times import NANOSECONDS, now_ns
@@ -42,27 +40,22 @@ async def identify(request: Request, core: CoreOf, states: bool = False, track: 
     answer then also has the tracked `posterior`, and `start` in the body says when the window began (the window
     is taken to end now where it does not).
     """
-    try:
-        body = WindowBody.model_validate_json(await request.body())
-    except ValidationError as error:
-        raise from_validation(error) from None
+    head, values = await run_in_threadpool(read_window, await request.body(), core.engine)
     engine = core.engine
-    values = window_values(body, engine)
-    if track and body.vehicle is None:
+    if track and head.vehicle is None:
         detail = "is needed to track"
         raise Problem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
-    work = core.compute.submit(lambda: engine.identify(values[None], states=states), Priority.REQUEST)
+    now = now_ns()
+    start = start_of(head, now)
     try:
-        estimates, seconds = await asyncio.wrap_future(work)
+        estimate = await asyncio.wrap_future(core.batcher.submit(values, states))
     except UnusableWindow as error:
         raise Problem(422, str(error)) from error
-    core.metrics.observe(seconds)
-    answer = _answer(engine, body.vehicle, estimates[0])
-    if track and body.vehicle is not None:
+    answer = _answer(engine, head.vehicle, estimate)
+    if track and head.vehicle is not None:
         length = round(engine.system.window / engine.system.sample_rate * NANOSECONDS)
-        start = start_of(body)
-        window = Window(now_ns() - length if start is None else start, engine.system.sample_rate, values)
-        batch = await run_in_threadpool(core.pipeline.track, body.vehicle, window, estimates[0])
+        window = Window(now - length if start is None else start, engine.system.sample_rate, values)
+        batch = await run_in_threadpool(core.pipeline.track, head.vehicle, window, estimate)
         posterior = batch.records[0].posterior
         answer["tracked"] = batch.records[0].tracked
         if posterior is not None:

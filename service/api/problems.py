@@ -16,6 +16,7 @@ from pydantic import ValidationError
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
 
 from sprung.service.errors import Busy, NoSpace, NotFound, UserError
 
@@ -73,6 +74,7 @@ def from_validation(error: ValidationError, prefix: str = "") -> Problem:
 
 EXPECTED = (
     Problem,
+    ClientDisconnect,
     HTTPException,
     RequestValidationError,
     UserError,
@@ -89,6 +91,8 @@ def install(app: FastAPI) -> None:
     """Answer every exception of the app with a problem."""
 
     async def on_problem(request: Request, error: Exception) -> Response:
+        if isinstance(error, ClientDisconnect):  # nobody is there to be answered
+            return Response(status_code=499)
         return problem_response(_as_problem(error), request.url.path)
 
     for kind in (*EXPECTED, Exception):

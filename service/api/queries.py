@@ -59,7 +59,7 @@ def resolution_of(text: str | None) -> float | None:
         value = float(text if unit is None else text[:-1]) * (unit or 1.0)
     except ValueError:
         value = math.nan
-    if not 0 <= value <= 1e9:
+    if not (value == 0 or 1e-3 <= value <= 1e9):
         raise wrong_query("resolution", "is no number of seconds, nor one with s, m, h or d behind it")
     return value
 

@@ -32,7 +32,9 @@ REFUSED = (
     b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 2\r\n"
     b"content-type: application/problem+json\r\ncontent-length: %d\r\n\r\n"
 )
-REFUSED_BODY = b'{"type": "about:blank", "title": "Service Unavailable", "status": 503, "detail": "too many connections"}'
+REFUSED_BODY = (
+    b'{"type": "about:blank", "title": "Service Unavailable", "status": 503, "detail": "too many connections are open"}'
+)
 
 
 class Doorkeeper:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, Table, insert, select, update
+from sqlalchemy import Connection, Table, func, insert, select, update
 
 from sprung.service.store.schema import jobs, recordings, reports
 
@@ -110,6 +110,14 @@ def unfinished_jobs(connection: Connection) -> Sequence[JobRow]:
 def stored_files(connection: Connection) -> set[str]:
     """Names inside the upload folder that recordings refer to."""
     return set(connection.execute(select(recordings.c.file).where(recordings.c.file.is_not(None))).scalars())
+
+
+def stored_bytes(connection: Connection) -> int:
+    """Bytes of the uploads and excerpts that are kept."""
+    query = select(func.coalesce(func.sum(recordings.c.size_bytes), 0)).where(
+        recordings.c.file.is_not(None), recordings.c.source.in_(("upload", "excerpt"))
+    )
+    return int(connection.execute(query).scalar_one())
 
 
 def add_report(connection: Connection, row: ReportRow) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from sprung.model.system import load_system
 from sprung.service.errors import UserError
 from sprung.service.worker import Limits, Worker, WorkerFailed
 from tests import service_tasks
@@ -112,3 +114,9 @@ def ended_by(end: Callable[[int], None], note: Path) -> int:
 def test_a_worker_does_not_outlive_its_parent(tmp_path: Path, how: signal.Signals) -> None:
     pid = ended_by(lambda parent: os.kill(parent, how), tmp_path / "pid")
     assert gone(pid)
+
+
+def test_a_system_travels_to_another_process() -> None:
+    system = load_system()
+    copy = pickle.loads(pickle.dumps(system))
+    assert copy.digest == system.digest and copy.laws == system.laws

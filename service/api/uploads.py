@@ -1,0 +1,234 @@
+"""Uploads: multipart/form-data straight to the data folder, refused as soon as what came of it says so."""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from fastapi import Request
+from fastapi.concurrency import run_in_threadpool
+from pydantic import TypeAdapter, ValidationError
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from sprung.replay.recording import EXTENSIONS
+from sprung.service.api.bodies import VehicleId
+from sprung.service.api.problems import Problem, from_validation
+from sprung.service.condition import free_bytes
+from sprung.service.errors import NoSpace
+from sprung.service.settings import Settings
+from sprung.service.store import Store, work
+from sprung.service.store.work import RecordingRow
+from sprung.service.times import now_ns
+
+CHUNK = 1 << 20
+MOST_PARTS = 8
+MOST_FIELD_BYTES = 4096
+_VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
+
+BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        "multipart/form-data": {
+            "schema": {
+                "type": "object",
+                "required": ["file"],
+                "properties": {
+                    "file": {"type": "string", "format": "binary", "description": "its name says its kind"},
+                    "vehicle": {"type": "string", "description": "whose it is; else as recorded, else the file's name"},
+                },
+            }
+        }
+    },
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Upload:
+    """A file that was received whole, and the form's vehicle."""
+
+    row: RecordingRow
+    vehicle: str | None
+
+
+async def receive(request: Request, settings: Settings, store: Store) -> Upload:
+    """Take the form of a request.
+
+    Raises Problem: 415 for another type of body or of file, 413 and 507 when it is too large, 422 for a wrong form.
+    Nothing stays on the disk then.
+    """
+    kind, options = parse_options_header(request.headers.get("content-type", ""))
+    boundary = options.get(b"boundary")
+    if kind != b"multipart/form-data" or not boundary:
+        raise Problem(415, "send multipart/form-data with a file")
+    stated = request.headers.get("content-length", "")
+    room = await run_in_threadpool(room_for_uploads, settings, store)
+    if room <= (int(stated) if stated.isdigit() else 0):
+        raise NoSpace(f"no room for this upload: {max(room, 0) / 1e6:.0f} MB are left for uploads; try again later")
+    form = Form(settings, boundary, room)
+    try:
+        held = bytearray()
+        async for chunk in request.stream():
+            held += chunk
+            if len(held) >= CHUNK or form.size == 0:
+                await run_in_threadpool(form.feed, bytes(held))
+                held.clear()
+        await run_in_threadpool(form.feed, bytes(held))
+        return await run_in_threadpool(form.finish)
+    except FormParserError as error:
+        raise Problem(422, f"the body is no multipart/form-data: {error}") from error
+    finally:
+        form.close()
+
+
+def room_for_uploads(settings: Settings, store: Store) -> int:
+    """Bytes that uploads may still take: of the quota, and of the disk."""
+    settings.uploads.mkdir(parents=True, exist_ok=True)
+    with store.read() as connection:
+        kept = work.stored_bytes(connection)
+    return min(settings.max_uploads_bytes - kept, free_bytes(settings.uploads) - settings.min_free_bytes)
+
+
+@dataclass
+class _Part:
+    """One part of the form while it comes."""
+
+    headers: dict[bytes, bytes] = field(default_factory=dict)
+    name: str = ""
+    is_file: bool = False
+    value: bytearray = field(default_factory=bytearray)
+
+
+class Form:
+    """Takes the bytes of a form; the file goes to the disk as it comes."""
+
+    def __init__(self, settings: Settings, boundary: bytes, room: int) -> None:
+        self.size = 0  # of the file so far
+        self._uploads = settings.uploads
+        self._room = room
+        self._parts = 0
+        self._part = _Part()
+        self._header = (bytearray(), bytearray())
+        self._values: dict[str, bytearray] = {}
+        self._label: str | None = None
+        self._stored = ""
+        self._id = work.new_id()
+        self._target: BinaryIO | None = None
+        self._ended = False
+        self._parser = MultipartParser(
+            boundary,
+            {
+                "on_part_begin": self._begin_part,
+                "on_header_begin": lambda: self._set_header(bytearray(), bytearray()),
+                "on_header_field": lambda data, start, end: self._header[0].extend(data[start:end]),
+                "on_header_value": lambda data, start, end: self._header[1].extend(data[start:end]),
+                "on_header_end": self._end_header,
+                "on_headers_finished": self._begin_content,
+                "on_part_data": self._content,
+                "on_end": self._end,
+            },
+        )
+
+    def feed(self, data: bytes) -> None:
+        """The next bytes.  Raises Problem or NoSpace as soon as they are wrong."""
+        if data:
+            self._parser.write(data)
+
+    def finish(self) -> Upload:
+        """The file in its place, on the disk for good."""
+        self._parser.finalize()
+        if self._target is None or self._label is None:
+            raise Problem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
+        if not self._ended:
+            raise Problem(422, "the body ends within the form")
+        vehicle = None
+        if "vehicle" in self._values:
+            try:
+                vehicle = _VEHICLE.validate_python(self._values["vehicle"].decode("utf-8", "replace"))
+            except ValidationError as error:
+                raise from_validation(error, "vehicle.") from None
+        self._target.flush()
+        os.fsync(self._target.fileno())
+        self._target.close()
+        (self._uploads / f"{self._stored}.part").replace(self._uploads / self._stored)
+        sync_folder(self._uploads)
+        row = RecordingRow(self._id, None, self._label, "upload", self._stored, self.size, None, now_ns(), None)
+        return Upload(row, vehicle)
+
+    def close(self) -> None:
+        """Delete what was not finished."""
+        if self._target is not None and not self._target.closed:
+            self._target.close()
+        if self._stored:
+            (self._uploads / f"{self._stored}.part").unlink(missing_ok=True)
+
+    def _begin_part(self) -> None:
+        self._parts += 1
+        if self._parts > MOST_PARTS:
+            raise Problem(422, f"the form has more than {MOST_PARTS} parts")
+        self._part = _Part()
+
+    def _set_header(self, name: bytearray, value: bytearray) -> None:
+        self._header = (name, value)
+
+    def _end_header(self) -> None:
+        name, value = self._header
+        self._part.headers[bytes(name).lower()] = bytes(value)
+
+    def _begin_content(self) -> None:
+        _, options = parse_options_header(self._part.headers.get(b"content-disposition", b""))
+        self._part.name = options.get(b"name", b"").decode("utf-8", "replace")
+        self._part.is_file = b"filename" in options
+        if not self._part.is_file:
+            return
+        if self._part.name != "file" or self._target is not None:
+            raise Problem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
+        name = options[b"filename"].decode("utf-8", "replace")
+        self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
+        extension = known_extension(self._label)
+        self._stored = f"{self._id}{extension}"  # the client has no part in it but a known extension
+        self._target = open(self._uploads / f"{self._stored}.part", "xb")  # noqa: SIM115 (closed by `close`)
+
+    def _content(self, data: bytes, start: int, end: int) -> None:
+        if self._part.is_file:
+            assert self._target is not None
+            self.size += end - start
+            if self.size > self._room:
+                raise NoSpace("no room for this upload is left; try again later")
+            self._target.write(memoryview(data)[start:end])
+            return
+        value = self._values.setdefault(self._part.name, bytearray())
+        value += data[start:end]
+        if len(value) > MOST_FIELD_BYTES:
+            raise Problem(422, f"the form's field {self._part.name[:40]!r} is too long")
+
+    def _end(self) -> None:
+        self._ended = True
+
+
+def known_extension(label: str) -> str:
+    """The extension of a file's name; a 415 Problem where no reader knows it."""
+    extension = Path(label).suffix.lower()
+    if extension not in EXTENSIONS:
+        detail = f"has no known extension; known are {' '.join(EXTENSIONS)}"
+        raise Problem(415, f"file {detail}", [{"field": "file", "detail": detail}], {"Connection": "close"})
+    return extension
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder last through a power cut, where the platform can."""
+    with suppress(OSError):
+        number = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+
+
+def discard(settings: Settings, row: RecordingRow) -> None:
+    """Delete an upload that was received and could not be accepted after all."""
+    if row.file is not None:
+        (settings.uploads / row.file).unlink(missing_ok=True)

@@ -1,0 +1,288 @@
+"""The server itself: connections that do not finish, bodies that are wrong or too large, uploads that have no room."""
+
+from __future__ import annotations
+
+import json
+import socket
+import ssl
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fastapi.testclient import TestClient
+
+from sprung.model.system import System
+from sprung.service.api.app import create_app
+from sprung.service.api.bodies import read_window
+from sprung.service.api.problems import Problem
+from sprung.service.api.server import make_server
+from sprung.service.core import Core, build_core
+from sprung.service.engine import Engine
+from sprung.service.settings import Settings
+
+
+@contextmanager
+def served(core: Core) -> Iterator[int]:
+    """The port of a real server."""
+    server = make_server(create_app(core), core.settings, core.stopping.set)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
+        thread.start()
+        deadline = time.monotonic() + 30
+        while not server.started:
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        yield listening.getsockname()[1]
+        server.should_exit = True
+        thread.join(20)
+
+
+def ask(port: int, path: str = "/health/live", seconds: float = 10.0) -> bytes:
+    with socket.create_connection(("127.0.0.1", port), timeout=seconds) as connection:
+        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
+        found = b""
+        while chunk := connection.recv(65536):
+            found += chunk
+        return found
+
+
+def closed_within(connection: socket.socket, seconds: float) -> bool:
+    connection.settimeout(seconds)
+    try:
+        return connection.recv(65536) == b"" or connection.recv(65536) == b""
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+
+
+def settings(tmp_path: Path, **changes: Any) -> Settings:
+    return Settings(data_dir=tmp_path, min_free_bytes=0, **changes)
+
+
+def test_half_sent_requests_do_not_make_the_service_unreachable(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, client_connections=40, header_seconds=60), engine)
+    with served(core) as port, ExitStack() as stack:
+        for _ in range(120):
+            held = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            held.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Le")
+        begun = time.monotonic()
+        assert b"200 OK" in ask(port)
+        assert time.monotonic() - begun < 3.0
+
+
+def test_a_header_that_does_not_come_is_not_waited_for(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, header_seconds=0.5), engine)
+    with served(core) as port, socket.create_connection(("127.0.0.1", port)) as slow:
+        slow.sendall(b"GET / HTTP/1.1\r\nHost:")
+        assert closed_within(slow, 10)
+
+
+def test_nothing_at_all_is_not_waited_for_either(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, header_seconds=0.5), engine)
+    with served(core) as port, socket.create_connection(("127.0.0.1", port)) as silent:
+        assert closed_within(silent, 10)
+
+
+def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, body_idle_seconds=0.5), engine)
+    with served(core) as port, socket.create_connection(("127.0.0.1", port)) as slow:
+        slow.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n{")
+        assert closed_within(slow, 10)
+        assert b"200 OK" in ask(port)
+
+
+def test_a_connection_that_is_kept_alive_stays_between_requests(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, header_seconds=0.5, body_idle_seconds=0.5), engine)
+    with served(core) as port, socket.create_connection(("127.0.0.1", port), timeout=10) as kept:
+        for _ in range(3):
+            kept.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            found = b""
+            while b'"ok"}' not in found:
+                found += kept.recv(65536)
+            assert b"200 OK" in found
+            time.sleep(1.7)
+
+
+def certificate(folder: Path, name: str, by: Path | None = None) -> Path:
+    """A certificate and its key in one file, signed by itself or by another's."""
+    path = folder / f"{name}.pem"
+    command = ["openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes"]
+    command += ["-days", "2", "-subj", f"/CN={name}", "-addext", "subjectAltName=IP:127.0.0.1"]
+    command += ["-keyout", f"{path}.key", "-out", f"{path}.crt"]
+    if by is not None:
+        command += ["-CA", f"{by}", "-CAkey", f"{by}", "-addext", "basicConstraints=critical,CA:FALSE"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        pytest.skip(f"openssl: {done.stderr[-200:]}")
+    path.write_text(Path(f"{path}.key").read_text() + Path(f"{path}.crt").read_text())
+    return path
+
+
+def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engine, tmp_path: Path) -> None:
+    authority = certificate(tmp_path, "authority")
+    server, client = certificate(tmp_path, "server", authority), certificate(tmp_path, "client", authority)
+    core = build_core(settings(tmp_path, tls_certificate=server, tls_client_ca=authority), engine)
+    with served(core) as port:
+        context = ssl.create_default_context(cafile=str(authority))
+
+        def status() -> bytes:
+            with (
+                socket.create_connection(("127.0.0.1", port), timeout=10) as plain,
+                context.wrap_socket(plain, server_hostname="127.0.0.1") as connection,
+            ):
+                connection.sendall(b"GET /health/live HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+                return connection.recv(65536)
+
+        with suppress(ssl.SSLError, ConnectionError):
+            assert status() == b""
+        context.load_cert_chain(str(client))
+        assert b"200 OK" in status()
+        assert b"200 OK" not in ask(port)  # no plain HTTP
+
+
+def test_wrong_bodies_cost_milliseconds(engine: Engine, system: System) -> None:
+    strings = {f"x{i}": ["1.5"] * 100 for i in range(900)}
+    for channels in (
+        {c.name: ["a"] * system.window for c in system.channels},
+        strings,
+        {str(i): [] for i in range(160_000)},
+        {"x": [1] * 900_000},
+        {c.name: [[]] * 20_000 for c in system.channels},
+    ):
+        body = json.dumps({"sample_rate": 100.0, "channels": channels}).encode()
+        begun = time.process_time()
+        with pytest.raises(Problem) as caught:
+            read_window(body, engine)
+        assert time.process_time() - begun < 0.2, len(body)
+        assert 1 <= len(caught.value.errors) <= 20 and caught.value.status == 422
+
+
+def test_a_key_flood_is_not_looked_at(engine: Engine) -> None:
+    with pytest.raises(Problem, match="strings"):
+        read_window(json.dumps({str(i): i for i in range(100_000)}).encode(), engine)
+
+
+@pytest.mark.parametrize("start", ["2200-01-01T00:00:00Z", "2399-01-01T00:00:00Z"])
+def test_a_window_of_the_future_is_refused_before_it_is_identified(client: TestClient, body: Any, start: str) -> None:
+    response = client.post("/identify?track=true", json=body | {"start": start})
+    assert response.status_code == 422
+    assert response.json()["errors"][0]["field"] == "start"
+
+
+@pytest.fixture
+def core(engine: Engine, tmp_path: Path) -> Core:
+    return build_core(settings(tmp_path, max_uploads_bytes=50_000), engine)
+
+
+@pytest.fixture
+def client(core: Core) -> Iterator[TestClient]:
+    with TestClient(create_app(core), raise_server_exceptions=False) as running:
+        yield running
+
+
+@pytest.fixture
+def body(system: System) -> dict[str, Any]:
+    channels = {channel.name: [0.01] * system.window for channel in system.channels}
+    return {"vehicle": "demo-0001", "sample_rate": 100.0, "channels": channels}
+
+
+def nothing_left(core: Core) -> bool:
+    return not core.settings.uploads.exists() or not list(core.settings.uploads.iterdir())
+
+
+@pytest.mark.parametrize("path", ["/recordings", "/diagnose"])
+def test_an_upload_past_the_quota_is_507_and_leaves_nothing(client: TestClient, core: Core, path: str) -> None:
+    assert client.post(path, files={"file": ("a.mcap", b"x" * 60_000)}).status_code == 507
+
+    def unstated() -> Iterator[bytes]:
+        yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.mcap"\r\n\r\n'
+        for _ in range(60):
+            yield b"x" * 1000
+        yield b"\r\n--b--\r\n"
+
+    headers = {"content-type": "multipart/form-data; boundary=b"}
+    assert client.post(path, content=unstated(), headers=headers).status_code == 507
+    assert nothing_left(core)
+
+
+def test_the_quota_counts_what_is_kept(client: TestClient) -> None:
+    assert client.post("/recordings", files={"file": ("a.mcap", b"x" * 30_000)}).status_code == 202
+    assert client.post("/recordings", files={"file": ("b.mcap", b"x" * 30_000)}).status_code == 507
+
+
+def test_a_file_of_no_known_kind_is_refused_before_its_content_came(client: TestClient, core: Core) -> None:
+    sent = 0
+
+    def endless() -> Iterator[bytes]:
+        nonlocal sent
+        yield b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.exe"\r\n\r\n'
+        for _ in range(10_000):
+            sent += 1
+            yield b"x" * 1000
+
+    # the test client hands over the whole body; a real one stops at the answer: what counts is that it is not kept
+    response = client.post(
+        "/recordings", content=endless(), headers={"content-type": "multipart/form-data; boundary=b"}
+    )
+    assert response.status_code in (413, 415)
+    assert nothing_left(core)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"--b--\r\n",
+        b"rubbish",
+        b'--b\r\nContent-Disposition: form-data; name="file"; filename="a.mcap"\r\n\r\nabc',
+        b'--b\r\nContent-Disposition: form-data; name="other"; filename="a.mcap"\r\n\r\nabc\r\n--b--\r\n',
+        b'--b\r\nContent-Disposition: form-data; name="file"\r\n\r\nno file\r\n--b--\r\n',
+        b'--b\r\nContent-Disposition: form-data; name="vehicle"\r\n\r\n' + b"v" * 5000 + b"\r\n--b--\r\n",
+        b'--b\r\nContent-Disposition: form-data; name="x"\r\n\r\n1\r\n' * 20 + b"--b--\r\n",
+    ],
+)
+def test_wrong_forms_are_refused_and_leave_nothing(client: TestClient, core: Core, content: bytes) -> None:
+    response = client.post("/recordings", content=content, headers={"content-type": "multipart/form-data; boundary=b"})
+    assert response.status_code == 422, response.text
+    assert nothing_left(core)
+    assert client.post("/recordings", content=content, headers={"content-type": "text/plain"}).status_code == 415
+
+
+def test_clients_that_ask_at_once_share_a_batch_and_each_gets_its_own(
+    client: TestClient, core: Core, body: dict[str, Any], system: System
+) -> None:
+    sizes: list[int] = []
+    real = core.batcher._engine.identifier.identify
+
+    def noted(values: Any, *rest: Any, **named: Any) -> Any:
+        sizes.append(len(values))
+        return real(values, *rest, **named)
+
+    core.batcher._engine.identifier.identify = noted  # type: ignore[method-assign]
+    release, started = threading.Event(), threading.Event()
+    core.compute.submit(lambda: (started.set(), release.wait()))
+    started.wait(5)
+    answers: dict[int, float] = {}
+
+    def one(number: int) -> None:
+        channels = {name: [0.01 * number] * system.window for name in body["channels"]}
+        answer = client.post("/identify", json=body | {"channels": channels}).json()
+        answers[number] = answer["parameters"][0]["ratio"]
+
+    threads = [threading.Thread(target=one, args=(number,)) for number in range(6)]
+    for thread in threads:
+        thread.start()
+    deadline = time.monotonic() + 10
+    while core.batcher.waiting < 6 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    release.set()
+    for thread in threads:
+        thread.join(10)
+    assert sizes == [6]
+    assert [round(answers[number], 3) for number in range(6)] == [1.0, 1.01, 1.02, 1.03, 1.041, 1.051]
