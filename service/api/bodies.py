@@ -62,7 +62,8 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
     Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
     Raises a 422 Problem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
     """
-    if max(content.count(mark) for mark in (b'"', b"[", b"{")) > 4 * MOST_CHANNELS:  # before they are made into anything
+    # counted before they are made into anything
+    if max(content.count(mark) for mark in (b'"', b"[", b"{")) > 4 * MOST_CHANNELS:
         detail = "holds too many strings or lists: a window has a list of plain numbers a channel"
         raise Problem(422, f"body {detail}", [_wrong("body", detail)])
     try:
