@@ -108,9 +108,10 @@ def _functions(
 
 
 def _between(value: float, x: list[float], y: list[float]) -> float:
-    """Linear interpolation of one number; quicker than through arrays."""
+    """Linear interpolation of one number; quicker than through arrays.  Where x stands still, the last y."""
     i = min(max(bisect_right(x, value), 1), len(x) - 1)
-    share = (value - x[i - 1]) / (x[i] - x[i - 1])
+    width = x[i] - x[i - 1]
+    share = (value - x[i - 1]) / width if width > 0 else 1.0
     return y[i - 1] + min(max(share, 0.0), 1.0) * (y[i] - y[i - 1])
 
 

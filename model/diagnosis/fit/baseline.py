@@ -12,15 +12,34 @@ from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.whitening import Whitener
+from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.system import System
 
 _REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
+_DIVERGED = (
+    "the system file's structure cannot be fitted to this recording: the numbers diverge; "
+    "check units, signs and order of the channels, and the masses and stiffnesses of the system file"
+)
 
 
 def baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
-    """The nominal structure on the first `split` samples, with noise levels estimated on the way."""
+    """The nominal structure on the first `split` samples, with noise levels estimated on the way.
+
+    Errors: `DiagnosisError` where the numbers of system file and recording fit each other so badly that none comes out.
+    """
+    try:
+        with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
+            problem, fit = _baseline(system, signals, declared, split)
+    except (np.linalg.LinAlgError, FloatingPointError):
+        raise DiagnosisError(_DIVERGED) from None
+    if not np.isfinite(fit.chi_square):
+        raise DiagnosisError(_DIVERGED)
+    return problem, fit
+
+
+def _baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, rated=drifting(system, signals.sensor_index))

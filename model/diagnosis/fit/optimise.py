@@ -18,7 +18,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
 from sprung.model.diagnosis.fit.linear_equivalent import preloaded
-from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.problem import Problem, law_forces
 from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened, scale_of, smoothed
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise
@@ -32,7 +32,12 @@ from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
 PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
-_SLACK = 5e-4  # of the objective: inputs are smoothed again and loops solved again in every round
+# Fall of the objective, twice a log-likelihood, below which a fit is done per standard deviation that it moved; below
+# which a step that fails has nothing to find; and beyond which a fit is no basis of comparisons: a tenth of the
+# margin by which one law is preferred to another
+_SMALL, _NUMERICAL, _UNSETTLED = 0.02, 0.3, 0.6
+_SMOOTHING = 5e-4  # share of chi-square by which smoothing the inputs anew may move it
+_DAMPING = (1e-6, 1e3)  # first and most, of the scaled normal equations
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class Fit:
     forward: Forward
     forces: LawForces | None
     motions: Motions
-    converged: bool
+    left: float  # by how much the objective fell in the last step, or would in a step that failed
     iterations: int
     bounded: bool = False  # a law's parameter stopped at its bound
 
@@ -62,6 +67,11 @@ class Fit:
         counts = [len(term.parameters) for term in self.point.terms]
         first = len(self.point.theta) + sum(counts[:index])
         return slice(first, first + counts[index])
+
+    @property
+    def converged(self) -> bool:
+        """Whether another step would change nothing that matters."""
+        return self.left < _UNSETTLED
 
     @property
     def deviance(self) -> float:
@@ -125,32 +135,37 @@ def optimise(
 ) -> Fit:
     """Gauss-Newton with Levenberg damping from `start`; stops when no parameter moves by `tolerance` std.
 
+    The fit is the best point seen: a step that raises the objective is never taken.  Since inputs are smoothed anew
+    and loops solved again in every step, a rise counts only against the present point under the same new inputs.
     `whitener`: that of a fit whose chi-square this one is compared with; by default, of the model at the start.
     """
-    point, working = _begun(problem, start, whitener)
-    lin = linearise(problem, point, working)
-    state = _State(point, working, lin, _objective(lin, point))
-    damping, converged, count = 1e-6, False, 0
+    state = _state(problem, *_begun(problem, start, whitener))
+    damping, left, count = _DAMPING[0], np.inf, 0
     for count in range(1, iterations + 1):
-        step, sigma = _step(state.lin, state.point, damping)
-        trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
+        step, sigma, promised = _step(state.lin, state.point, damping)
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
-        lin = linearise(problem, trial, working)
-        value = _objective(lin, trial)
-        if value <= state.value + _SLACK * float(state.lin.residual @ state.lin.residual) + 0.5:
-            gained = state.value - value
-            state = _State(replace(trial, near=near_of(lin.forces)), working, lin, value)
-            damping = max(damping / 10, 1e-9)
-            if size < tolerance or gained < 0.02 * max(1.0, size):
-                converged = True
+        trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
+        proposed = _state(problem, trial, working)
+        if proposed.value >= state.value and promised < _NUMERICAL:
+            left = promised
+            break
+        rise = proposed.value - state.value
+        if 0 <= rise < _SMOOTHING * float(state.lin.residual @ state.lin.residual) and not problem.follows:
+            state = replace(state, working=working, value=_value_under(problem, state, working))
+        if proposed.value < state.value:
+            left = state.value - proposed.value
+            state = proposed
+            damping = max(damping / 10, _DAMPING[0] / 1e3)
+            if size < tolerance or left < _SMALL * max(1.0, size):
                 break
             if count in (2, 4):
                 state = replace(state, point=preloaded(problem, state.point, state.working.inputs))
         else:
-            damping = max(damping * 30, 1e-4)
-            if damping > 1e3:
+            left = promised
+            damping = max(damping * 30, 100 * _DAMPING[0])
+            if damping > _DAMPING[1]:
                 break
-    return _finish(problem, state, converged, count)
+    return _finish(problem, state, left, count)
 
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
@@ -161,8 +176,25 @@ def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[P
     return opened(problem, preloaded(problem, start, None), whitener)
 
 
-def _objective(lin: Linearised, point: Point) -> float:
-    return float(lin.residual @ lin.residual + lin.log_det + np.sum((point.theta / PRIOR) ** 2))
+def _state(problem: Problem, point: Point, working: Working) -> _State:
+    """The model linearised at a point.  Objective: twice the negative log-posterior, up to a constant."""
+    lin = linearise(problem, point, working)
+    return _State(replace(point, near=near_of(lin.forces)), working, lin, _value(lin.residual, lin.log_det, point))
+
+
+def _value(residual: FloatArray, log_det: float, point: Point) -> float:
+    return float(residual @ residual + log_det + np.sum((point.theta / PRIOR) ** 2))
+
+
+def _value_under(problem: Problem, state: _State, working: Working) -> float:
+    """The objective at the present point under inputs that were smoothed anew."""
+    inputs, point = working.inputs, state.point
+    if inputs is None:
+        return state.value
+    forward = state.lin.forward.driven_by(inputs.part, point.near)
+    shown = problem.shown(forward, law_forces(forward, point, inputs))
+    free = problem.free_columns(forward) @ point.state
+    return _value(working.whitener(problem.part.sensors - shown - free, problem.part), state.lin.log_det, point)
 
 
 def _normal(lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
@@ -174,27 +206,35 @@ def _normal(lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
     return normal * scale * scale[:, None], scale
 
 
-def _step(lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray]:
-    """Gauss-Newton step and the standard deviations of theta and term parameters."""
+def _step(lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray, float]:
+    """Gauss-Newton step, standard deviations of theta and term parameters, and the fall that a full step promises."""
     P = len(point.theta)
     scaled, scale = _normal(lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
     gradient[:P] -= point.theta / PRIOR**2
-    scaled[np.diag_indices_from(scaled)] += damping + 1e-13
-    inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
-    step = scale * (inverse @ (gradient * scale))
+    step, variance, promised = _solved(scaled, scale, gradient, damping)
     held = held_back(point, step)
     if held.any():  # the others go on as if it were given
         scaled[held], scaled[:, held], gradient[held] = 0.0, 0.0, 0.0
-        inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
-        step = scale * (inverse @ (gradient * scale))
+        step, variance, promised = _solved(scaled, scale, gradient, damping)
     free = len(scaled) - len(point.state)
-    sigma = (scale * np.sqrt(np.maximum(np.diag(inverse), 1e-300)))[:free]
-    return step, sigma
+    return step, np.sqrt(np.maximum(variance, 1e-300))[:free], promised
 
 
-def _finish(problem: Problem, state: _State, converged: bool, count: int) -> Fit:
+def _solved(
+    scaled: FloatArray, scale: FloatArray, gradient: FloatArray, damping: float
+) -> tuple[FloatArray, FloatArray, float]:
+    """Solution of damped normal equations, its variances, and the fall of the objective with least damping."""
+    values, vectors = np.linalg.eigh(scaled)
+    values = np.maximum(values, 0.0)
+    turned = vectors.T @ (gradient * scale)
+    damped = values + damping + 1e-13
+    step = scale * (vectors @ (turned / damped))
+    return step, scale**2 * (vectors**2 @ (1 / damped)), float(np.sum(turned**2 / (values + _DAMPING[0])))
+
+
+def _finish(problem: Problem, state: _State, left: float, count: int) -> Fit:
     """The fit at a state, with its uncertainty."""
     point, lin = state.point, state.lin
     P = len(point.theta)
@@ -219,7 +259,7 @@ def _finish(problem: Problem, state: _State, converged: bool, count: int) -> Fit
         forward=lin.forward,
         forces=lin.forces,
         motions=lin.motions,
-        converged=converged,
+        left=left,
         iterations=count,
         bounded=any(t.bounded for t in point.terms),
     )

@@ -292,9 +292,9 @@ class Forward:
         elements = [self.element_of(term) for term in waveform]
         return Loop(self.plant, waveform, ports, elements, self.fine_motion(ports, state))
 
-    def driven_by(self, part: Part) -> Forward:
-        """The same model under other inputs."""
-        other = replace(self, part=part)
+    def driven_by(self, part: Part, start_force: tuple[FloatArray, ...] = ()) -> Forward:
+        """The same model under other inputs; `start_force`: its laws' forces nearby."""
+        other = replace(self, part=part, start_force=start_force)
         other.__dict__["plant"] = self.plant
         return other
 

@@ -46,6 +46,7 @@ _UNUSUAL = 4.0  # evidence that a factor e outside the usual range of a paramete
 _STRONGER = 1.1
 _HINT = 0.02  # share of a law's strength at which its first step is taken
 _BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
+_SETTLING = 3  # rounds in which fits that still fall and could lead are fitted on
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
 _FURTHER = 3  # candidates that are tried for a runner-up where none was close
 _QUIET = 0.5  # least noise power of a block over the estimated one
@@ -152,8 +153,23 @@ def compete(
     named = finished([trial for trial in leading if trial.named])
     unnamed = [trial for trial in leading if not trial.named]
     if not any(_may_lead(problem, trial.hit, named) for trial in unnamed):
-        return _graded(problem, base, [*named, *(replace(trial, finished=False) for trial in unnamed), *behind])
-    return _graded(problem, base, [*named, *finished(unnamed), *behind])
+        all_trials = [*named, *(replace(trial, finished=False) for trial in unnamed), *behind]
+    else:
+        all_trials = [*named, *finished(unnamed), *behind]
+    return _settled(problem, base, _graded(problem, base, all_trials))
+
+
+def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+    """Trials by evidence, none of which could lead if only it were fitted on: a fit that still falls is no gain."""
+    for _ in range(_SETTLING):
+        best = trials[0].evidence
+        falling = [t for t in trials if t.finished and not t.fit.converged and t.evidence + t.fit.left > best]
+        if not falling:
+            break
+        others = [t for t in trials if all(t is not one for one in falling)]
+        again = share(lambda trial: _finished(problem, base, trial), falling, WORKERS)
+        trials = _graded(problem, base, [*again, *others])
+    return trials
 
 
 def runner_up(problem: Problem, base: Fit, hits: list[Hit], chosen: Trial, tried: list[Trial]) -> Trial | None:
@@ -268,9 +284,14 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
         return start
     hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
     faint = start_of(base, replace(hit, term=hint))
-    with np.errstate(all="ignore"):
-        faint, working = opened(problem, faint, base.whitener)
-        lin = linearise(problem, faint, working)
+    try:
+        with np.errstate(all="ignore"):
+            faint, working = opened(problem, faint, base.whitener)
+            lin = linearise(problem, faint, working)
+    except np.linalg.LinAlgError:
+        return start
+    if not np.all(np.isfinite(lin.residual)) or not np.all(np.isfinite(lin.jacobian)):
+        return start
     count = len(hit.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
@@ -331,7 +352,7 @@ def profile_gain(before: FloatArray, after: FloatArray, sensors: int, quiet: flo
     """
     power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
     bins = len(power[0])
-    edges = np.unique(np.round(np.geomspace(_FIRST_BLOCK, bins, _BLOCKS)).astype(int))
+    edges = np.unique(np.round(np.geomspace(min(_FIRST_BLOCK, bins), bins, _BLOCKS)).astype(int))
     edges = np.concatenate([[0], edges[edges > 0]])
     counts = 2.0 * np.diff(edges)[:, None]
     levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, quiet) for p in power]

@@ -1,0 +1,67 @@
+"""The optimiser: never uphill, and breakage told from divergence."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.fit import optimise as module
+from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.fit.optimise import optimise, try_optimise
+from sprung.model.diagnosis.record.channels import DiagnosisError, prepare
+from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import find_law
+from tests.diagnosis_cases import quarter_car, simulate
+
+
+@pytest.fixture(scope="module")
+def clean():
+    system = quarter_car()
+    signals = prepare(system, simulate(seconds=12, seed=2).values, 100.0).signals
+    return baseline(system, signals, declared_noise(system, signals), 700)
+
+
+@pytest.mark.parametrize("factor", [1.05, 1.5, 4.0])
+def test_a_fit_is_never_worse_than_any_point_that_it_saw(clean, factor, monkeypatch):
+    problem, fit = clean
+    seen = []
+    whole = module._state
+
+    def recorded(*args):
+        seen.append(whole(*args))
+        return seen[-1]
+
+    monkeypatch.setattr(module, "_state", recorded)
+    again = optimise(problem, replace(fit.point, theta=fit.point.theta + np.log(factor)), whitener=fit.whitener)
+    objective = again.deviance + float(np.sum(again.point.theta**2))
+    # all points but the first, which was weighed before inputs were smoothed
+    assert objective <= min(state.value for state in seen[1:]) + 0.5
+    assert again.converged
+    assert again.chi_square == pytest.approx(fit.chi_square, abs=0.5)
+
+
+def test_a_fit_from_its_own_solution_stays_there(clean):
+    problem, fit = clean
+    again = optimise(problem, fit.point, whitener=fit.whitener)
+    assert again.converged
+    assert np.abs((again.point.theta - fit.point.theta) / np.sqrt(np.diag(fit.covariance))).max() < 0.1
+
+
+def test_errors_of_the_program_are_no_divergence(clean):
+    problem, fit = clean
+    broken = Term(find_law("cubic_stiffness"), "secondary", (1e9, 2.0), scales=(1e9, 1.0))  # one parameter too many
+    with pytest.raises(ValueError):
+        try_optimise(problem, Point(fit.point.theta, (broken,), fit.point.state), 3)
+
+
+def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch):
+    def singular(*args, **kwargs):
+        raise np.linalg.LinAlgError("Matrix is not positive definite")
+
+    monkeypatch.setattr("sprung.model.diagnosis.fit.baseline.optimise", singular)
+    system = quarter_car()
+    signals = prepare(system, simulate(seconds=12).values, 100.0).signals
+    with pytest.raises(DiagnosisError, match="numbers diverge; check units"):
+        baseline(system, signals, declared_noise(system, signals), 700)
