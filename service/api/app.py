@@ -24,6 +24,7 @@ from sprung.service.api import (
     signals,
 )
 from sprung.service.api.description import PROBLEMS, describe
+from sprung.service.api.head import HeadAsGet
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
 from sprung.service.core import Core
@@ -74,4 +75,5 @@ def create_app(
         limit=core.settings.max_body_bytes,
         paths={"/recordings": uploads, "/diagnose": uploads},
     )
+    app.add_middleware(HeadAsGet)
     return app

@@ -45,12 +45,78 @@ def describe(app: FastAPI) -> None:
             own = ProblemAnswer.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= own.pop("$defs", {}) | {"ProblemAnswer": own}
             for path, methods in found["paths"].items():
-                for operation in methods.values():
+                for method, operation in methods.items():
                     _complete(path, operation)
+                    if (path, method) in EXAMPLES:
+                        operation["responses"]["200"]["content"]["application/json"]["example"] = EXAMPLES[path, method]
             app.openapi_schema = found
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+EXAMPLES: dict[tuple[str, str], Any] = {
+    ("/vehicles", "get"): {
+        "vehicles": [
+            {
+                "vehicle": "car-17",
+                "label": None,
+                "health": "out_of_specification",
+                "last_window": "2026-09-21T14:23:19.500Z",
+                "received": "2026-09-21T14:23:20.112Z",
+                "silent": False,
+                "alarms": 1,
+                "unacknowledged": 1,
+                "largest": "secondary_2l.damping",
+                "drift": -0.392,
+                "learned": 1.0,
+                "retired": None,
+            }
+        ],
+        "next": None,
+        "counts": {"ok": 41, "out_of_specification": 1},
+    },
+    ("/vehicles/{id}/history", "get"): {
+        "vehicle": "car-17",
+        "parameter": "secondary_2l.damping",
+        "unit": "N s/m",
+        "nominal": 20000.0,
+        "resolution": 60.0,
+        "points": [
+            {
+                "time": "2026-09-21T14:23:00.000Z",
+                "value": 11160.0,
+                "std": 37.7,
+                "lower95": 11086.1,
+                "upper95": 11233.9,
+                "low": 11120.0,
+                "high": 11210.0,
+                "ratio": 0.558,
+                "windows": 120,
+            }
+        ],
+    },
+    ("/vehicles/{id}/alarms", "get"): {
+        "vehicle": "car-17",
+        "alarms": [
+            {
+                "id": 7,
+                "vehicle": "car-17",
+                "parameter": "secondary_2l.damping",
+                "kind": "change",
+                "onset": "2026-09-21T14:13:50.000Z",
+                "raised": "2026-09-21T14:14:02.000Z",
+                "recovered": None,
+                "change": -0.392,
+                "std": 0.002,
+                "severity": "alarm",
+                "report": None,
+                "acknowledged": None,
+                "acknowledged_by": None,
+            }
+        ],
+    },
+}
 
 
 def _complete(path: str, operation: dict[str, Any]) -> None:
