@@ -7,6 +7,7 @@ import json
 import shutil
 import subprocess
 import threading
+import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -149,10 +150,11 @@ def test_the_typed_client_uploads(served: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(shutil.which("openapi-python-client") is None, reason="needs openapi-python-client")
-def test_a_generated_client_reads_a_vehicle(served: str, client: TestClient, tmp_path: Path) -> None:
+def test_a_generated_client_reads_a_vehicle(served: str, tmp_path: Path) -> None:
     tool = shutil.which("openapi-python-client")
     assert tool is not None
-    (tmp_path / "openapi.json").write_text(json.dumps(client.get("/openapi.json").json()))
+    with urllib.request.urlopen(f"{served}/openapi.json") as answer:
+        (tmp_path / "openapi.json").write_bytes(answer.read())
     command = [tool, "generate", "--path", "openapi.json", "--meta", "none", "--output-path", "made"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "WARNING" not in done.stdout + done.stderr, done.stdout + done.stderr
