@@ -18,6 +18,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "replay": ("sprung.benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
     "serve": ("sprung.benchmarks.serve", "latency of POST /identify, against a bare echo"),
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
+    "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
     "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
     "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),

@@ -26,6 +26,8 @@ MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
 _WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range")  # an address without its noise
 
+SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
+
 
 def _channel(name: str, quantity: str, at: Address) -> Channel:
     gain, offset = at.conversion(SI[quantity])
@@ -98,8 +100,13 @@ class System:
 
     @cached_property
     def inputs(self) -> tuple[Channel, ...]:
-        """Measured input signals, in the order of the file; a support's displacement, velocity, acceleration."""
+        """Measured input signals, in the order of the file; a support's displacement, velocity, acceleration.
+
+        Wheels on a track have none; the measured speed, where there is one, tells how late each of them is.
+        """
         channels = []
+        if self.on_track and self._speed_measured:
+            channels.append(_channel("speed", "speed", self.file.speed))
         for name, source in self.file.inputs.items():
             if isinstance(source, ForceInput):
                 channels.append(_channel(name, "force", source))
@@ -116,12 +123,22 @@ class System:
     @cached_property
     def auxiliary(self) -> tuple[Channel, ...]:
         """Measured signals that say how the vehicle runs: `speed`, and `BODY.pressure` of loads."""
-        speed = self.file.speed
-        channels = [] if speed is None or speed.value is not None else [_channel("speed", "speed", speed)]
+        channels = []
+        if self._speed_measured and not self.on_track:
+            channels.append(_channel("speed", "speed", self.file.speed))
         for name, body in self.file.bodies.items():
             if body.load is not None and body.load.pressure is not None:
                 channels.append(_channel(f"{name}.pressure", "pressure", body.load.pressure))
         return tuple(channels)
+
+    @cached_property
+    def on_track(self) -> bool:
+        """Whether what moves it is a track that nobody measures."""
+        return any(isinstance(source, TrackInput) for source in self.file.inputs.values())
+
+    @property
+    def _speed_measured(self) -> bool:
+        return self.file.speed is not None and self.file.speed.value is None
 
     @cached_property
     def time(self) -> TimeColumn:
@@ -240,15 +257,26 @@ def unsupported(file: SystemFile) -> list[str]:
     """What the format can say and identification cannot use yet, one line each."""
     found = []
     for name, source in file.inputs.items():
-        if isinstance(source, TrackInput):
-            found.append(f"inputs.{name}: kind track is not supported by identification yet")
-        elif isinstance(source, SupportInput) and source.displacement is None:
+        if isinstance(source, SupportInput) and source.displacement is None:
             found.append(f"inputs.{name}: a support without displacement is not supported by identification yet")
         elif isinstance(source, SupportInput) and source.acceleration is not None:
             found.append(f"inputs.{name}.acceleration: not supported by identification yet; leave it out")
+    tracks = [name for name, source in file.inputs.items() if isinstance(source, TrackInput)]
+    if tracks and len(tracks) < len(file.inputs):
+        other = next(name for name in file.inputs if name not in tracks)
+        found.append(
+            f"inputs.{other}: measured inputs beside a track are not supported; make all wheels kind track, or none"
+        )
+    seconds = file.window / file.sample_rate
+    if tracks and seconds < SHORTEST_TRACK:
+        least = round(SHORTEST_TRACK * file.sample_rate)
+        found.append(
+            f"window: {seconds:g} s is too short to tell vehicle from track where no input is measured; "
+            f"{least} samples at the least, a minute ({round(60 * file.sample_rate)}) is usual"
+        )
     for name, body in file.bodies.items():
-        if body.load is not None:
+        if body.load is not None and not tracks:
             found.append(f"bodies.{name}.load: a varying load is not supported by identification yet")
-    if file.speed is not None and file.speed.value is None:
+    if file.speed is not None and file.speed.value is None and not tracks:
         found.append("speed: a measured speed is not supported by identification yet; give a number in m/s")
     return found

@@ -14,7 +14,6 @@ from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.system import System
 from sprung.replay import open_recording
 from sprung.replay.pacing import paced
-from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
 from sprung.service.worker import Emit, Limits, Worker
 
@@ -102,7 +101,6 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     recording = open_recording(request.path, system.channels, dbc=request.dbc, time=system.time, start=start)
     windower, spans = windower_of(system), Spans()
     held: list[Window] = []
-    whole = 0
     told = time.monotonic()
 
     def tell() -> None:
@@ -113,21 +111,18 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     for block in paced(spans.watch(recording.blocks()), request.speed):
         for window in windower.push(block):
             held.append(window)
-            whole += 1
             if len(held) >= request.batch_windows:
                 tell()
         if time.monotonic() - told > SIGN_OF_LIFE_SECONDS:
             tell()
-    last = windower.flush()
-    held += last
+    held += windower.flush()
     for first in range(0, len(held), request.batch_windows):
         emit(Piece(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
-    said = remarks(windower, whole + len(last))
     return Ending(
         recording.tally,
         recording.vehicle,
-        [*said, *recording.problems],
-        recording.incomplete or bool(said),
+        list(recording.problems),
+        recording.incomplete,
         windower.expected,
         windower.lost,
         spans.first_ns,

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 
 from sprung.model.diagnosis.api import diagnose
-from sprung.model.identification.identify import Identifier, UnusableWindow, load_identifier
+from sprung.model.identification.identify import load_identifier
+from sprung.model.identifier import Identifies, UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.simulate.linear import LinearSimulator, knots
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system, parse_system
@@ -129,7 +130,7 @@ def simulate(
 
 
 def identify(
-    system: System, values: FloatArray | Mapping[str, FloatArray], model: Identifier | None = None
+    system: System, values: FloatArray | Mapping[str, FloatArray], model: Identifies | None = None
 ) -> IdentifiedWindow:
     """Stiffness and damping of every element from one window.
 
@@ -155,7 +156,7 @@ def identify(
     return IdentifiedWindow(_values(system, estimate), estimate)
 
 
-def track(system: System, recording: Recording, model: Identifier | None = None) -> Tracked:
+def track(system: System, recording: Recording, model: Identifies | None = None) -> Tracked:
     """Posterior, drift and alarms of every parameter over a whole recording.
 
     >>> import sprung

@@ -26,7 +26,9 @@ ORDER = [
     "laws",
     "systemfile",
     "system",
+    "identifier",
     "simulate",
+    "ambient",
     "identification",
     "tracking",
 ]

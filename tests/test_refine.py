@@ -7,9 +7,10 @@ from test_system import OSCILLATOR, QUARTER_CAR
 
 from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
 from sprung.model.identification.features import ForceBalance, magnitudes
-from sprung.model.identification.identify import Identifier, UnusableWindow, identifiability
+from sprung.model.identification.identify import Identifier, identifiability
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refiner
+from sprung.model.identifier import UnusableWindow
 from sprung.model.system import load_system, parse_system
 
 

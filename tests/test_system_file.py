@@ -167,9 +167,9 @@ def test_track_load_speed_and_tests_without_a_body_can_be_said():
             .replace("window: 200", "window: 200\nspeed: {csv: v, unit: km/h}")
         )
     )
-    assert system.inputs == ()
-    assert [(c.name, c.unit) for c in system.auxiliary] == [("speed", "m/s"), ("sprung.pressure", "Pa")]
-    assert system.auxiliary[0].gain == pytest.approx(1 / 3.6)
+    assert [(c.name, c.unit) for c in system.inputs] == [("speed", "m/s")]  # says how late the wheels are
+    assert [(c.name, c.unit) for c in system.auxiliary] == [("sprung.pressure", "Pa")]
+    assert system.inputs[0].gain == pytest.approx(1 / 3.6)
     parse_system_file(
         "{name: dyno, sample_rate: 100, window: 64, bodies: {},"
         " inputs: {rod: {kind: support, displacement: {csv: x}}},"

@@ -55,8 +55,11 @@ def wheel_spectra(
     side: Array,
     correlation: float = 0.5,
     joint_spacing: float | None = None,
+    own_share: float = 0.0,
 ) -> tuple[NDArray[np.complex128], Array, int]:
     """Displacement of every wheel as harmonics of a period that is longer than `seconds`.
+
+    own_share: part of every wheel's power that no other wheel sees.
 
     Returns `irfft` coefficients on the grid of 1 kHz (F, wheels), angular frequencies (F,) and the period's samples.
     """
@@ -73,6 +76,9 @@ def wheel_spectra(
         rails[float(y)] * np.exp(-1j * omega * (position.max() - x) / speed)
         for x, y in zip(position, side, strict=True)
     ]
+    if own_share > 0:
+        alone = (_rail_spectrum(rng, samples, speed, level) for _ in delayed)
+        delayed = [np.sqrt(1 - own_share) * d + np.sqrt(own_share) * a for d, a in zip(delayed, alone, strict=True)]
     return np.stack(delayed, axis=1), omega, samples
 
 

@@ -8,27 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
+from sprung.model.ambient.foreseen import foreseen
+from sprung.model.ambient.identify import AmbientIdentifier
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System
 
 _FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
 EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
-
-
-class UnusableWindow(ValueError):
-    """A window that cannot be identified at all; the message names the channel and what to do."""
-
-
-@dataclass(slots=True)
-class StageTimes:
-    """Seconds spent in the stages of the last batch, for metrics."""
-
-    estimate: float = 0.0
-    refine: float = 0.0
 
 
 @dataclass(slots=True)
@@ -88,11 +79,41 @@ class Identifier:
         return windows
 
 
-def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifier:
+@dataclass(slots=True)
+class OutputOnly:
+    """Windows of a system without inputs: a free decay where that explains the window, ambient forces otherwise."""
+
+    decay: Identifier
+    ambient: AmbientIdentifier
+    times: StageTimes = field(default_factory=StageTimes)
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate."""
+        return self.ambient.digest
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window; see `model.identifier.Identifies`."""
+        found = self.decay.identify(windows, start, states=states)
+        shaken = [b for b, estimate in enumerate(found) if not (estimate.adequate and estimate.identifiable.any())]
+        again = self.ambient.identify(windows[shaken], None if start is None else start[shaken])
+        for b, estimate in zip(shaken, again, strict=True):
+            found[b] = estimate
+        spent = self.decay.times.refine + (self.ambient.times.refine if shaken else 0.0)
+        self.times = StageTimes(0.0, spent)
+        return found
+
+
+def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifies:
     """The system's identifier with trained weights from `model` (a directory), or the bundled ones if they fit.
 
-    Without weights for the system the refinement starts from the nominal values.
+    Without weights for the system the refinement starts from the nominal values.  Systems on a track, or without any
+    input, are identified from the spectra of their sensors (`model.ambient`), for which there is nothing to train.
     """
+    if system.on_track:
+        return AmbientIdentifier(system)
+    if not system.file.inputs:
+        return OutputOnly(Identifier(system, None, workers), AmbientIdentifier(system))
     estimator = load_estimator(model, system) if model is not None else bundled_estimator(system)
     return Identifier(system, estimator, workers)
 
@@ -100,10 +121,13 @@ def load_identifier(system: System, model: str | Path | None = None, workers: in
 def identifiability(system: System, seed: int = 0) -> FloatArray:
     """Standard deviation of each log-ratio that one simulated window gives at the nominal values, shape (P,).
 
-    The median over 16 windows of running on an average track; `PRIOR_STD` where a window tells nothing.
+    The median over 16 windows of running on an average track; `PRIOR_STD` where a window tells nothing.  Without
+    measured inputs what the spectra of an unmeasured track, or of ambient forces, tell.
     """
     if not system.parameters:
         return np.zeros(0)
+    if system.on_track or not system.file.inputs:
+        return foreseen(system)
     truth = np.zeros((16, len(system.parameters)))
     runs = simulate_runs(system, truth, system.window, np.random.default_rng(seed))
     refined = Refiner(system).refine(runs.values, truth)

@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
-from sprung.model.identification.identify import UnusableWindow
+from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response

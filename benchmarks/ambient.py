@@ -1,0 +1,153 @@
+"""Nothing measured below: accuracy of a minute of accelerometers against the Cramer-Rao bound, and how well a single
+degraded spring or damper is found with two of them.
+
+The rides come from `benchmarks/generator`, the bound from its transfer functions by finite differences: neither uses
+the product's likelihood.  Speed, load, levels of the rails, coherence and every wheel's own share are unknown to all.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE
+from sprung.benchmarks.generator.ride import SYSTEM, Ride, draw_ride, record, transfer
+from sprung.benchmarks.generator.track import SHORTEST
+from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
+from sprung.model.ambient.identify import AmbientIdentifier
+from sprung.model.system import BUNDLED, load_system
+
+Array = NDArray[np.float64]
+
+SENSORS = {  # rows of the bundled vehicle's sensors
+    "12 accelerometers": list(range(12)),
+    "2 car + 1 per bogie": [0, 3, 5, 10],
+}
+GROUPS = {  # of parameters: rows of stiffnesses, then of dampings, then the load
+    "primary stiffness": slice(0, 8),
+    "secondary stiffness": slice(8, 12),
+    "primary damping": slice(12, 20),
+    "secondary damping": slice(20, 24),
+    "load": slice(24, 25),
+}
+LOWEST = 0.65  # Hz, where the bound's band begins
+OCTAVES = np.log(2.0)
+STEP = 1e-5  # of finite differences
+
+
+def run(rides: int = 40, seconds: float = 60.0, seed: int = 9000) -> Iterator[dict[str, Any]]:
+    """Both parts, one figure at a time."""
+    yield from accuracy(rides, seconds, seed)
+
+
+def accuracy(rides: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
+    """Error over the bound, coverage of intervals, time; for every set of sensors."""
+    system = load_system(BUNDLED / "accelerometers.yaml")
+    vehicle = read_vehicle(SYSTEM)
+    for name, rows in SENSORS.items():
+        error, std, least, spent, fits = [], [], [], [], []
+        for number in range(rides):
+            rng = np.random.default_rng([seed, number])
+            ride = draw_ride(rng)
+            values = np.full((round(seconds * SAMPLE_RATE), 12), np.nan)
+            values[:, rows] = record(rng, ride, seconds)[:, rows]
+            begin = time.process_time()
+            told = AmbientIdentifier(system).told(values)
+            spent.append(time.process_time() - begin)
+            if told is None:
+                raise RuntimeError(f"ride {number} of seed {seed} told nothing")
+            error.append(told.log_ratio - np.append(ride.log_ratio, ride.load))
+            std.append(np.sqrt(np.diag(told.covariance)))
+            least.append(bound(vehicle, ride, rows, seconds))
+            fits.append(told.chi_square)
+        yield from _figures(name, rides, seconds, np.array(error), np.array(std), np.array(least))
+        yield {
+            "figure": "windows",
+            "sensing": name,
+            "cpu_seconds": float(np.median(spent)),
+            "chi_square": float(np.median(fits)),
+            "speed": "unknown",
+        }
+
+
+def _figures(name: str, rides: int, seconds: float, error: Array, std: Array, least: Array) -> Iterator[dict[str, Any]]:
+    everything = {**GROUPS, "all 24": slice(0, 24)}
+    for group, rows in everything.items():
+        e, s, b = error[:, rows], std[:, rows], least[:, rows]
+        yield {
+            "figure": "accuracy",
+            "sensing": name,
+            "parameters": group,
+            "rides": rides,
+            "seconds": seconds,
+            "rmse_percent": float(100 * np.sqrt(np.mean(e**2))),
+            "bound_percent": float(100 * np.sqrt(np.mean(b**2))),
+            "bound_median_percent": float(100 * np.median(b)),
+            "rmse_over_bound": float(np.sqrt(np.mean(e**2) / np.mean(b**2))),
+            "error_over_bound_rms": float(np.sqrt(np.mean((e / b) ** 2))),
+            "error_over_std_rms": float(np.sqrt(np.mean((e / s) ** 2))),
+            "coverage_95": float(np.mean(np.abs(e) < 1.96 * s)),
+        }
+
+
+def bound(vehicle: Vehicle, ride: Ride, sensors: list[int], seconds: float) -> Array:
+    """Standard deviations (24 parameters, load) that no unbiased estimator can beat, for a stationary record.
+
+    Slepian-Bangs: F_ij = T integral over f of tr S^-1 dS/dx_i S^-1 dS/dx_j, everything else free: two levels and one
+    coherence per octave, a share of its own for every wheel, the speed.
+    """
+    top = SHORTEST * ride.speed / (2 * np.pi)
+    frequency = np.linspace(LOWEST, top * 0.99, 400)
+    x = np.concatenate([ride.log_ratio, [ride.load], _nuisances(ride, frequency, len(vehicle.inputs))])
+
+    def spectrum(at: Array) -> NDArray[np.complex128]:
+        return _spectrum(vehicle, ride, at, frequency)[:, sensors][:, :, sensors]
+
+    S = spectrum(x)
+    inverse = np.linalg.inv(np.linalg.cholesky(S))
+    slopes = []
+    for i in range(len(x)):
+        step = np.zeros(len(x))
+        step[i] = STEP
+        slope = (spectrum(x + step) - spectrum(x - step)) / (2 * STEP)
+        slopes.append((inverse @ slope @ inverse.conj().swapaxes(1, 2)).reshape(-1))
+    rows = np.array(slopes)
+    information = (rows @ rows.conj().T).real * seconds * (frequency[1] - frequency[0])
+    scale = np.sqrt(np.diag(information))
+    covariance = np.linalg.inv(information / np.outer(scale, scale)) / np.outer(scale, scale)
+    return np.asarray(np.sqrt(np.diag(covariance))[:25])
+
+
+def _octaves(frequency: Array) -> Array:
+    """Hat functions over log-frequency, an octave apart, (F, nodes)."""
+    count = 1 + int(np.ceil(np.log(frequency[-1] / frequency[0]) / OCTAVES))
+    place = np.log(frequency / frequency[0])[:, None] / OCTAVES - np.arange(count)
+    return np.asarray(np.maximum(1 - np.abs(place), 0.0))
+
+
+def _nuisances(ride: Ride, frequency: Array, wheels: int) -> Array:
+    """Truth of [levels left, levels right (relative, log), coherence per octave, own shares, log-speed]."""
+    count = _octaves(frequency).shape[1]
+    return np.concatenate([np.zeros(2 * count), np.full(count, ride.coherence), np.full(wheels, ride.own_share), [0.0]])
+
+
+def _spectrum(vehicle: Vehicle, ride: Ride, x: Array, frequency: Array) -> NDArray[np.complex128]:
+    """Spectral matrix of the sensors, in the units of a sample's variance, (F, S, S)."""
+    hats, omega = _octaves(frequency), 2 * np.pi * frequency
+    count, wheels = hats.shape[1], len(vehicle.inputs)
+    left, right, coherence = (hats @ part for part in x[25 : 25 + 3 * count].reshape(3, count))
+    share = x[25 + 3 * count : 25 + 3 * count + wheels]
+    size = np.where(vehicle.input_side > 0, np.exp(left / 2)[:, None], np.exp(right / 2)[:, None])
+    delay = np.exp(1j * omega[:, None] * vehicle.input_position / (ride.speed * np.exp(x[-1])))
+    across = vehicle.input_side[:, None] != vehicle.input_side[None, :]
+    alike = np.where(across, coherence[:, None, None], 1.0) * np.sqrt(np.outer(1 - share, 1 - share))
+    wheel = (size * delay)[:, :, None] * alike * (size * delay).conj()[:, None, :]
+    wheel = wheel + (size**2)[:, :, None] * np.diag(share)
+    level = ride.level_at(omega)[:, None, None] * SAMPLE_RATE / 2
+    A = transfer(vehicle, replace(ride, log_ratio=x[:24], load=float(x[24])), omega).to_sensors
+    return np.asarray(A @ (level * wheel) @ A.conj().swapaxes(1, 2) + np.diag(vehicle.sensor_noise**2))

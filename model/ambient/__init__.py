@@ -1,0 +1,1 @@
+"""Identification with no measured input: from the spectra of the sensors alone."""

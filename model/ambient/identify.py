@@ -1,0 +1,147 @@
+"""Windows without any measured input to estimates: wheels on a track, or forces on the structure."""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+import numpy as np
+
+from sprung.model.ambient.excitation import Excitation
+from sprung.model.ambient.forces import ForceExcitation
+from sprung.model.ambient.periodogram import Spectra
+from sprung.model.ambient.sensing import Sensing, sensing
+from sprung.model.ambient.speed import Track
+from sprung.model.ambient.window import LOAD_STD, Told, WindowFit
+from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
+from sprung.model.schema import Body
+from sprung.model.signals import BoolArray, Estimate, FloatArray
+from sprung.model.system import System
+
+IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
+FIT_SIGMAS = 6.0  # chi-square further than this above one, or
+FIT_EXCESS = 0.3  # by this much: the window does not fit
+
+
+class Assumption(Protocol):
+    """What is assumed about the sources of a window."""
+
+    def excitation(self, inputs: FloatArray, found: Spectra, sensed: Sensing) -> Excitation | None:
+        """For a window's input columns (T, I) and spectra; None if it cannot be used."""
+
+
+class Forces:
+    """Unmeasured forces on every degree of freedom."""
+
+    def __init__(self, system: System) -> None:
+        self.inertia = system.mechanics.mass
+
+    def excitation(self, inputs: FloatArray, found: Spectra, sensed: Sensing) -> ForceExcitation:
+        return ForceExcitation(self.inertia, found)
+
+
+class AmbientIdentifier:
+    """Identifies windows of a system on a track (column 0 is the speed where it is measured) or without inputs."""
+
+    def __init__(self, system: System) -> None:
+        varying = {name: body for name, body in system.file.bodies.items() if body.load is not None}
+        self.system, self.times = system, StageTimes()
+        self.window = WindowFit(system, list(varying), [_load_std(body) for body in varying.values()])
+        self.assumption: Assumption = Track(system, self.window) if system.on_track else Forces(system)
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate."""
+        return self.system.digest
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
+
+        states: never simulated, for nobody knows what moved the system.  Errors: `UnusableWindow`.
+        """
+        windows = self._checked(windows)
+        begin = time.perf_counter()
+        found = [self._estimate(values, None if start is None else start[b]) for b, values in enumerate(windows)]
+        self.times = StageTimes(0.0, time.perf_counter() - begin)
+        return found
+
+    def told(self, values: FloatArray, start: FloatArray | None = None) -> Told | None:
+        """What one window (T, C) says in full; None if it is too quiet, too short or too slow."""
+        inputs = len(self.system.inputs)
+        sensors = np.flatnonzero(np.isfinite(values[:, inputs:]).all(axis=0))
+        if len(sensors) == 0:
+            return None
+        noise = self.system.sensor_noise[sensors]
+        found = self.window.spectra(values[:, inputs + sensors], noise)
+        if found is None:
+            return None
+        sensed = sensing(self.system.mechanics, sensors, noise)
+        excitation = self.assumption.excitation(values[:, :inputs], found, sensed)
+        if excitation is None:
+            return None
+        return self.window.told(self.window.fit(found, sensed, excitation, start), found, sensed)
+
+    def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
+        told = self.told(values, start)
+        present = np.asarray(np.isfinite(values[:, len(self.system.inputs) :]).all(axis=0))
+        P = len(self.system.parameters)
+        return _silent(P, len(present)) if told is None else _as_estimate(told, P, present)
+
+    def _checked(self, windows: FloatArray) -> FloatArray:
+        windows = np.asarray(windows, dtype=np.float64)
+        channels, inputs = self.system.channels, len(self.system.inputs)
+        if windows.ndim != 3 or windows.shape[2] != len(channels):
+            raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
+        if not np.isfinite(windows[:, :, :inputs]).all():
+            raise UnusableWindow(f"{channels[0].name}: the speed is missing or not finite")
+        for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
+            raise UnusableWindow(f"{channels[column].name}: not finite")
+        return windows
+
+
+def _as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:
+    """The first P unknowns are the system's parameters."""
+    fitted = told.fitted
+    # What the model cannot follow is treated as more noise, so that intervals stay honest.
+    covariance = fitted.covariance[:P, :P] * max(1.0, told.chi_square)
+    identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
+    fits = told.chi_square < 1 + max(FIT_SIGMAS * told.chi_std, FIT_EXCESS)
+    per_sensor = np.full(len(present), np.nan)
+    per_sensor[present] = told.per_sensor
+    return Estimate(
+        log_ratio=np.where(identifiable, fitted.x[:P], 0.0),
+        covariance=np.where(np.outer(identifiable, identifiable), covariance, np.eye(P) * PRIOR_STD**2),
+        identifiable=identifiable,
+        nrmse=float(np.sqrt(np.mean(told.per_sensor**2))),
+        per_sensor=per_sensor,
+        chi_square=told.chi_square,
+        adequate=bool(fits and fitted.converged),
+        converged=fitted.converged,
+        iterations=fitted.iterations,
+        informative=bool(identifiable.any() or not fits),
+    )
+
+
+def _silent(P: int, sensors: int) -> Estimate:
+    """The estimate of a window that tells nothing."""
+    return Estimate(
+        log_ratio=np.zeros(P),
+        covariance=np.eye(P) * PRIOR_STD**2,
+        identifiable=np.zeros(P, dtype=bool),
+        nrmse=float("nan"),
+        per_sensor=np.full(sensors, np.nan),
+        chi_square=1.0,
+        adequate=True,
+        converged=True,
+        iterations=0,
+        informative=False,
+    )
+
+
+def _load_std(body: Body) -> float:
+    """Standard deviation of the logarithm of a body's varying mass."""
+    if body.load is None or body.load.max is None:
+        return LOAD_STD
+    mass = body.mass.value
+    low, high = mass + (body.load.min or 0.0), mass + body.load.max
+    return float(max(np.log(high / mass), np.log(mass / low), 0.02))

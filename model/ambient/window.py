@@ -1,0 +1,165 @@
+"""One window of sensors, without any measured input, to parameters: band, start, fit and how well it fits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.ambient.excitation import Excitation, Prior
+from sprung.model.ambient.fit import Fitted, fit
+from sprung.model.ambient.periodogram import Spectra, spectra
+from sprung.model.ambient.response import Responses
+from sprung.model.ambient.sensing import Sensing
+from sprung.model.ambient.whittle import Whittle
+from sprung.model.identifier import PRIOR_STD
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+LOWEST = 0.75  # of the lowest natural frequency, where the band begins
+HIGHEST = 0.36  # of the sample rate: anti-aliasing filters begin above
+LONGEST = 4.0  # periods of the band's lower edge that a window holds, at least
+EXCESS = 4.0  # power over noise, below which a sensor tells nothing
+OCTAVES = 1.0  # of band, and
+GROUPS = 12  # of bins, below which a window tells nothing
+SHARPEST, BLUNTEST = 0.002, 0.03  # width of a group of bins over its frequency
+BLURS = (0.1, 0.01, 0.001)  # see `Whittle`; steps on the way to none
+RIGID = 1e-6  # of the highest natural frequency: slower modes are motions of the whole without any spring
+LOAD_STD = 0.3  # of a body's mass that varies, where the file states no range
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What one window told about P unknowns and the excitation's Q free numbers."""
+
+    fitted: Fitted
+    spectra: Spectra
+    chi_square: float  # mean square of the whitened periodograms about one, over its expectation; 1 where all is right
+    chi_std: float  # its standard deviation where all is right
+    per_sensor: FloatArray  # share of each sensor's rms that the model takes for noise, shape (S,)
+    unknowns: int  # P: parameters, then loads
+
+    @property
+    def log_ratio(self) -> FloatArray:
+        """Of the unknowns, shape (P,)."""
+        return self.fitted.x[: self.unknowns]
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Of the log-ratios, shape (P, P)."""
+        return self.fitted.covariance[: self.unknowns, : self.unknowns]
+
+    @property
+    def speed(self) -> tuple[float, float]:
+        """Under a track: speed towards +x and its standard deviation, m/s."""
+        slowness, std = self.fitted.x[-1], np.sqrt(self.fitted.covariance[-1, -1])
+        return float(1 / slowness), float(std / slowness**2)
+
+
+class WindowFit:
+    """Fits windows of one system under one kind of excitation."""
+
+    def __init__(self, system: System, loads: Sequence[str] = (), load_std: Sequence[float] = ()) -> None:
+        """loads: bodies whose mass and inertias are unknown, too, with the standard deviations of their logarithms."""
+        self.system, self.loads = system, tuple(loads)
+        P = len(system.parameters)
+        self.prior_std = np.concatenate([np.full(P, PRIOR_STD), np.asarray(load_std, dtype=np.float64)])
+        modes = system.mechanics.modes(system.bodies)
+        fastest = max((mode.frequency for mode in modes), default=0.0)
+        modes = [mode for mode in modes if mode.frequency > RIGID * fastest]
+        self.lowest = min((mode.frequency for mode in modes), default=0.0)
+        damping = min((mode.damping_ratio for mode in modes if mode.damping_ratio > 0), default=BLUNTEST * 5)
+        self.sharpness = float(np.clip(damping / 5, SHARPEST, BLUNTEST))
+
+    @property
+    def P(self) -> int:
+        return len(self.prior_std)
+
+    def low(self, samples: int) -> float | None:
+        """Lower edge of the band of a window of `samples`, Hz; None where it is too short."""
+        rate = self.system.sample_rate
+        low = max(LOWEST * self.lowest, LONGEST * rate / samples)
+        return None if low * 2**OCTAVES > HIGHEST * rate else low
+
+    def spectra(self, values: FloatArray, noise: FloatArray) -> Spectra | None:
+        """Spectra (T, S) in the band in which a sensor stands out of its noise (S,); None where there is too little."""
+        rate = self.system.sample_rate
+        low = self.low(len(values))
+        if low is None:
+            return None
+        found = spectra(values, rate, (low, HIGHEST * rate), self.sharpness)
+        power = np.diagonal(found.matrix, axis1=1, axis2=2).real / noise**2
+        about = np.maximum(found.weight, 1e-9)
+        width = np.ones(max(1, min(9, len(about) // 4)))
+        smooth = np.stack([np.convolve(p * about, width, "same") for p in power.T], axis=1)
+        smooth /= np.convolve(about, width, "same")[:, None]
+        silent = np.flatnonzero(smooth.max(axis=1) < EXCESS)
+        top = found.frequency[silent[0]] * 0.97 if len(silent) else np.inf
+        keep = found.frequency < top
+        if keep.sum() < GROUPS or found.frequency[keep][-1] < low * 2**OCTAVES:
+            return None
+        return found.part(np.flatnonzero(keep))
+
+    def fit(
+        self,
+        found: Spectra,
+        sensed: Sensing,
+        excitation: Excitation,
+        start: FloatArray | None = None,
+        blurs: tuple[float, ...] = (*BLURS, 0.0),
+    ) -> Fitted:
+        """From `start` (the first of all unknowns and free numbers), or nominal values and what the sensors' power
+        tells about the excitation."""
+        responses = Responses(self.system, sensed, self.loads)
+        nothing = np.zeros(self.P)
+        z = excitation.start(self.power(responses, excitation, found))
+        own = excitation.prior(z)
+        prior = Prior(np.concatenate([nothing, own.mean]), np.concatenate([self.prior_std, own.std]))
+        x = np.concatenate([nothing, z])
+        if start is not None:
+            x[: len(start)] = start
+        for blur in blurs:
+            likelihood = Whittle(responses, excitation, found, blur)
+            if blur == blurs[0] and start is None:
+                x = fit(likelihood, x, prior, free=np.arange(len(x)) >= self.P, limit=6).x
+            fitted = fit(likelihood, x, prior, limit=12 if blur > 0 else 40)
+            x = fitted.x
+        return fitted
+
+    def told(self, fitted: Fitted, found: Spectra, sensed: Sensing) -> Told:
+        """How well the fit explains the window."""
+        whitened = fitted.at.whitened
+        size, spares = whitened.shape[1], len(sensed.spare)
+        # Complex Wishart of m degrees of freedom: E |W - 1|^2 = R^2 / m.
+        fits = (np.abs(whitened - np.eye(size)) ** 2).sum(axis=(1, 2)) * found.weight
+        apart = (sensed.contradiction(found.matrix) - 1) ** 2 * found.weight[:, None]
+        numbers = size**2 + spares
+        statistic = (fits + apart.sum(axis=1)) / numbers
+        variance = 2 / numbers + 4 / (size * found.weight)
+        return Told(
+            fitted=fitted,
+            spectra=found,
+            chi_square=float(statistic.mean()),
+            chi_std=float(np.sqrt(np.mean(variance) / len(statistic))),
+            per_sensor=_noise_share(fitted, found, sensed),
+            unknowns=self.P,
+        )
+
+    def power(self, responses: Responses, excitation: Excitation, found: Spectra) -> FloatArray:
+        """Level of the sources against that of `start(1)`, from the signals' power, (F,)."""
+        A = responses.at(np.zeros(self.P), found.sides).signals
+        unit = excitation.sources(excitation.start(np.ones(len(found.frequency)))).matrix
+        expected = np.einsum("fsx,fxy,fsy->f", A, unit, A.conj(), optimize=True).real
+        expected = (expected[: len(expected) // 2] + expected[len(expected) // 2 :]) / 2
+        measured = np.einsum("fii->fi", responses.sensing.seen(found.matrix)).real
+        return np.asarray(np.maximum(measured - 1, 0.05 * measured).sum(axis=1) / expected)
+
+
+def _noise_share(fitted: Fitted, found: Spectra, sensed: Sensing) -> FloatArray:
+    """Share of every sensor's rms that the model takes for noise, (S,): what is left after the most likely motion."""
+    left = sensed.rows.T @ np.linalg.inv(fitted.at.covariance) @ sensed.rows + sensed.spare.T @ sensed.spare
+    left = sensed.noise[:, None] ** 2 * left  # R S^-1, (F, S, S)
+    error = np.einsum("f,fij,fjk,fik->i", found.weight, left, found.matrix, left.conj(), optimize=True).real
+    whole = np.einsum("f,fii->i", found.weight, found.matrix).real
+    return np.asarray(np.sqrt(np.maximum(error, 0.0) / whole))

@@ -1,0 +1,40 @@
+"""What everything that turns windows into estimates has in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+from sprung.model.signals import Estimate, FloatArray
+
+PRIOR_STD = 1.0  # of every log-ratio: nominal values are right within a factor e either way
+
+
+class UnusableWindow(ValueError):
+    """A window that cannot be identified at all; the message names the channel and what to do."""
+
+
+@dataclass(slots=True)
+class StageTimes:
+    """Seconds spent in the stages of the last batch, for metrics."""
+
+    estimate: float = 0.0
+    refine: float = 0.0
+
+
+class Identifies(Protocol):
+    """Windows in, estimates out."""
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate; estimates of another digest are not comparable."""
+
+    @property
+    def times(self) -> StageTimes:
+        """Seconds spent in the stages of the last batch."""
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window of (B, T, C), columns in the order of `System.channels`, NaN for absent sensors.
+
+        start: log-ratios (B, P) to begin from.  Errors: `UnusableWindow`.
+        """
