@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 
@@ -86,7 +87,7 @@ def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: i
     nothing = np.full(len(rows), np.nan)
     order = np.argsort(offset, kind="stable")
     offset, value = offset[order], value[order]
-    first = np.r_[True, np.diff(offset) > 1e-6]  # duplicates: the first one stays
+    first = np.diff(offset, prepend=-np.inf) > 1e-6  # duplicates: the first one stays
     offset, value = offset[first], value[first]
     if len(offset) < FEWEST:
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), 0.0, True)
@@ -97,6 +98,35 @@ def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: i
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, False)
     if rate < SLOWEST * (1.0 - 1e-3):
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), rate, True)
+    return _on_rows(even, start, period, rows, longest)
+
+
+def uneven(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled:
+    """One channel at the grid positions `rows` whose time stamps are those of its samples but fit no even clock.
+
+    A cubic spline through the samples (not-a-knot ends) is read at even steps of their mean distance, or of a grid
+    period where that is shorter, then resampled as an even channel.  Between samples that are further
+    apart than `longest` grid periods and two and a half mean distances there is a gap.
+    """
+    nothing = Resampled(np.full(len(rows), np.nan), np.zeros(len(rows), dtype=bool), 0.0, True)
+    order = np.argsort(offset, kind="stable")
+    offset, value = offset[order], value[order]
+    good = np.isfinite(value) & (np.diff(offset, prepend=-np.inf) > 1e-6)
+    offset, value = offset[good], value[good]
+    if len(offset) < FEWEST:
+        return nothing
+    steps = np.diff(offset)
+    typical = float(steps[steps <= 5.0 * steps.mean()].mean())
+    if typical > 1.0 / SLOWEST:
+        return Resampled(nothing.value, nothing.bridged, 1.0 / typical, True)
+    period = min(typical, 1.0)
+    start = float(np.ceil(offset[0] / period)) * period
+    at = np.arange(start, offset[-1] + 1e-9, period)
+    right = np.clip(np.searchsorted(offset, at), 1, len(offset) - 1)
+    even = CubicSpline(offset, value)(at)
+    even[offset[right] - offset[right - 1] > max(longest + 1.0, 2.5 * typical)] = np.nan
+    if len(even) < FEWEST or np.isnan(even).all():
+        return nothing
     return _on_rows(even, start, period, rows, longest)
 
 

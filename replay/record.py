@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 from cantools.database import Database
 
-from sprung.model.signals import ANY_TIME, Channel, FloatArray, SampleBlock, TimeColumn
+from sprung.model.signals import ANY_TIME, BoolArray, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.grid import REACH, place, resample
+from sprung.replay.grid import REACH, place, resample, uneven
 from sprung.replay.recording import Recording, open_recording
 from sprung.replay.stream import Jump, Order
 
+MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
+TELL_LOSS = 0.01  # share of a channel's samples above which their loss is told
 ROWS_AT_ONCE = 512  # rows that are resampled together, so that memory stays small
 
 
@@ -54,24 +56,39 @@ def load_record(
     the longest stretch is kept and the others are named in `problems`.
     """
     recording = open_recording(path, channels, dbc=dbc, time_source=time_source, time=time, start=start)
-    stretches = _stretches(recording, Order(delay, pause, confirm=max(8, 2 * len(channels))))
+    stretches = _stretches(recording, Order(delay, pause, confirm=max(8, 2 * len(channels))), sample_rate)
     longest = max(stretches, key=lambda block: len(block.time))
     if len(stretches) > 1:
         left_out = sum(len(block.time) for block in stretches) - len(longest.time)
         recording.account.problem(
             f"the clock jumps {len(stretches) - 1} times; the longest stretch is used, {left_out} samples are not"
         )
-    start, values = _grid(longest, len(channels), sample_rate)
+    start, values = _grid(longest, recording, sample_rate)
     missing = np.isnan(values)
-    lost = int(missing[:, ~missing.all(axis=0)].sum())
+    absent: BoolArray = np.asarray(missing.all(axis=0))
+    _tell_losses(recording, missing, absent, sample_rate)
     account = recording.account
+    lost = int(missing[:, ~absent].sum())
     return Record(start, sample_rate, values, lost, account.vehicle, tuple(account.problems), account)
 
 
-def _stretches(recording: Recording, order: Order) -> list[SampleBlock]:
+def _tell_losses(recording: Recording, missing: BoolArray, absent: BoolArray, sample_rate: float) -> None:
+    """Say of every channel that lacks much how much, and where its longest gap is."""
+    for channel in np.flatnonzero((missing.mean(axis=0) > TELL_LOSS) & ~absent):
+        edges = np.flatnonzero(np.diff(np.r_[False, missing[:, channel], False].astype(np.int8)))
+        starts, ends = edges[::2], edges[1::2]
+        worst = int(np.argmax(ends - starts))
+        recording.account.problem(
+            f"{recording.channels[channel].name}: {100 * missing[:, channel].mean():.2g} % of its samples are missing; "
+            f"the longest of {len(starts)} gaps has {(ends - starts)[worst] / sample_rate:.3g} s, "
+            f"from {starts[worst] / sample_rate:.2f} s on"
+        )
+
+
+def _stretches(recording: Recording, order: Order, sample_rate: float) -> list[SampleBlock]:
     """Runs of samples without a clock jump between them."""
     runs: list[list[SampleBlock]] = [[]]
-    for block in recording.blocks():
+    for block in recording.at_rate(sample_rate):
         for piece in order.push(block):
             if isinstance(piece, Jump):
                 runs.append([])
@@ -94,27 +111,46 @@ def _stretches(recording: Recording, order: Order) -> list[SampleBlock]:
     return joined
 
 
-def _grid(block: SampleBlock, channels: int, sample_rate: float) -> tuple[int, FloatArray]:
+def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple[int, FloatArray]:
     """Start time and values (T, C): copied where the samples lie on the grid, else resampled."""
     start = int(block.time.min())
     offset: FloatArray = np.asarray((block.time - start) * (sample_rate / 1e9), dtype=np.float64)
     rows = int(np.rint(offset.max())) + 1
-    placed = place(offset, block.channel, block.value, rows, channels)
+    channels = recording.channels
+    if rows > MOST_CELLS // len(channels):
+        raise UnreadableRecording(
+            f"{recording.path}: {rows / sample_rate:.4g} s at {sample_rate:g} Hz are more than can be analysed in one "
+            "piece; check the unit of its times (`time: {unit: ...}` in the system file) or cut it"
+        )
+    placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
     for channel in np.flatnonzero(placed.off_grid.any(axis=0)):
         own = block.channel == channel
-        values[:, channel] = _resample_long(offset[own], block.value[own], rows)
+        values[:, channel], between = _resample_long(offset[own], block.value[own], rows, recording.stamped)
+        if between:
+            steps = np.diff(np.sort(block.time[own])) / 1e6
+            low, high = np.percentile(steps, [1, 99])
+            recording.account.note(
+                f"{channels[channel].name}: its time stamps fit no even clock (steps of {low:.3g} to {high:.3g} ms) in "
+                f"{100 * between / rows:.2g} % of the record: interpolated between them (cubic spline)"
+            )
     return start, values
 
 
-def _resample_long(offset: FloatArray, value: FloatArray, rows: int) -> FloatArray:
+def _resample_long(offset: FloatArray, value: FloatArray, rows: int, stamped: bool) -> tuple[FloatArray, int]:
+    """Values at the rows, and how many of them had to be interpolated between uneven stamps."""
     order = np.argsort(offset, kind="stable")
     offset, value = offset[order], value[order]
     column = np.full(rows, np.nan)
+    between = 0
     for first in range(0, rows, ROWS_AT_ONCE):
         last = min(first + ROWS_AT_ONCE, rows)
         near = slice(*np.searchsorted(offset, [first - 4 * REACH, last + 4 * REACH]))
-        result = resample(offset[near], value[near], np.arange(first, last, dtype=np.float64))
+        at = np.arange(first, last, dtype=np.float64)
+        result = resample(offset[near], value[near], at)
+        if not result.even and stamped:
+            result = uneven(offset[near], value[near], at)
+            between += last - first
         result.value[result.bridged] = np.nan
         column[first:last] = result.value
-    return column
+    return column, between

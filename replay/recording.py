@@ -16,6 +16,7 @@ from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
 from sprung.replay.plausible import Screen
+from sprung.replay.sampling import at_rate
 from sprung.replay.stamps import ABSOLUTE, SECOND
 from sprung.replay.tables import column_blocks
 
@@ -55,6 +56,16 @@ class Recording:
         self._source = source
         self._start = start
         self._screen = Screen(channels, account, converter(channels))
+
+    @property
+    def stamped(self) -> bool:
+        """Its times are those of sampling; on a bus they are those of arrival."""
+        return self.path.suffix.lower() not in CAN_READERS
+
+    def at_rate(self, sample_rate: float) -> Iterator[SampleBlock]:
+        """`blocks`, channels of much higher rates reduced to that of the grid; raises UnreadableRecording also when all
+        are too slow for it."""
+        return at_rate(self.blocks(), self.channels, sample_rate, self.account, self.path)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """Blocks in file order; raises UnreadableRecording when none of the channels is in the file, or when it

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
-from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample
+from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample, uneven
 from sprung.replay.stream import Jump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
@@ -38,10 +38,12 @@ class Windower:
         largest_share: float = 0.03,
         delay: float = 0.5,
         pause: float = 5.0,
+        stamped: bool = False,
     ) -> None:
         """`inputs`: names (or number of leading) channels without which a window is worthless; `longest_gap`
         consecutive samples and `largest_share` of a window's samples may be repaired; `delay`: s that samples may
-        come out of order; `pause`: s of silence after which the grid starts anew."""
+        come out of order; `pause`: s of silence after which the grid starts anew; `stamped`: times are those
+        of sampling, not of arrival, so that uneven ones can be interpolated between."""
         self.channels = tuple(channels)
         self.sample_rate = float(sample_rate)
         self.window = int(window)
@@ -55,6 +57,7 @@ class Windower:
         self.largest_share = largest_share
         self.order = Order(delay, pause, confirm=max(8, 2 * len(names)))
         self.delay = delay
+        self.stamped = stamped
         self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
         self.expected = 0  # samples that the emitted windows should hold, each counted once
         self.lost = 0  # of these, samples that did not come or were invalid
@@ -259,6 +262,10 @@ class _Batch:
             counted = by_count(offset[near], value[near], grid, self.owner.longest_gap)
             if counted is not None:
                 return counted, "arrival times made even"
+            if self.owner.stamped:
+                around = slice(*np.searchsorted(offset, [rows.start - 2 * REACH, rows.stop + 2 * REACH]))
+                between = uneven(offset[around], value[around], grid, self.owner.longest_gap)
+                return between, f"{self.owner.channels[channel].name} unevenly sampled: interpolated"
         name, own = self.owner.channels[channel].name, result.rate * self.owner.sample_rate
         if not result.even:
             return result, f"{name} unevenly sampled"

@@ -89,9 +89,16 @@ class Spans:
             yield block
 
 
-def windower_of(system: System) -> Windower:
-    """The windower of a system."""
-    return Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
+def windower_of(system: System, stamped: bool = False) -> Windower:
+    """The windower of a system; `stamped`: times are those of sampling, not of arrival."""
+    return Windower(
+        system.channels,
+        system.sample_rate,
+        system.window,
+        system.hop,
+        inputs=len(system.inputs),
+        stamped=stamped,
+    )
 
 
 def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
@@ -99,7 +106,7 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     system = request.system
     start = request.path.stat().st_mtime_ns if request.start is None and request.path.is_file() else request.start
     recording = open_recording(request.path, system.channels, dbc=request.dbc, time=system.time, start=start)
-    windower, spans = windower_of(system), Spans()
+    windower, spans = windower_of(system, recording.stamped), Spans()
     held: list[Window] = []
     told = time.monotonic()
 
@@ -108,7 +115,7 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
         emit(Piece(held, _copy(recording.tally), recording.vehicle))
         held, told = [], time.monotonic()
 
-    for block in paced(spans.watch(recording.blocks()), request.speed):
+    for block in paced(spans.watch(recording.at_rate(system.sample_rate)), request.speed):
         for window in windower.push(block):
             held.append(window)
             if len(held) >= request.batch_windows:

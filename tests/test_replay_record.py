@@ -41,8 +41,11 @@ def test_a_channel_of_another_rate_is_resampled(tmp_path):
     seconds = np.arange(0, 20.0, 1 / 610.35)
     write_table(tmp_path / "a.csv", seconds, [np.sin(2 * np.pi * 3 * seconds), np.cos(2 * np.pi * 2 * seconds)])
     record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 200.0)
-    grid = np.arange(len(record.values)) / 200.0
+    grid = record.start / 1e9 + np.arange(len(record.values)) / 200.0
     assert np.abs(record.values[20:-20, 0] - np.sin(2 * np.pi * 3 * grid[20:-20])).max() < 2e-3
+    assert record.problems == (
+        "2 channels: 610.4 Hz reduced to 200 Hz (linear-phase FIR, flat to 80 Hz, -80 dB from 100 Hz)",
+    )
 
 
 def test_rounded_time_stamps_do_not_move_samples(tmp_path):

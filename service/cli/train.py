@@ -15,9 +15,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.replay import open_recording
-from sprung.replay.windowing import Windower
 from sprung.service.cli.console import errors
 from sprung.service.errors import UserError
+from sprung.service.reading import windower_of
 
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
@@ -41,8 +41,9 @@ def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatA
     """Windows of all recordings that were not dropped, shape (B, T, C)."""
     found = []
     for path in paths:
-        windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
-        for block in open_recording(path, system.channels, dbc=dbc, time=system.time).blocks():
+        recording = open_recording(path, system.channels, dbc=dbc, time=system.time)
+        windower = windower_of(system, recording.stamped)
+        for block in recording.at_rate(system.sample_rate):
             found += [w.values for w in windower.push(block) if w.outcome != "dropped"]
         found += [w.values for w in windower.flush() if w.outcome != "dropped"]
     if not found:
