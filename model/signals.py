@@ -74,6 +74,7 @@ class Window:
     outcome: Outcome = "used"
     reason: str | None = None  # why it was repaired or dropped
     repaired_samples: int = 0
+    new_segment: bool = False  # the first after the clock jumped: its time says nothing about what came before
 
 
 @dataclass(frozen=True, slots=True)

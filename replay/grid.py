@@ -31,6 +31,8 @@ EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an ev
 PUNCTUAL = 0.2  # share of samples with about the least delay, without which it is no delay but disorder
 STEADY = 0.45  # grid periods by which the least delay may change while no sample is lost
 FIRST_STAMPS = 64  # of the search for a jittered clock
+FASTEST = 1000.0  # own rate / grid rate beyond which stamps are no sensor's clock
+MOST_STEPS = 512.0  # typical steps that the first stamps may span; the search costs as much
 LONGEST_REPAIR = REACH - NEIGHBOURS  # consecutive samples
 
 
@@ -91,6 +93,8 @@ def resample(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: i
     offset, value = offset[first], value[first]
     if len(offset) < FEWEST:
         return Resampled(nothing, np.zeros(len(rows), dtype=bool), 0.0, True)
+    if float(np.median(np.diff(offset))) * FASTEST < 1.0:
+        return Resampled(nothing, np.zeros(len(rows), dtype=bool), FASTEST, False)
     period, coherence = _period(offset)
     rate = 1.0 / period
     even, start = _lattice(offset, value, period)
@@ -186,7 +190,8 @@ def _period(offset: FloatArray) -> tuple[float, float]:
         guesses.append(float(np.polyfit(np.r_[0.0, step], offset, 1)[0]))
     near = np.array([guess for guess in guesses if abs(guess / typical - 1.0) < 0.2] or [typical])
     fit = _coherence(offset, near)
-    if fit.max() < WELL_EVEN:
+    few = offset[min(len(offset), FIRST_STAMPS) - 1] - offset[0]
+    if fit.max() < WELL_EVEN and few < MOST_STEPS * typical:
         near = np.r_[near, _search(offset, typical)]
         fit = _coherence(offset, near)
     best = int(np.argmax(fit))

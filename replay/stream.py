@@ -7,7 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.signals import SampleBlock
+from sprung.model.signals import IntArray, SampleBlock
+
+PIECE = 1024  # samples looked at together: a stream that leaps to and fro costs no more than its length times this
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,6 +17,7 @@ class Jump:
     """The clock jumped (or the sender paused): what follows starts anew."""
 
     seconds: float
+    at: int  # ns, the first time after it
 
 
 class Order:
@@ -39,7 +42,26 @@ class Order:
     def push(self, block: SampleBlock) -> list[SampleBlock | Jump]:
         """The samples that belong to the stream, with jumps between them."""
         out: list[SampleBlock | Jump] = []
-        rest = block
+        if self._smooth(block.time):
+            return self._whole(block)
+        for first in range(0, len(block.time), PIECE):
+            self._push(_cut(block, first, first + PIECE), out)
+        return out
+
+    def _smooth(self, time: IntArray) -> bool:
+        """Whether all of a block belongs to the stream at once."""
+        if not len(time) or self.newest is None:
+            return False
+        newest = np.maximum.accumulate(np.r_[self.newest, time[:-1]])
+        step = time - newest
+        return bool(step.min() >= -self.delay and step.max() <= self.pause)
+
+    def _whole(self, block: SampleBlock) -> list[SampleBlock | Jump]:
+        self.newest = max(self.newest or 0, int(block.time.max()))
+        self._discard_waiting()
+        return [block]
+
+    def _push(self, rest: SampleBlock, out: list[SampleBlock | Jump]) -> None:
         while len(rest.time):
             if self.newest is None:
                 self.newest = int(rest.time[0])
@@ -54,7 +76,6 @@ class Order:
                 rest = _cut(rest, count, None)
             else:
                 rest = self._wait(rest, out)
-        return out
 
     def flush(self) -> None:
         """At the end: what still waits never became a stream."""
@@ -74,7 +95,7 @@ class Order:
             self._waiting_count += 1
             if self._waiting_count >= self.confirm:
                 first = int(self._waiting[0].time[0])
-                out.append(Jump((first - newest) / 1e9))
+                out.append(Jump((first - newest) / 1e9, first))
                 out.extend(self._waiting)
                 self.newest = self._waiting_newest
                 self._waiting, self._waiting_count = [], 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,9 @@ FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid f
 MOST_WINDOWS = 64  # that are made together
 MOSTLY_THERE = 0.2  # share of missing samples above which a channel is looked at as one of a lower rate
 COHERENT = 0.5  # mean resultant length of the phases above which they have a common phase
+KEPT_JUMPS = 1000
+MOST_RATE = 100  # times the grid's rate: a stream of more samples than all channels give at this one stands still
+FEWEST_KEPT = 1_000_000  # samples that may wait in any case
 
 
 class Windower:
@@ -59,14 +63,22 @@ class Windower:
         self.delay = delay
         self.stamped = stamped
         self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
+        self.jumps: list[Jump] = []  # of the clock, and pauses; the first ones
+        self.samples = 0  # that belonged to the stream
+        self.longest = 0.0  # s, the longest stretch of samples without a jump
         self.expected = 0  # samples that the emitted windows should hold, each counted once
         self.lost = 0  # of these, samples that did not come or were invalid
         self._period = 1e9 / self.sample_rate  # ns
         self._pending: list[SampleBlock] = []
         self._base = 0  # ns since epoch: the grid's first sample.  Floats hold differences to it only, because a
         self._origin: float | None = None  # float of an absolute time is 256 ns coarse.  ns of the next window's row 0
+        self._begun = 0  # ns, first time of the stretch without a jump
         self._overlap = (0, 0)  # samples and lost samples of the last window that the next one shares
         self._first_row = True  # the next window is the first of its grid: nothing lies before it
+        self._new_segment = False  # the next window is the first after a jump
+        rows = self.window + (delay + pause) * self.sample_rate
+        self._most = max(FEWEST_KEPT, int(MOST_RATE * rows * len(names)))
+        self._waiting = 0  # samples in `_pending`
 
     def push(self, block: SampleBlock) -> list[Window]:
         """Windows that this block completed."""
@@ -75,11 +87,21 @@ class Windower:
             if isinstance(piece, Jump):
                 out += self._finish()
                 self.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
+                self._new_segment = True
+                if len(self.jumps) < KEPT_JUMPS:
+                    self.jumps.append(piece)
                 continue
             self._pending.append(piece)
+            self._waiting += len(piece.time)
+            self.samples += len(piece.time)
             if self._origin is None:
                 self._base, self._origin = int(piece.time[0]), 0.0
+                self._begun = self._base
+            if self._waiting > self._most:  # time stands still, or nearly
+                self.reasons["too many samples for their time"] += self._waiting
+                self._forget_all()
         if self._origin is not None and self.order.newest is not None:
+            self.longest = max(self.longest, (self.order.newest - self._begun) / 1e9)
             horizon = self.order.newest - self._base - self.delay * 1e9
             rows = int(np.floor((horizon - self._origin) / self._period)) - REACH
             out += self._emit(rows, ended=False)
@@ -101,8 +123,12 @@ class Windower:
             out = self._emit(rows, ended=True)
         self.expected += self._overlap[0]
         self.lost += self._overlap[1]
-        self._pending, self._origin, self._first_row, self._overlap = [], None, True, (0, 0)
+        self._forget_all()
         return out
+
+    def _forget_all(self) -> None:
+        self._pending, self._waiting = [], 0
+        self._origin, self._first_row, self._overlap = None, True, (0, 0)
 
     def _emit(self, rows: int, *, ended: bool) -> list[Window]:
         """All windows within the next `rows` rows; the grid follows the samples' phase from window to window."""
@@ -114,7 +140,9 @@ class Windower:
             batch = _Batch(self, samples, count, after=min(beyond, REACH) if ended else REACH)
             moved = batch.first_out_of_phase()
             for index in range(count if moved is None else moved):
-                out.append(batch.window(index))
+                window = batch.window(index)
+                out.append(replace(window, new_segment=True) if self._new_segment else window)
+                self._new_segment = False
             done = count if moved is None else moved
             self._origin += done * self.hop * self._period
             rows -= done * self.hop
@@ -145,6 +173,7 @@ class Windower:
         oldest = (self._origin or 0.0) - (REACH + 2) * self._period
         keep = samples.time - self._base >= oldest
         self._pending = [SampleBlock(samples.time[keep], samples.channel[keep], samples.value[keep])]
+        self._waiting = int(keep.sum())
 
 
 class _Batch:

@@ -18,6 +18,7 @@ from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
 from sprung.service.times import NANOSECONDS
 from sprung.service.worker import Limits
 
+MOST_LOST = 0.1  # of the samples; with more, too few windows can be used
 NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
 
 OnBatch = Callable[[Batch], None]
@@ -31,7 +32,9 @@ class Fed:
     vehicle: str
     windows: Counter[str] = field(default_factory=lambda: Counter(used=0, repaired=0, dropped=0))
     reasons: Counter[str] = field(default_factory=Counter)  # of windows that were dropped
-    late: int = 0
+    adequate: int = 0  # windows that fit the model
+    late: int = 0  # windows that were not tracked, older than what the tracker had seen
+    stored_before: int = 0  # windows that the store had already
     expected: int = 0  # samples that the windows should hold
     lost: int = 0  # of these, samples that did not come or were invalid
     first_ns: int | None = None  # of the samples
@@ -48,6 +51,17 @@ class Fed:
             return 0.0
         return round((self.last_ns - self.first_ns) / NANOSECONDS + 1 / sample_rate, 3)
 
+    @property
+    def fitting(self) -> dict[str, int]:
+        """What became of the windows beyond being read."""
+        return {"adequate": self.adequate, "untracked": self.late}
+
+    @property
+    def monitored(self) -> bool:
+        """Whether the recording tells how its vehicle is: windows were used, and few samples are lost."""
+        usable = self.windows["used"] + self.windows["repaired"] - self.late
+        return usable > 0 and self.lost < MOST_LOST * self.expected
+
     def summary(self) -> dict[str, Any]:
         """The counts, as the store and the jobs keep them."""
         return {
@@ -56,6 +70,8 @@ class Fed:
             "frames": self.tally.as_dict(),
             "samples": {"expected": self.expected, "lost": self.lost},
             "problems": self.problems[:20],
+            "fitting": self.fitting,
+            "monitored": self.monitored,
             "late_windows": self.late,
         }
 
@@ -133,6 +149,8 @@ def feed_file(
 def _count(fed: Fed, batch: Batch) -> Batch:
     fed.windows.update(record.outcome for record in batch.records)
     fed.reasons.update(r.reason or "" for r in batch.records if r.outcome == "dropped")
-    fed.late += batch.late
+    fed.adequate += sum(record.solved is not None and record.solved.adequate for record in batch.records)
+    fed.stored_before += len(batch.records) - len(batch.fresh)
+    fed.late += sum(record.solved is not None and not record.tracked for record in batch.records)
     fed.state = batch.state
     return batch

@@ -17,7 +17,7 @@ from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
-from sprung.service.times import now_ns
+from sprung.service.times import AHEAD, now_ns
 from sprung.service.views import vehicle_view
 
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
@@ -162,7 +162,7 @@ class Pipeline:
             at = self._current(connection, vehicle)
             # another process may have stored some of them while this one was identifying
             raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
-            records, after = self._follow(at, windows, estimates, set(raced))
+            records, after = self._follow(at, windows, estimates, set(raced), now)
             new = [record for record in records if record.start not in raced]
             tracked = time.perf_counter()
             if new:
@@ -187,18 +187,30 @@ class Pipeline:
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         skip: set[int],
+        now: int,
     ) -> tuple[list[WindowRecord], _Vehicle]:
-        """Feed the windows that are newer than what the tracker has seen, in order."""
+        """Feed the windows that are newer than what the tracker has seen, in order.
+
+        One that is older is followed all the same when the clock must have been wrong: where the clock of its stream
+        stepped back, and where the last window is stamped in the future.
+        """
+        tracker = self.engine.tracker
         state, last = at.state, at.last_window_ns
         records = []
         for window, estimate in zip(windows, estimates, strict=True):
             posterior, fed = None, False
-            if estimate is not None and window.start > last and window.start not in skip:
-                state = self.engine.tracker.update(state, estimate, window.start)
+            fresh = window.start not in skip
+            if fresh and window.start <= last and (window.new_segment or last > now + AHEAD):
+                state = tracker.rebase(state, window.start)
+                last = window.start - 1
+            if fresh and window.start > last and estimate is None:
+                state = tracker.missed(state)
+            if fresh and window.start > last and estimate is not None:
+                state = tracker.update(state, estimate, window.start)
                 last = window.start
                 fed = True
                 if state.used:  # before, there is nothing but the prior: no measurement, and not drawn as one
-                    posterior = Posterior(*self.engine.tracker.posterior(state))
+                    posterior = Posterior(*tracker.posterior(state))
             records.append(
                 WindowRecord(
                     window.start,

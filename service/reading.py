@@ -14,6 +14,7 @@ from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.system import System
 from sprung.replay import open_recording
 from sprung.replay.pacing import paced
+from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
 from sprung.service.worker import Emit, Limits, Worker
 
@@ -108,6 +109,7 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     recording = open_recording(request.path, system.channels, dbc=request.dbc, time=system.time, start=start)
     windower, spans = windower_of(system, recording.stamped), Spans()
     held: list[Window] = []
+    whole = 0
     told = time.monotonic()
 
     def tell() -> None:
@@ -118,18 +120,21 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     for block in paced(spans.watch(recording.at_rate(system.sample_rate)), request.speed):
         for window in windower.push(block):
             held.append(window)
+            whole += 1
             if len(held) >= request.batch_windows:
                 tell()
         if time.monotonic() - told > SIGN_OF_LIFE_SECONDS:
             tell()
-    held += windower.flush()
+    last = windower.flush()
+    held += last
     for first in range(0, len(held), request.batch_windows):
         emit(Piece(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
+    said = remarks(windower, whole + len(last))
     return Ending(
         recording.tally,
         recording.vehicle,
-        list(recording.problems),
-        recording.incomplete,
+        [*said, *recording.problems],
+        recording.incomplete or bool(said),
         windower.expected,
         windower.lost,
         spans.first_ns,

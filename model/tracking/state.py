@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from sprung.model.signals import FloatArray, IntArray
 from sprung.model.tracking.changes import Changes
+from sprung.model.tracking.coverage import Coverage
 from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.misfit import Fit
 from sprung.model.tracking.scatter import Scatter
@@ -65,6 +66,7 @@ class TrackerState:
     changes: Changes
     fit: Fit
     alarms: tuple[Alarm, ...]  # active and closed, oldest first
+    coverage: Coverage = field(default_factory=Coverage)
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -93,6 +95,7 @@ class TrackerState:
             "changes": _pack_all(asdict(self.changes)),
             "fit": asdict(self.fit),
             "alarms": [asdict(alarm) for alarm in self.alarms],
+            "coverage": asdict(self.coverage),
         }
 
     @classmethod
@@ -117,9 +120,15 @@ class TrackerState:
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=Fit(**data["fit"]),
                 alarms=tuple(Alarm(**alarm) for alarm in data["alarms"]),
+                coverage=_coverage(data),
             )
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise TrackerStateError(f"stored tracker state can't be read: {error!r}") from error
+
+
+def _coverage(data: Mapping[str, Any]) -> Coverage:
+    """Older states do not have it: what they used they could use."""
+    return Coverage(**data["coverage"]) if "coverage" in data else Coverage(data["used"], 1.0)
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> Belief:

@@ -14,8 +14,8 @@ from scipy.linalg.lapack import dpotrf
 
 from sprung.model.signals import BoolArray, Estimate, FloatArray
 from sprung.model.tracking import changes as change_test
+from sprung.model.tracking import coverage, misfit, scatter, surprise
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, Severity, TrackerState, TrackerStateError
 
@@ -101,8 +101,9 @@ class Tracker:
         self._check(state, estimate)
         if state.time is not None and time_ns <= state.time:
             return state
+        seen = coverage.update(state.coverage, usable=True)
         if not estimate.informative:
-            return replace(state, time=time_ns, idle=state.idle + 1)
+            return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         centre = time_ns + _ns(self.settings.window / 2)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
@@ -116,8 +117,35 @@ class Tracker:
             inflation=float(new.scatter.inflation.max()),
             time=centre,
         )
-        new = replace(new, time=time_ns, fit=fit)
+        new = replace(new, time=time_ns, fit=fit, coverage=seen)
         return replace(new, alarms=self._alarms(new, centre))
+
+    def missed(self, state: TrackerState) -> TrackerState:
+        """State after a window that was of no use (samples lost, a gap): nobody watched the vehicle meanwhile."""
+        return replace(state, coverage=coverage.update(state.coverage, usable=False))
+
+    def rebase(self, state: TrackerState, time_ns: int) -> TrackerState:
+        """State before a window that starts at `time_ns`, though the last one was stamped later: a clock was wrong.
+
+        What is under way (anchors, onsets that are not alarms yet) moves along, as if one window followed the other;
+        what was stated with its time stays as it was stated.
+        """
+        if state.time is None or time_ns > state.time:
+            return state
+        shift = time_ns - _ns(self.settings.hop) - state.time
+        changes, fit = state.changes, state.fit
+        return replace(
+            state,
+            time=state.time + shift,
+            last=None if state.last is None else state.last + shift,
+            scatter=replace(state.scatter, anchored=state.scatter.anchored + shift),
+            changes=replace(changes, up_since=changes.up_since + shift, down_since=changes.down_since + shift),
+            fit=replace(
+                fit,
+                rising_since=fit.rising_since + shift,
+                misfit_since=None if fit.misfit_since is None else fit.misfit_since + shift,
+            ),
+        )
 
     def update_many(self, state: TrackerState, windows: Iterable[tuple[Estimate, int]]) -> TrackerState:
         """`update` over windows in their order."""
@@ -169,12 +197,15 @@ class Tracker:
         return tuple(reports)
 
     def health(self, state: TrackerState) -> Health:
-        """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M."""
+        """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M.
+
+        A vehicle of which nothing came, or too little lately that could be used, is not monitored: check function.
+        """
         peak = max((abs(alarm.change or 0.0) for alarm in state.active), default=0.0)
         severities = {(alarm.kind, alarm.severity) for alarm in state.active}
         if peak >= self.settings.failure_change:
             return "failure"
-        if any(kind == "misfit" for kind, _ in severities):
+        if any(kind == "misfit" for kind, _ in severities) or not state.coverage.monitored:
             return "check_function"
         if ("change", "alarm") in severities:
             return "out_of_specification"
@@ -256,9 +287,9 @@ class Tracker:
             if alarm.closed is not None:
                 alarms.append(alarm)
             elif alarm.kind == "misfit":
-                alarms.append(alarm if state.misfit_since is not None else replace(alarm, closed=now))
+                alarms.append(alarm if state.misfit_since is not None else _closed(alarm, now))
             elif active[alarm.parameter or ""] == 0:
-                alarms.append(replace(alarm, closed=now))
+                alarms.append(_closed(alarm, now))
             else:
                 i = self.names.index(alarm.parameter or "")
                 alarms.append(self._followed(alarm, float(drift[i]), float(drift_std[i])))
@@ -288,6 +319,11 @@ class Tracker:
         closed = [alarm for alarm in alarms if alarm.closed is not None]
         surplus = {alarm.key for alarm in closed[: max(0, len(closed) - self.settings.kept_alarms)]}
         return tuple(alarm for alarm in alarms if alarm.closed is None or alarm.key not in surplus)
+
+
+def _closed(alarm: Alarm, now: int) -> Alarm:
+    """Closed now, or when it was opened if a clock that was wrong then says that this is later."""
+    return replace(alarm, closed=max(now, alarm.opened))
 
 
 def _proper(covariance: FloatArray) -> bool:

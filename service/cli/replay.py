@@ -18,7 +18,7 @@ from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
-from sprung.service.times import to_iso
+from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.views import VehicleView, alarm_dict, vehicle_view, window_dict
 
 
@@ -114,23 +114,29 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
             print(f"sprung: {path}: {line}", file=sys.stderr)
     if complaint:
         print(f"sprung: {complaint}", file=sys.stderr)
-    return int(bool(complaint) or bool(view.active))
+    return int(bool(complaint) or bool(view.active) or not fed.monitored)
 
 
 def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
     """The last line of `replay --json`."""
     return {
         "vehicle": fed.vehicle,
-        "health": view.health,
+        "health": health(view, fed),
         "windows": dict(fed.windows),
+        "fitting": fed.fitting,
         "frames": fed.tally.as_dict(),
         "samples": {"expected": fed.expected, "lost": fed.lost},
-        "problems": fed.problems,
+        "problems": fed.problems[:20],
         "parameters": [p.as_dict() for p in view.parameters],
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
         "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
         "wall_seconds": round(fed.wall_seconds, 3),
     }
+
+
+def health(view: VehicleView, fed: Fed) -> str:
+    """The vehicle's health; a recording that hardly tells of it calls for a check of the function."""
+    return view.health if fed.monitored or view.health == "failure" else "check_function"
 
 
 def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
@@ -139,8 +145,12 @@ def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
     pace = recorded / max(fed.wall_seconds, 1e-9)
     lines = [f"{recorded:.1f} s recorded in {fed.wall_seconds:.1f} s ({pace:.0f} x real time); windows: {counts}"]
-    if fed.late:
-        lines.append(f"{fed.late} windows are older than what the vehicle's tracker had seen: stored, not tracked")
+    if fed.adequate < fed.windows["used"] + fed.windows["repaired"]:
+        lines.append(f"{fed.adequate} of {fed.windows['used'] + fed.windows['repaired']} windows fit the model")
+    if fed.last_ns is not None and fed.last_ns > now_ns() + AHEAD:
+        lines.append(f"the recording ends on {to_iso(fed.last_ns)}, which is in the future by this host's clock")
+    if fed.stored_before:
+        lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:
         change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
         std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f} %"
@@ -156,9 +166,16 @@ def incomplete_line(path: Path, fed: Fed) -> str | None:
         parts.append(f"{fed.lost} of {fed.expected} samples lost ({100 * fed.lost / max(fed.expected, 1):.2g} %)")
     bad = {name: count for name in ("dropped", "corrupt") if (count := fed.tally.as_dict()[name])}
     parts += [f"{count} messages {name}" for name, count in bad.items()]
-    parts += [f"{fed.windows[name]} windows {name}" for name in ("repaired", "dropped") if fed.windows[name]]
+    if fed.windows["repaired"]:
+        parts.append(f"{fed.windows['repaired']} windows repaired")
+    if fed.windows["dropped"]:
+        why = ", ".join(f"{reason}: {count}" for reason, count in fed.reasons.most_common(3))
+        parts.append(f"{fed.windows['dropped']} windows dropped ({why})")
+    if fed.late:
+        parts.append(f"{fed.late} windows not tracked, for they are older than what was known of {fed.vehicle}")
     parts += fed.problems[:3] if fed.incomplete else []
     if not parts:
         return None
     total = sum(fed.windows.values())
-    return f"{path}: incomplete: {', '.join(parts)}; {total} windows in all"
+    verdict = "incomplete" if fed.monitored else "not monitored"
+    return f"{path}: {verdict}: {', '.join(parts)}; {total} windows in all"
