@@ -19,6 +19,7 @@ from sprung.replay.bus import BusAddress, lost_by_kernel, opening_options, widen
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import EXTENDED, FrameBlock
+from sprung.replay.plausible import OUT_OF_TIME, Screen, nanoseconds
 from sprung.replay.recording import CAN_READERS
 
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0  # s, doubled from try to try
@@ -26,6 +27,7 @@ MOST_FRAMES = 4096  # frames of one block, so that a flooded bus stays bounded i
 BUS_ERRORS = (can.CanError, OSError, ValueError)
 BEHIND_SECONDS = 5.0  # frames that wait longer are not worth reading: they are given up until ...
 CAUGHT_UP_SECONDS = 0.5  # ... the reader is this close again
+CLOCK_STEP_SECONDS = 120.0  # a longer delay than this is a clock that was set, not a queue
 ASK_SECONDS = 5.0  # between two looks at the kernel's counters
 OFFSET_DRIFT = 1e-3  # by which the clock of an interface may drift against the host's
 
@@ -70,7 +72,7 @@ class LiveBus:
         self._behind = False
         self._asked = 0.0
         self._decoder = CanDecoder(channels, dbc)
-        self._convert = converter(channels)
+        self._screen = Screen(channels, self.account, converter(channels))
         self._ids = frozenset(self._decoder.ids.tolist())
         self._latency = latency
         wanted = opening_options(self.address, sorted(self._ids))
@@ -100,7 +102,9 @@ class LiveBus:
                         wanted = self._current(self._wanted(messages))
                         if not wanted:
                             continue
-                        block = self._convert(self._decoder.decode(frame_block(wanted, self.account), self.account))
+                        block = self._screen.check(
+                            self._decoder.decode(frame_block(wanted, self.account), self.account)
+                        )
                         if len(block.time):
                             yield block
             except BUS_ERRORS as error:
@@ -160,6 +164,8 @@ class LiveBus:
             return messages
         waited = time.time() - messages[-1].timestamp
         self._offset = min(self._offset + OFFSET_DRIFT * self._latency, waited)
+        if waited - self._offset > CLOCK_STEP_SECONDS:  # no queue is so long: one of the clocks was set
+            self._offset = waited
         self.lag = waited - self._offset
         if self.lag > (CAUGHT_UP_SECONDS if self._behind else BEHIND_SECONDS):
             self._behind = True
@@ -179,10 +185,14 @@ def frame_block(messages: Sequence[can.Message], account: Account) -> FrameBlock
     """python-can messages as columns; error and remote frames are counted as foreign."""
     frames = [message for message in messages if not (message.is_error_frame or message.is_remote_frame)]
     account.foreign(len(messages) - len(frames), "error or remote frame")
+    time, timely = nanoseconds(np.array([message.timestamp for message in frames], dtype=np.float64))
+    if not timely.all():
+        account.corrupt(int((~timely).sum()), OUT_OF_TIME)
+        frames, time = [message for message, good in zip(frames, timely, strict=True) if good], time[timely]
     width = 64 if any(len(message.data) > 8 for message in frames) else 8
     data = b"".join(bytes(message.data).ljust(width, b"\0") for message in frames)
     return FrameBlock(
-        np.array([round(message.timestamp * 1e9) for message in frames], dtype=np.int64),
+        time,
         np.array(
             [message.arbitration_id | (EXTENDED if message.is_extended_id else 0) for message in frames],
             dtype=np.uint32,

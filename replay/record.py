@@ -16,6 +16,7 @@ from sprung.replay.recording import Recording, open_recording
 from sprung.replay.stream import Jump, Order
 
 MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
+CELLS_ALWAYS, CELLS_PER_SAMPLE = 10_000_000, 50  # and at most so many: a record that is nearly all gaps is none
 TELL_LOSS = 0.01  # share of a channel's samples above which their loss is told
 ROWS_AT_ONCE = 512  # rows that are resampled together, so that memory stays small
 
@@ -117,7 +118,13 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
     offset: FloatArray = np.asarray((block.time - start) * (sample_rate / 1e9), dtype=np.float64)
     rows = int(np.rint(offset.max())) + 1
     channels = recording.channels
-    if rows > MOST_CELLS // len(channels):
+    cells = rows * len(channels)
+    if cells > CELLS_ALWAYS + CELLS_PER_SAMPLE * len(block.time):
+        raise UnreadableRecording(
+            f"{recording.path}: {len(block.time)} samples in {rows / sample_rate:.4g} s are too few for {sample_rate:g} Hz; "
+            "check the unit of its times (`time: {unit: ...}` in the system file) or give a stretch without pauses"
+        )
+    if cells > MOST_CELLS:
         raise UnreadableRecording(
             f"{recording.path}: {rows / sample_rate:.4g} s at {sample_rate:g} Hz are more than can be analysed in one "
             "piece; check the unit of its times (`time: {unit: ...}` in the system file) or cut it"

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.signals import IntArray, SampleBlock
-
-PIECE = 1024  # samples looked at together: a stream that leaps to and fro costs no more than its length times this
+from sprung.model.signals import SampleBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,79 +33,61 @@ class Order:
         self.confirm = confirm
         self.newest: int | None = None  # ns
         self.counts: Counter[str] = Counter()  # dropped samples by reason
-        self._waiting: list[SampleBlock] = []
-        self._waiting_count = 0
+        self._waiting: list[tuple[int, int, float]] = []  # time, channel, value
         self._waiting_newest = 0
 
     def push(self, block: SampleBlock) -> list[SampleBlock | Jump]:
         """The samples that belong to the stream, with jumps between them."""
-        out: list[SampleBlock | Jump] = []
-        if self._smooth(block.time):
-            return self._whole(block)
-        for first in range(0, len(block.time), PIECE):
-            self._push(_cut(block, first, first + PIECE), out)
-        return out
-
-    def _smooth(self, time: IntArray) -> bool:
-        """Whether all of a block belongs to the stream at once."""
-        if not len(time) or self.newest is None:
-            return False
-        newest = np.maximum.accumulate(np.r_[self.newest, time[:-1]])
-        step = time - newest
-        return bool(step.min() >= -self.delay and step.max() <= self.pause)
-
-    def _whole(self, block: SampleBlock) -> list[SampleBlock | Jump]:
-        self.newest = max(self.newest or 0, int(block.time.max()))
-        self._discard_waiting()
-        return [block]
-
-    def _push(self, rest: SampleBlock, out: list[SampleBlock | Jump]) -> None:
-        while len(rest.time):
-            if self.newest is None:
-                self.newest = int(rest.time[0])
-            before = np.maximum.accumulate(np.r_[self.newest, rest.time[:-1]])
-            step = rest.time - before
-            wrong = (step < -self.delay) | (step > self.pause)
-            count = int(np.argmax(wrong)) if wrong.any() else len(rest.time)
-            if count:
-                out.append(_cut(rest, 0, count))
-                self.newest = max(self.newest, int(rest.time[:count].max()))
-                self._discard_waiting()
-                rest = _cut(rest, count, None)
-            else:
-                rest = self._wait(rest, out)
+        if not len(block.time):
+            return []
+        newest = int(block.time[0]) if self.newest is None else self.newest
+        step = block.time - np.maximum.accumulate(np.r_[newest, block.time[:-1]])
+        if step.min() >= -self.delay and step.max() <= self.pause:  # the usual case, in one piece
+            self.newest = max(newest, int(block.time.max()))
+            self._discard_waiting()
+            return [block]
+        return self._one_by_one(block, newest)
 
     def flush(self) -> None:
         """At the end: what still waits never became a stream."""
         self._discard_waiting()
 
-    def _wait(self, rest: SampleBlock, out: list[SampleBlock | Jump]) -> SampleBlock:
-        """Take samples outside the stream one by one until they are confirmed or the stream goes on."""
-        newest = self.newest or 0
-        for index in range(len(rest.time)):
-            time = int(rest.time[index])
+    def _one_by_one(self, block: SampleBlock, newest: int) -> list[SampleBlock | Jump]:
+        out: list[SampleBlock | Jump] = []
+        taken: list[int] = []
+        for index, time in enumerate(block.time.tolist()):
             if -self.delay <= time - newest <= self.pause:
-                return _cut(rest, index, None)
-            if self._waiting_count and not -self.delay <= time - self._waiting_newest <= self.pause:
+                newest = self.newest = max(newest, time)
                 self._discard_waiting()
-            self._waiting_newest = time if not self._waiting_count else max(self._waiting_newest, time)
-            self._waiting.append(_cut(rest, index, index + 1))
-            self._waiting_count += 1
-            if self._waiting_count >= self.confirm:
-                first = int(self._waiting[0].time[0])
-                out.append(Jump((first - newest) / 1e9, first))
-                out.extend(self._waiting)
-                self.newest = self._waiting_newest
-                self._waiting, self._waiting_count = [], 0
-                return _cut(rest, index + 1, None)
-        return _cut(rest, len(rest.time), None)
+                taken.append(index)
+                continue
+            if self._waiting and not -self.delay <= time - self._waiting_newest <= self.pause:
+                self._discard_waiting()
+            self._waiting_newest = max(self._waiting_newest, time) if self._waiting else time
+            self._waiting.append((time, int(block.channel[index]), float(block.value[index])))
+            if len(self._waiting) >= self.confirm:
+                out.append(_take(block, taken))
+                taken = []
+                first = self._waiting[0][0]
+                out += [Jump((first - newest) / 1e9, first), _joined(self._waiting)]
+                newest = self.newest = self._waiting_newest
+                self._waiting = []
+        out.append(_take(block, taken))
+        return [piece for piece in out if isinstance(piece, Jump) or len(piece.time)]
 
     def _discard_waiting(self) -> None:
-        for block in self._waiting:
-            late = self.newest is not None and int(block.time[0]) < self.newest
+        for time, _, _ in self._waiting:
+            late = self.newest is not None and time < self.newest
             self.counts["late" if late else "stray time stamp"] += 1
-        self._waiting, self._waiting_count = [], 0
+        self._waiting = []
 
 
-def _cut(block: SampleBlock, start: int, end: int | None) -> SampleBlock:
-    return SampleBlock(block.time[start:end], block.channel[start:end], block.value[start:end])
+def _take(block: SampleBlock, rows: list[int]) -> SampleBlock:
+    return SampleBlock(block.time[rows], block.channel[rows], block.value[rows])
+
+
+def _joined(samples: list[tuple[int, int, float]]) -> SampleBlock:
+    time, channel, value = zip(*samples, strict=True)
+    return SampleBlock(
+        np.array(time, dtype=np.int64), np.array(channel, dtype=np.int32), np.array(value, dtype=np.float64)
+    )
