@@ -121,8 +121,8 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
     cells = rows * len(channels)
     if cells > CELLS_ALWAYS + CELLS_PER_SAMPLE * len(block.time):
         raise UnreadableRecording(
-            f"{recording.path}: {len(block.time)} samples in {rows / sample_rate:.4g} s are too few for {sample_rate:g} Hz; "
-            "check the unit of its times (`time: {unit: ...}` in the system file) or give a stretch without pauses"
+            f"{recording.path}: {len(block.time)} samples in {rows / sample_rate:.4g} s are too few for "
+            f"{sample_rate:g} Hz; check the unit of its times (`time: {{unit: ...}}` in the system file) or cut it"
         )
     if cells > MOST_CELLS:
         raise UnreadableRecording(
