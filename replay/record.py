@@ -119,15 +119,15 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
     rows = int(np.rint(offset.max())) + 1
     channels = recording.channels
     cells = rows * len(channels)
-    if cells > CELLS_ALWAYS + CELLS_PER_SAMPLE * len(block.time):
-        raise UnreadableRecording(
-            f"{recording.path}: {len(block.time)} samples in {rows / sample_rate:.4g} s are too few for "
-            f"{sample_rate:g} Hz; check the unit of its times (`time: {{unit: ...}}` in the system file) or cut it"
-        )
     if cells > MOST_CELLS:
         raise UnreadableRecording(
             f"{recording.path}: {rows / sample_rate:.4g} s at {sample_rate:g} Hz are more than can be analysed in one "
             "piece; check the unit of its times (`time: {unit: ...}` in the system file) or cut it"
+        )
+    if cells > CELLS_ALWAYS + CELLS_PER_SAMPLE * len(block.time):
+        raise UnreadableRecording(
+            f"{recording.path}: {len(block.time)} samples in {rows / sample_rate:.4g} s are too few for "
+            f"{sample_rate:g} Hz; check the unit of its times (`time: {{unit: ...}}` in the system file) or cut it"
         )
     placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
