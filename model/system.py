@@ -14,6 +14,7 @@ import numpy as np
 from sprung.model.address import Address
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.laws.placed import PlacedLaw, placed_laws
+from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
 from sprung.model.schema import SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
 from sprung.model.signals import Channel, FloatArray, TimeColumn
@@ -64,6 +65,10 @@ class System:
     def laws(self) -> tuple[PlacedLaw, ...]:
         """What is in place beyond the nominal structure."""
         return placed_laws(self.file, self.catalogue)[0]
+
+    def undistorted(self, values: FloatArray) -> FloatArray:
+        """Recorded channels (..., T, C) without the faults of measurements that the file states."""
+        return undone(values, [channel.name for channel in self.channels], self.laws, self.sample_rate)
 
     @property
     def name(self) -> str:

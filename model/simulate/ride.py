@@ -10,6 +10,7 @@ import scipy.linalg
 
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, SupportLaw
 from sprung.model.laws.placed import PlacedLaw
+from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import knots
@@ -50,7 +51,8 @@ def simulate_ride(
     inputs = _checked(system, inputs)
     mechanics = with_values(system, values or {})
     laws = system.laws
-    driven = _true_inputs(system, laws, inputs)
+    names = [channel.name for channel in system.inputs]
+    driven = undone(inputs, names, laws, system.sample_rate)
     windows = np.concatenate([driven, np.zeros((len(driven), len(system.sensors)))], axis=1)[None]
     drives = knots(system, windows)[0]
     time = CLOCK_LEAD + np.arange(len(inputs)) / system.sample_rate
@@ -107,19 +109,6 @@ def _checked(system: System, inputs: FloatArray) -> FloatArray:
     if len(bad):
         raise SimulationError(f"{system.inputs[bad[0]].name}: samples are missing or not finite; every input is needed")
     return inputs
-
-
-def _true_inputs(system: System, laws: tuple[PlacedLaw, ...], inputs: FloatArray) -> FloatArray:
-    """What drove the system, from what faulty channels show."""
-    names = [channel.name for channel in system.inputs]
-    true = inputs.copy()
-    for placed in laws:
-        if not isinstance(placed.law, SensorLaw) or placed.law.restore is None:
-            continue
-        for place in placed.places:
-            for column in (i for i, name in enumerate(names) if name == place or name.startswith(f"{place}.")):
-                true[:, column] = placed.law.restore(true[:, column], placed.values, system.sample_rate)
-    return true
 
 
 def _move_supports(system: System, laws: tuple[PlacedLaw, ...], drives: FloatArray, time: FloatArray) -> None:

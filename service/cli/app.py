@@ -158,14 +158,20 @@ def diagnose(
     out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the pictures.")] = None,
     name: Annotated[str | None, typer.Option("--name", help="Of the recording, in the report.")] = None,
     start: Start = None,
+    write_system: Annotated[
+        Path | None, typer.Option("--write-system", help="Write the system file with what was found.")
+    ] = None,
+    laws: Annotated[
+        Path | None, typer.Option("--laws", help="Python file with laws of your own; it is run: trust it.")
+    ] = None,
     json_lines: Json = False,
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
-    from sprung.service.cli.diagnose import run
+    from sprung.service.cli.diagnose import Asked, run
 
-    return run(file, system, dbc, out, name, start, json_lines)
+    return run(file, system, dbc, Asked(out, name, start, write_system, laws), json_lines)
 
 
 @app.command()

@@ -4,43 +4,56 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 from sprung.model.diagnosis.record.channels import TooLittleError
 from sprung.model.diagnosis.report.report import Report
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.own import load_laws
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.replay.record import Record, load_record
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
 from sprung.service.diagnosing import load_excerpt
+from sprung.service.improved import write_improved
 
 
-def run(
-    file: Path,
-    system_file: Path | None,
-    dbc: Path | None,
-    out: Path | None,
-    name: str | None,
-    start: str | None,
-    json_lines: bool,
-) -> int:
+@dataclass(frozen=True)
+class Asked:
+    """Options of one diagnosis."""
+
+    out: Path | None = None  # folder of the page
+    name: str | None = None  # of the recording, in the report
+    start: str | None = None  # when time counts from 0
+    write_system: Path | None = None
+    laws: Path | None = None  # of a user's own
+
+
+def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, json_lines: bool) -> int:
     """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
-    system = load_system(system_file or MANCHESTER)
+    catalogue = CATALOGUE
+    if asked.laws is not None:
+        catalogue += load_laws(asked.laws, tuple(law.name for law in CATALOGUE))
+    system = load_system(system_file or MANCHESTER, catalogue)
     known = dbc or (MANCHESTER_DBC if system_file is None else None)
-    record = load(file, system, known, start_time(start, [file]))
+    record = load(file, system, known, start_time(asked.start, [file]))
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
     try:
-        report = _diagnose(system, record, name or file.name, quiet=json_lines)
+        report = _diagnose(system, record, asked.name or file.name, quiet=json_lines)
     except TooLittleError as error:
         print(f"sprung: {file}: {error}", file=sys.stderr)
         return 1
-    if out is not None:
+    if asked.out is not None:
         from sprung.service.report import write_report
 
-        files = write_report(report, system, out)
+        files = write_report(report, system, asked.out)
         if not json_lines:
             print(f"{files.page}")
+    if asked.write_system is not None:
+        write_improved(asked.write_system, system_file or MANCHESTER, system, report)
+        print(f"sprung: {asked.write_system}: the system with what was found", file=sys.stderr)
     if json_lines:
         print(json.dumps(report.to_dict(), allow_nan=False), flush=True)
     else:
@@ -59,7 +72,7 @@ def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
     from sprung.model.diagnosis.api import Options, diagnose
 
     with stages(errors()) as show:
-        return diagnose(system, record, Options(file=name), silent_stage if quiet else show)
+        return diagnose(system, record, Options(file=name, catalogue=system.catalogue), silent_stage if quiet else show)
 
 
 def text(report: Report) -> str:

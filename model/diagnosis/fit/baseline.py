@@ -15,6 +15,7 @@ from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import given_terms
 from sprung.model.system import System
 
 _REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
@@ -25,7 +26,7 @@ _DIVERGED = (
 
 
 def baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
-    """The nominal structure on the first `split` samples, with noise levels estimated on the way.
+    """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
 
     Errors: `DiagnosisError` where the numbers of system file and recording fit each other so badly that none comes out.
     """
@@ -45,7 +46,7 @@ def _baseline(system: System, signals: Signals, declared: Noise, split: int) -> 
     part = transform(first, noise, rated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise)
     n = 2 * system.mechanics.n
-    start = Point(np.zeros(len(system.parameters)), (), np.zeros(n))
+    start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(n))
     if len(noise.force):
         # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))

@@ -114,6 +114,11 @@ class Investigation:
     input_faults: tuple[InputFault, ...] = ()
     notes: tuple[str, ...] = ()
 
+    @property
+    def given(self) -> int:
+        """How many laws the system file itself puts in place: the first terms of every fit."""
+        return len(self.base.point.terms)
+
 
 @dataclass(frozen=True)
 class Judgement:

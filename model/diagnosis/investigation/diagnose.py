@@ -63,7 +63,7 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
 def _begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
     """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
     tell(0.02, "channels and noise")
-    prepared = prepare(system, record.values, record.sample_rate)
+    prepared = prepare(system, system.undistorted(record.values), record.sample_rate)
     signals, split = cut(prepared.signals, options.train_share)
     declared = declared_noise(system, signals)
     tell(0.05, "nominal structure identified again; screening all laws at all places")
@@ -194,7 +194,7 @@ def _minor(state: Investigation, trial: Trial) -> bool:
             left = float(np.sum(state.fit.noise.force**2))
             if trial.worth < min(_MINOR_BESIDE * found.trial.worth, _MOST_LEFT * left):
                 return True
-        elif trial.worth < _MINOR_BESIDE * _worth(state.fit, index):
+        elif trial.worth < _MINOR_BESIDE * _worth(state.fit, state.given + index):
             return True
     return False
 

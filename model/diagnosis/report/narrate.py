@@ -20,6 +20,7 @@ from sprung.model.diagnosis.report.report import (
     Candidate,
     Finding,
     FitFigures,
+    IdentifiedLaw,
     LawParameter,
     ParameterValue,
     RecordingFacts,
@@ -72,10 +73,46 @@ def narrate(outcome: Outcome, record: Recorded) -> Report:
         changes=_changes(outcome),
         explained=explained,
         unexplained=unexplained,
+        laws=_laws(outcome),
+        noise=_noise(course),
         summary=_summary(outcome, findings, explained),
         advice=tuple(advice),
         evidence=evidence_arrays(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
     )
+
+
+def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
+    """Every law of the final model that has a name and values: those of the file, then those that were found."""
+    fit, course = outcome.final, outcome.investigation
+    count = course.given + (len(course.found) if outcome.judgement.carried else 0)
+    found = []
+    for index, term in enumerate(fit.point.terms[:count]):
+        if term.law.name != UNKNOWN:
+            found.append(IdentifiedLaw(term.location, term.law.name, _law_parameters(fit, index)[0], term.variant))
+    for fault in course.input_faults:
+        spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
+        parameter = LawParameter(spec.name, value, fault.std, spec.unit)
+        found.append(IdentifiedLaw(fault.term.location, fault.term.law.name, (parameter,)))
+    return tuple(found)
+
+
+def _noise(course: Investigation) -> dict[str, float]:
+    """Standard deviation of one sample of every channel, as the model found it."""
+    system, noise = course.system, course.problem.noise
+    levels: dict[str, float] = {}
+    support = force = 0
+    for name, source in system.file.inputs.items():
+        if source.kind == "force":
+            levels[name] = float(noise.force[force])
+            force += 1
+            continue
+        levels[f"{name}.displacement"] = float(noise.displacement[support])
+        levels[f"{name}.velocity"] = float(noise.velocity[support])
+        support += 1
+    present = [system.sensors[i] for i in course.problem.sensors]
+    levels |= dict(zip(present, noise.sensors.tolist(), strict=True))
+    known = {channel.name for channel in system.channels}
+    return {name: level for name, level in levels.items() if name in known and np.isfinite(level)}
 
 
 def _findings(outcome: Outcome) -> list[Finding]:
@@ -226,8 +263,8 @@ def _physics(outcome: Outcome) -> list[Finding]:
     """Findings of the fitted terms, in the order in which they were found: by evidence."""
     course, findings = outcome.investigation, []
     for index, found in enumerate(course.found):
-        term = course.fit.point.terms[index]
-        parameters, block = _law_parameters(outcome.final, index)
+        term = course.fit.point.terms[course.given + index]
+        parameters, block = _law_parameters(outcome.final, course.given + index)
         rival = found.runner_up
         family, advice = _look_alikes(found)
         finding = Finding(

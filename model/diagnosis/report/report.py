@@ -63,6 +63,22 @@ class LawParameter:
 
 
 @dataclass(frozen=True, slots=True)
+class IdentifiedLaw:
+    """One law of the final model with its values: what a system file can take over."""
+
+    location: str
+    effect: str
+    parameters: tuple[LawParameter, ...]
+    variant: str = ""  # of body laws: the mode's shape, the direction of a force
+
+    def to_dict(self) -> dict[str, Any]:
+        result: dict[str, Any] = {"location": self.location, "effect": self.effect}
+        if self.variant:
+            result["variant"] = self.variant
+        return result | {"parameters": [p.to_dict() for p in self.parameters]}
+
+
+@dataclass(frozen=True, slots=True)
 class FitFigures:
     """Free-run error relative to the measured signal, on samples that no fit saw."""
 
@@ -186,6 +202,8 @@ class Report:
     changes: tuple[str, ...] = ()  # parameters that left their nominal value, in words
     explained: float | None = None  # share of the excess error that the findings explain, held-out part
     unexplained: Unexplained = Unexplained()
+    laws: tuple[IdentifiedLaw, ...] = ()  # of the final model, those of the system file first
+    noise: Mapping[str, float] = field(default_factory=dict)  # channel -> deviation of one sample, as found
     summary: str = ""
     advice: tuple[str, ...] = ()  # what could not be decided and why
     evidence: dict[str, NDArray[Any]] = field(default_factory=dict)
@@ -211,6 +229,8 @@ class Report:
             "changes": list(self.changes),
             "explained": _number(self.explained),
             "unexplained": self.unexplained.to_dict(),
+            "laws": [law.to_dict() for law in self.laws],
+            "noise": {name: _number(level) for name, level in self.noise.items()},
             "summary": self.summary,
             "advice": list(self.advice),
         }

@@ -25,6 +25,7 @@ class Term:
     preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
 
     scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
+    fixed: tuple[bool, ...] = ()  # parameters that the system file holds; as `parameters`, none if left out
 
     def at(self, parameters: FloatArray) -> Term:
         return replace(self, parameters=tuple(float(v) for v in parameters))
@@ -52,8 +53,9 @@ class Term:
 
     def held_back(self, step: FloatArray) -> list[bool]:
         """Which parameters stand at a bound that a step would take them over."""
-        triples = zip(self.law.parameters, self.parameters, step, strict=True)
-        return [(v <= spec.low and s < 0) or (v >= spec.high and s > 0) for spec, v, s in triples]
+        fixed = self.fixed or (False,) * len(self.parameters)
+        entries = zip(self.law.parameters, self.parameters, step, fixed, strict=True)
+        return [f or (v <= spec.low and s < 0) or (v >= spec.high and s > 0) for spec, v, s, f in entries]
 
     @property
     def slopes(self) -> FloatArray:
@@ -79,6 +81,23 @@ class Term:
         if len(names) == 2:
             weights[system.elements.index(names[1])] = -1.0
         return weights
+
+
+def given_terms(system: System) -> tuple[Term, ...]:
+    """The laws that the system file puts in place, but for faults of measurements, which are undone in the signals."""
+    found = []
+    for placed in system.laws:
+        law = placed.law
+        if isinstance(law, SensorLaw):
+            continue
+        scales = tuple(max(abs(value), 1e-12) for value in placed.values)
+        variant = placed.variant
+        if isinstance(law, BodyLaw) and not variant:
+            variant = law.variants(system.mechanics, system.bodies.index(placed.location))[0]
+        elif isinstance(law, ElementLaw) and any(getattr(other, "wider", None) is law for other in system.catalogue):
+            variant = WIDER
+        found.append(Term(law, placed.location, placed.values, variant, scales=scales, fixed=placed.fixed))
+    return tuple(found)
 
 
 def supports(system: System) -> list[str]:

@@ -1,0 +1,26 @@
+"""Faults of measurements that a system file knows of, taken out of what was recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sprung.model.laws.base import SensorLaw
+from sprung.model.laws.placed import PlacedLaw
+from sprung.model.signals import FloatArray
+
+
+def undone(values: FloatArray, channels: Sequence[str], laws: Sequence[PlacedLaw], sample_rate: float) -> FloatArray:
+    """Channels as they would be without the faults that `laws` state; values (..., T, C), a copy where one is changed.
+
+    A law at an input without quantity counts for all its channels.  Signals that are lost (stuck) stay as they are.
+    """
+    result = values
+    for placed in laws:
+        law = placed.law
+        if not isinstance(law, SensorLaw) or law.restore is None:
+            continue
+        for column, name in enumerate(channels):
+            if any(name == place or name.startswith(f"{place}.") for place in placed.places):
+                result = result.copy() if result is values else result
+                result[..., column] = law.restore(result[..., column], placed.values, sample_rate)
+    return result

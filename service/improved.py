@@ -1,0 +1,121 @@
+"""The system file with what a diagnosis found: nominal values, laws and noise; comments and order stay."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from sprung.model.diagnosis.report.report import IdentifiedLaw, Report
+from sprung.model.system import System, parse_system
+
+_NOISE = "sensor_noise"  # written as the channel's noise, not as a law
+_DIGITS = 6
+
+
+def improved_text(text: str, system: System, report: Report) -> str:
+    """The text of a system file (the one that `system` was read from) with the findings of a report.
+
+    Parameters get the values that were identified with the findings in place; laws stand with values and deviations;
+    the noise of every channel is the one found.  Unnamed forces have no values to write and are left out.
+    """
+    yaml = YAML()
+    yaml.width = 4096
+    file = yaml.load(text)
+    for parameter in report.augmented:
+        part, _, quantity = parameter.name.rpartition(".")
+        group = file["bodies" if quantity == "mass" else "elements"]
+        _set_value(group[part], quantity, parameter.value)
+    for group in ("elements", "bodies", "inputs", "sensors"):
+        for entry in (file.get(group) or {}).values():
+            _drop_laws(entry)
+    for law in report.laws:
+        _place(file, system, law)
+    for finding in report.findings:
+        if finding.effect == _NOISE and finding.parameters:
+            for name in finding.location.split("|"):
+                channel = _channel(file, name)
+                if channel is not None and channel.get("noise"):
+                    channel["noise"] = _rounded(channel["noise"] * finding.parameters[0].value)
+    for name, level in report.noise.items():
+        channel = _channel(file, name)
+        if channel is not None and level > 0:
+            channel["noise"] = _rounded(level)
+    out = io.StringIO()
+    yaml.dump(file, out)
+    return out.getvalue()
+
+
+def write_improved(path: Path, source: Path, system: System, report: Report) -> None:
+    """Write the improved file, once it has been read back without an error."""
+    text = improved_text(source.read_text(encoding="utf-8"), system, report)
+    parse_system(text, str(path), system.catalogue)
+    path.write_text(text, encoding="utf-8")
+
+
+def _set_value(entry: Any, quantity: str, value: float) -> None:
+    if isinstance(entry.get(quantity), Mapping):
+        entry[quantity]["value"] = _rounded(value)
+    else:
+        entry[quantity] = _rounded(value)
+
+
+def _drop_laws(entry: Any) -> None:
+    """Take out laws, whose values come anew; faults of measurements stay: they were undone before."""
+    if not isinstance(entry, Mapping):
+        return
+    if "laws" in entry:
+        kept = [law for law in entry["laws"] if all(effect.startswith("sensor_") for effect in law)]
+        del entry["laws"]  # type: ignore[attr-defined]
+        if kept:
+            entry["laws"] = kept  # type: ignore[index]
+
+
+def _place(file: Any, system: System, law: IdentifiedLaw) -> None:
+    names = law.location.split("|")
+    entry = _holder(file, system, names[0])
+    if entry is None:
+        return
+    values = CommentedMap()
+    for parameter in law.parameters:
+        setting = CommentedMap(value=_rounded(parameter.value))
+        if parameter.std > 0:
+            setting["std"] = float(f"{parameter.std:.3g}")
+        setting.fa.set_flow_style()
+        values[parameter.name] = setting
+    if law.variant and law.variant != "wider":
+        values["variant"] = law.variant
+    if len(names) == 2:
+        values["with"] = names[1]
+    values.fa.set_flow_style()
+    placed = entry.setdefault("laws", CommentedSeq())
+    made = CommentedMap({law.effect: values})
+    made.fa.set_flow_style()
+    placed.append(made)
+
+
+def _holder(file: Any, system: System, name: str) -> Any:
+    """The entry of the file that a law belongs to."""
+    for group in ("elements", "bodies", "inputs", "sensors"):
+        if name in (file.get(group) or {}):
+            return file[group][name]
+    return _channel(file, name)
+
+
+def _channel(file: Any, name: str) -> Any:
+    """The address of a channel: `car_1l`, `wheel_11l.velocity`."""
+    part, _, quantity = name.rpartition(".")
+    sensors, inputs = file.get("sensors") or {}, file.get("inputs") or {}
+    if name in sensors:
+        return sensors[name]
+    if name in inputs:
+        return inputs[name]
+    return inputs.get(part, {}).get(quantity)
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
