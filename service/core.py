@@ -23,6 +23,7 @@ from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
 from sprung.service.live import LiveFeed
 from sprung.service.metrics import Metrics
+from sprung.service.notify.notices import Notices
 from sprung.service.operations import Operations
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
@@ -55,6 +56,7 @@ class Core:
     condition: Condition
     operations: Operations
     batcher: Batcher
+    notices: Notices
     stopping: threading.Event
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
 
@@ -69,6 +71,7 @@ class Core:
         self.board.restore(stored_views(self))
         self.jobs.start()
         self.housekeeping.start()
+        self.notices.start()
 
     def close(self) -> None:
         """Finish what was accepted, then let go of the store."""
@@ -78,6 +81,7 @@ class Core:
             stack.callback(self.compute.close)
             stack.callback(self.jobs.close)
             stack.callback(self.housekeeping.close)
+            stack.callback(self.notices.close)
 
 
 def build_core(settings: Settings, engine: Engine) -> Core:
@@ -95,9 +99,11 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     stopping = threading.Event()
     hub = Hub()
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
-    pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory)
+    feeds: list[LiveFeed] = []
+    notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
+    pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms)
     recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
-    diagnosis_jobs = DiagnosisJobs(settings, engine, store, pipeline.model_id)
+    diagnosis_jobs = DiagnosisJobs(settings, engine, store, pipeline.model_id, on_report=notices.report)
     kinds = {
         "recording": Kind(recordings.run, settings.recording_seconds),
         "diagnosis": Kind(diagnosis_jobs.run, settings.diagnosis_seconds),
@@ -123,7 +129,9 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         Condition(settings, store),
         Operations(settings, pipeline, board),
         batcher,
+        notices,
         stopping,
+        feeds,
     )
     waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}
     vitals = Vitals(__version__, engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import os
 import shutil
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+
+from sqlalchemy import Connection
 
 from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
 from sprung.service.engine import Engine
@@ -84,6 +87,9 @@ class Diagnoses:
         return job is not None and job.state in work.UNFINISHED
 
 
+OnReport = Callable[[Connection, str | None, str, dict[str, Any]], None]
+
+
 class DiagnosisJobs:
     """Runs jobs of kind `diagnosis`, each in a process of its own, and keeps their reports."""
 
@@ -94,12 +100,15 @@ class DiagnosisJobs:
         store: Store,
         model_id: int,
         task: Task[DiagnosisRequest, Stage, DiagnosisResult] = run,
+        on_report: OnReport = lambda connection, vehicle, report_id, report: None,
     ) -> None:
+        """on_report: told of a new report inside the transaction that stores it."""
         self._settings = settings
         self._engine = engine
         self._store = store
         self._model_id = model_id
         self.task = task
+        self._on_report = on_report
 
     def run(self, job: JobRow, progress: Progress) -> dict[str, Any]:
         """Handler of jobs of kind `diagnosis`; returns the report's id and verdict."""
@@ -113,6 +122,7 @@ class DiagnosisJobs:
             if work.get_report(connection, report_id) is None:
                 report = ReportRow(report_id, vehicle, row.id, found.verdict, found.report, now_ns())
                 work.add_report(connection, report)
+                self._on_report(connection, vehicle, report_id, found.report)
             if vehicle is not None and row.source == "excerpt":
                 fleet.attach_report(connection, vehicle, self._model_id, report_id)
         return {"report": report_id, "verdict": found.verdict}

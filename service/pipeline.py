@@ -22,6 +22,8 @@ from sprung.service.views import vehicle_view
 
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 
+OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
+
 
 @dataclass(slots=True)
 class Batch:
@@ -77,13 +79,16 @@ class Pipeline:
         listeners: Sequence[Callable[[Batch], None]] = (),
         vehicles_in_memory: int = FORGET_BEYOND,
         clock: Callable[[], int] = now_ns,
+        on_alarms: OnAlarms = lambda connection, vehicle, changes: None,
     ) -> None:
+        """on_alarms: told of alarms that open, change or close, inside the transaction that stores them."""
         self.engine = engine
         self.store = store
         self._compute = compute
         self._listeners = listeners
         self._limit = vehicles_in_memory
         self._clock = clock
+        self._on_alarms = on_alarms
         self._vehicles: OrderedDict[str, _Vehicle] = OrderedDict()
         self._lock = threading.Lock()
         with store.write() as connection:
@@ -284,7 +289,9 @@ class Pipeline:
     def _save(self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]) -> None:
         row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
         fleet.save_tracker(connection, vehicle, self.model_id, row, now)
-        fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+        changes = fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+        if changes:
+            self._on_alarms(connection, vehicle, changes)
         self._save_status(connection, vehicle, at, now, new)
 
     def _remember(self, vehicle: str, at: _Vehicle) -> None:

@@ -70,6 +70,17 @@ class Settings(BaseSettings):
 
     silent_seconds: float = Field(default=600.0, gt=0)  # nothing heard for so long: the vehicle is shown as silent
 
+    public_url: str = ""  # where people reach the pages, as in https://sprung.example.org; for links in notifications
+    webhooks: str = ""  # URLs that events are posted to, separated by spaces
+    webhook_secret: str | None = None  # signs them (Standard Webhooks); whsec_... or any text
+    mail_to: str = ""  # addresses that events are mailed to, separated by spaces
+    mail_from: str = "sprung@localhost"
+    smtp_host: str = ""
+    smtp_port: int = Field(default=25, ge=1, le=65535)
+    smtp_starttls: bool = False
+    smtp_user: str | None = None
+    smtp_password: str | None = None
+
     misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 

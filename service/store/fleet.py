@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from sqlalchemy import Connection, and_, func, or_, select, update
 
@@ -40,6 +40,15 @@ class AlarmRow:
     vehicle: str | None = None
     acknowledged: int | None = None  # ns since epoch
     acknowledged_by: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AlarmChange:
+    """Something about an alarm is new."""
+
+    what: Literal["opened", "changed", "closed"]  # changed: its severity
+    alarm: Alarm
+    before: str | None  # severity as it was
 
 
 def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
@@ -96,8 +105,10 @@ def save_tracker(connection: Connection, vehicle: str, model_id: int, row: Track
     upsert(connection, tracker_states, [values], key=("vehicle_id", "model_id"))
 
 
-def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iterable[Alarm]) -> None:
-    """Insert alarms or bring them up to date; a report that is attached stays attached."""
+def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iterable[Alarm]) -> list[AlarmChange]:
+    """Insert alarms or bring them up to date; a report that is attached stays attached.  What is new about them."""
+    found = list(found)
+    changes = _changes(connection, vehicle, model_id, found)
     values = [
         {
             "vehicle_id": vehicle,
@@ -115,6 +126,27 @@ def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iter
         for alarm in found
     ]
     upsert(connection, alarms, values, key=("vehicle_id", "model_id", "kind", "parameter", "opened_ns"))
+    return changes
+
+
+def _changes(connection: Connection, vehicle: str, model_id: int, found: list[Alarm]) -> list[AlarmChange]:
+    if not found:
+        return []
+    table = alarms
+    query = select(table.c.kind, table.c.parameter, table.c.opened_ns, table.c.severity, table.c.closed_ns)
+    query = query.where(table.c.vehicle_id == vehicle, table.c.model_id == model_id)
+    query = query.where(table.c.opened_ns >= min(alarm.opened for alarm in found))
+    stored = {(row.kind, row.parameter, row.opened_ns): row for row in connection.execute(query)}
+    changes = []
+    for alarm in found:
+        row = stored.get((alarm.kind, alarm.parameter or "", alarm.opened))
+        if row is None:
+            changes.append(AlarmChange("opened", alarm, None))
+        if alarm.closed is not None and (row is None or row.closed_ns is None):
+            changes.append(AlarmChange("closed", alarm, None if row is None else row.severity))
+        elif row is not None and row.closed_ns is None and row.severity != alarm.severity:
+            changes.append(AlarmChange("changed", alarm, row.severity))
+    return changes
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,143 @@
+"""The outbox: an event is written down in the transaction of what it tells of, and sent by a thread of its own.
+
+An attempt that fails is made again after 5 s, 30 s, 2 min, ... for about two days; what was given up stays to be seen.
+"""
+
+from __future__ import annotations
+
+import logging
+import smtplib
+import threading
+import uuid
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sqlalchemy import Connection
+from sqlalchemy.exc import SQLAlchemyError
+
+from sprung.service.errors import UserError
+from sprung.service.live import FeedStatus
+from sprung.service.notify import events, senders
+from sprung.service.settings import Settings
+from sprung.service.store import Store, outbox
+from sprung.service.store.fleet import AlarmChange
+from sprung.service.store.outbox import DeliveryRow
+from sprung.service.times import NANOSECONDS, now_ns
+
+log = logging.getLogger("sprung.notify")
+
+PAUSES = (5, 30, 120, 600, 1800, 3600, 10_800, 21_600, 43_200, 86_400)  # s before the next attempt
+KEPT_DAYS = 30
+PERIOD_SECONDS = 2.0
+FORGET_SECONDS = 3600
+AT_ONCE = 50
+
+
+class Notices:
+    """Accepts events and delivers them to every receiver of the settings."""
+
+    def __init__(self, settings: Settings, store: Store, feeds: Callable[[], Sequence[FeedStatus]] = tuple) -> None:
+        """Raises UserError for a receiver that is no http(s) URL and no mail address."""
+        self._settings = settings
+        self._store = store
+        self._feeds = feeds
+        self._working: dict[str, bool] = {}
+        self._targets = receivers(settings)
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sprung-notify", daemon=True)
+
+    def start(self) -> None:
+        """Begin; without receivers there is nothing to do."""
+        if self._targets:
+            self._thread.start()
+
+    def close(self) -> None:
+        """Stop; what waits is sent after the next start."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def alarms(self, connection: Connection, vehicle: str, changes: Sequence[AlarmChange]) -> None:
+        """Alarms of a vehicle were opened, changed or closed."""
+        for change in changes:
+            self._accept(connection, events.alarm_event(self._settings.public_url, vehicle, change, now_ns()))
+
+    def report(self, connection: Connection, vehicle: str | None, report: str, found: dict[str, Any]) -> None:
+        """A mismatch report is there."""
+        findings = [str(f.get("sentence") or f"{f['location']}: {f['effect']}") for f in found.get("findings", [])]
+        base, verdict = self._settings.public_url, str(found.get("verdict", ""))
+        self._accept(connection, events.report_event(base, vehicle, report, verdict, findings, now_ns()))
+
+    def watch_feeds(self) -> None:
+        """Tell of live buses that were lost or found since the last call."""
+        for feed in self._feeds():
+            before = self._working.get(feed.name, True)
+            self._working[feed.name] = feed.works
+            if before != feed.works:
+                base = self._settings.public_url
+                event = events.feed_event(base, feed.name, feed.vehicle, feed.works, feed.detail, now_ns())
+                with self._store.write() as connection:
+                    self._accept(connection, event)
+
+    def deliver(self, now: int) -> int:
+        """Try what is due, as if it were `now`; how many arrived."""
+        with self._store.read() as connection:
+            waiting = outbox.due(connection, now, AT_ONCE)
+        arrived = 0
+        for row in waiting:
+            if self._stopping.is_set():
+                break
+            arrived += self._attempt(row, now)
+        return arrived
+
+    def _attempt(self, row: DeliveryRow, now: int) -> bool:
+        try:
+            if row.target.startswith("mailto:"):
+                senders.mail(self._settings, row.target.removeprefix("mailto:"), row.event)
+            else:
+                senders.post(row.target, row.event, self._settings.webhook_secret)
+            values: dict[str, Any] = {"state": "delivered", "error": None}
+        except (OSError, ValueError, smtplib.SMTPException) as error:
+            line = " ".join(str(error).split())[:300] or type(error).__name__
+            dead = row.attempts >= len(PAUSES)
+            pause = PAUSES[min(row.attempts, len(PAUSES) - 1)]
+            values = {"state": "dead" if dead else "waiting", "error": line, "next_ns": now + pause * NANOSECONDS}
+            log.log(logging.ERROR if dead else logging.INFO, "%s to %s: %s", row.kind, row.target, line)
+        with self._store.write() as connection:
+            outbox.settle(connection, row.id, now, attempts=row.attempts + 1, **values)
+        return values["state"] == "delivered"
+
+    def _accept(self, connection: Connection, event: dict[str, Any]) -> None:
+        now = now_ns()
+        for target in self._targets:
+            row = DeliveryRow(str(uuid.uuid4()), event["type"], target, event, "waiting", 0, now, None, now, now)
+            outbox.add_delivery(connection, row)
+
+    def _run(self) -> None:
+        forgotten = 0
+        while not self._stopping.wait(PERIOD_SECONDS):
+            try:
+                self.watch_feeds()
+                self.deliver(now_ns())
+                if now_ns() - forgotten > FORGET_SECONDS * NANOSECONDS:
+                    forgotten = now_ns()
+                    with self._store.write() as connection:
+                        outbox.forget_deliveries(connection, forgotten - KEPT_DAYS * 86_400 * NANOSECONDS)
+            except SQLAlchemyError:
+                log.exception("notifications could not be sent; they are tried again")
+
+
+def receivers(settings: Settings) -> tuple[str, ...]:
+    """Webhooks, then mail addresses as mailto:.  Raises UserError for one that cannot be."""
+    found = []
+    for url in settings.webhooks.replace(",", " ").split():
+        if not url.startswith(("http://", "https://")) or len(url) > 300:
+            raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {url[:80]!r} is no http:// or https:// URL")
+        found.append(url)
+    for address in settings.mail_to.replace(",", " ").split():
+        if "@" not in address.strip("@") or len(address) > 250:
+            raise UserError(f"setting mail_to (SPRUNG_MAIL_TO): {address[:80]!r} is no mail address")
+        found.append(f"mailto:{address}")
+    if settings.mail_to and not settings.smtp_host:
+        raise UserError("setting smtp_host (SPRUNG_SMTP_HOST) is needed to send mail to SPRUNG_MAIL_TO")
+    return tuple(found)

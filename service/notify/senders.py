@@ -1,0 +1,77 @@
+"""One attempt to deliver an event: a signed webhook, or a mail.  Raises OSError, or ValueError, when it fails."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import hmac
+import json
+import smtplib
+import ssl
+import time
+import urllib.error
+import urllib.request
+from email.message import EmailMessage
+from typing import Any
+
+from sprung.service.notify.events import sentence
+from sprung.service.settings import Settings
+
+SECONDS = 10.0
+SUCCESS = range(200, 300)
+
+
+class _NoRedirects(urllib.request.HTTPRedirectHandler):
+    """A receiver that moved must be told of in the settings: signed events do not follow anybody's pointer."""
+
+    def redirect_request(self, *_: Any, **__: Any) -> None:
+        return None
+
+
+_opener = urllib.request.build_opener(_NoRedirects)
+
+
+def post(url: str, event: dict[str, Any], secret: str | None) -> None:
+    """CloudEvents in structured mode, signed as Standard Webhooks (standardwebhooks.com) has it."""
+    body = json.dumps(event, allow_nan=False).encode()
+    headers = {"Content-Type": "application/cloudevents+json", "User-Agent": "sprung"}
+    headers |= signature(event["id"], int(time.time()), body, secret)
+    request = urllib.request.Request(url, body, headers, method="POST")
+    try:
+        with _opener.open(request, timeout=SECONDS) as answer:
+            status = answer.status
+    except urllib.error.HTTPError as error:
+        with error:
+            status = error.code
+    if status not in SUCCESS:
+        raise ValueError(f"the receiver answered {status}")
+
+
+def signature(identity: str, seconds: int, body: bytes, secret: str | None) -> dict[str, str]:
+    """Headers `webhook-id`, `webhook-timestamp` and, with a secret, `webhook-signature`.
+
+    HMAC-SHA256 over `ID.TIMESTAMP.BODY`, base64; the timestamp lets receivers refuse what was replayed.
+    """
+    headers = {"webhook-id": identity, "webhook-timestamp": str(seconds)}
+    if secret:
+        key = base64.b64decode(secret.removeprefix("whsec_")) if secret.startswith("whsec_") else secret.encode()
+        digest = hmac.new(key, f"{identity}.{seconds}.".encode() + body, hashlib.sha256).digest()
+        headers["webhook-signature"] = f"v1,{base64.b64encode(digest).decode()}"
+    return headers
+
+
+def mail(settings: Settings, address: str, event: dict[str, Any]) -> None:
+    """A plain mail with the sentence, what to do, and where to look."""
+    message = EmailMessage()
+    message["From"], message["To"] = settings.mail_from, address
+    message["Subject"] = sentence(event)
+    message["Message-ID"] = f"<{event['id']}@sprung>"
+    lines = [sentence(event), event["data"].get("advisory") or "", *event["data"].get("findings", [])]
+    lines += [event["data"]["page"], "", json.dumps(event, indent=1)]
+    message.set_content("\n".join(line for line in lines if line is not None))
+    with smtplib.SMTP(settings.smtp_host, settings.smtp_port, timeout=SECONDS) as server:
+        if settings.smtp_starttls:
+            server.starttls(context=ssl.create_default_context())
+        if settings.smtp_user and settings.smtp_password:
+            server.login(settings.smtp_user, settings.smtp_password)
+        server.send_message(message)
