@@ -87,7 +87,7 @@ def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     count = course.given + (len(course.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        if term.law.name != UNKNOWN:
+        if term.law.named:
             found.append(IdentifiedLaw(term.location, term.law.name, _law_parameters(fit, index)[0], term.variant))
     for fault in course.input_faults:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
