@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
+
+from sprung.model import comfort
 from sprung.model.signals import Tally
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Priority
@@ -44,6 +47,7 @@ class Fed:
     problems: list[str] = field(default_factory=list)  # one line each
     incomplete: bool = False
     wall_seconds: float = 0.0
+    ride: comfort.RideQuality | None = None  # minutes of the body's accelerometers
 
     def recorded_seconds(self, sample_rate: float) -> float:
         """From the first sample to the end of the last one."""
@@ -73,6 +77,7 @@ class Fed:
             "fitting": self.fitting,
             "monitored": self.monitored,
             "late_windows": self.late,
+            "comfort": None if self.ride is None else self.ride.summary(),
         }
 
 
@@ -112,7 +117,8 @@ def feed_file(
     request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start)
     reading: Reading = Here(request) if limits is None else Apart(request, limits)
     started = time.perf_counter()
-    fed = Fed("")
+    ride = comfort.RideQuality(system)
+    fed = Fed("", ride=ride)
     priority = Priority.LIVE if speed else Priority.BATCH
 
     def name(recorded: str | None) -> str:
@@ -123,6 +129,9 @@ def feed_file(
             found = None
             if piece.windows:
                 fed.vehicle = name(piece.vehicle)
+                for window in piece.windows:
+                    if window.outcome != "dropped":
+                        ride.push(window.start, window.values)
                 found = pipeline.identify(fed.vehicle, piece.windows, priority)
             yield found, piece.tally
 
@@ -144,6 +153,17 @@ def feed_file(
     fed.first_ns, fed.last_ns = ending.first_ns, ending.last_ns
     fed.wall_seconds = time.perf_counter() - started
     return fed
+
+
+def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
+    """The ride's comfort, and what the changes from the vehicle's own baseline cost of it on an average track."""
+    told = fed.ride.summary() if fed.ride is not None else {"minutes": 0, "sensors": {}}
+    if fed.state is None:
+        return told | {"cost": None}
+    reports = pipeline.engine.tracker.report(fed.state)
+    now = np.array([report.log_ratio for report in reports])
+    then = np.array([np.log((report.baseline or report.value) / report.nominal) for report in reports])
+    return told | {"cost": comfort.cost(pipeline.engine.system, now, then)}
 
 
 def _count(fed: Fed, batch: Batch) -> Batch:

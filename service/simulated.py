@@ -27,14 +27,21 @@ class Compared:
 
 def newest_window(engine: Engine, excerpt: Excerpt | None, vehicle: str) -> tuple[int, FloatArray]:
     """Start and values (T, C) of the newest whole window that is held.  Raises NotFound where there is none."""
+    if unmeasured(engine):
+        raise NotFound(f"what moves {vehicle} is not measured, so there is nothing to simulate its sensors from")
     for start, values in reversed(list(whole_windows(engine, excerpt))):
         return start, values
     raise NotFound(f"no recent samples of {vehicle} are held; they are kept for a minute after they came")
 
 
+def unmeasured(engine: Engine) -> bool:
+    """Whether the system is identified from its sensors alone."""
+    return engine.system.on_track or not engine.system.file.inputs
+
+
 def whole_windows(engine: Engine, excerpt: Excerpt | None) -> Iterator[tuple[int, FloatArray]]:
     """Windows one after the other, oldest first, counted back from the newest sample; none with a missing input."""
-    if excerpt is None:
+    if excerpt is None or unmeasured(engine):
         return
     length, inputs = engine.system.window, len(engine.system.inputs)
     for first in range(len(excerpt.values) % length, len(excerpt.values) - length + 1, length):

@@ -29,6 +29,7 @@ ORDER = [
     "identifier",
     "simulate",
     "ambient",
+    "comfort",
     "identification",
     "tracking",
 ]

@@ -38,6 +38,8 @@ DESCRIPTION = (
     "Times are RFC 3339 in UTC, values SI; every error is `application/problem+json` (RFC 9457)."
 )
 
+VALUE_BYTES = 40  # of one value of a window as JSON, generously: a minute of a vehicle without inputs is 1.5 MB
+
 
 def create_app(
     core: Core, on_start: Callable[[], None] = lambda: None, on_stop: Callable[[], None] | None = None
@@ -70,9 +72,10 @@ def create_app(
         app.include_router(part.router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
     app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes
+    system = core.engine.system
     app.add_middleware(
         BodyLimit,
-        limit=core.settings.max_body_bytes,
+        limit=max(core.settings.max_body_bytes, VALUE_BYTES * system.window * len(system.channels)),
         paths={"/recordings": uploads, "/diagnose": uploads},
     )
     app.add_middleware(HeadAsGet)

@@ -13,7 +13,7 @@ from sprung.service.cli.console import parameter_table, print_table, progress
 from sprung.service.cli.starts import start_time
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
-from sprung.service.feed import Fed, feed_file
+from sprung.service.feed import Fed, comfort_dict, feed_file
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
@@ -129,6 +129,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
         "problems": fed.problems[:20],
         "parameters": [p.as_dict() for p in view.parameters],
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
+        "comfort": comfort_dict(pipeline, fed),
         "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
         "wall_seconds": round(fed.wall_seconds, 3),
     }

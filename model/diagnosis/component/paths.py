@@ -10,7 +10,8 @@ import math
 
 import numpy as np
 
-from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
+from sprung.model.laws.along import bouc_wen_memory
+from sprung.model.laws.hysteresis import GAMMA
 from sprung.model.signals import FloatArray
 
 
