@@ -13,6 +13,9 @@ KEPT_PROBLEMS = 100  # lines; a file can be damaged in a million places
 class UnreadableRecording(ValueError):
     """The input cannot be read at all; the message is one line that says what, where and what to do."""
 
+    def __init__(self, message: str) -> None:
+        super().__init__(" ".join(part.strip() for part in message.splitlines() if part.strip()))
+
 
 @dataclass(slots=True)
 class Account:

@@ -5,10 +5,12 @@ A field may be nested and indexed: `/imu/data.linear_acceleration.z`, `/scan.ran
 
 from __future__ import annotations
 
+import io
 import json
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, Literal
@@ -59,7 +61,8 @@ class Topic:
         self._stamp: tuple[tuple[str, ...], tuple[str, str]] | None = None  # where the messages carry their time
         for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
             try:
-                self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
+                with redirect_stdout(io.StringIO()):  # the parser of ROS 2 definitions prints what it cannot read
+                    self.decode = self.decode or factory.decoder_for(channel.message_encoding, schema)
             except Exception as error:  # the decoders' parsers raise what they happen to raise
                 account.problem(f"schema of topic {self.name} cannot be read: {_line(error)}")
         if self.decode is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -157,14 +158,34 @@ def open_recording(
     elif extension in TEXT_TABLES:
         source = csvtable.blocks(path, channels, account, time)
     elif extension in PARQUET:
-        source = parquet.blocks(path, channels, account, time)
+        source = _whatever(path, parquet.blocks(path, channels, account, time), account)
     elif extension in series.KINDS:
-        source = _series(path, channels, account, time)
+        source = _whatever(path, _series(path, channels, account, time), account)
     else:
         if dbc is None:
             raise UnreadableRecording(f"{path}: a CAN recording needs a CAN database; name it with --dbc")
         source = _decoded(CAN_READERS[extension](path, account), CanDecoder(channels, dbc), account)
     return Recording(path, channels, source, account, start)
+
+
+def _whatever(path: Path, source: Iterator[SampleBlock], account: Account) -> Iterator[SampleBlock]:
+    """Blocks of a format that a package of others parses: whatever it raises about a damaged file is one line."""
+    rows = 0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # told by what comes of it
+            for block in source:
+                rows += len(block.time)
+                yield block
+    except UnreadableRecording:
+        raise
+    except Exception as error:
+        what = str(error) or type(error).__name__
+        if not rows:
+            raise UnreadableRecording(
+                f"{path}: damaged, or not of the kind that its name says: {what[:200]}"
+            ) from error
+        account.problem(f"damaged after {rows} values ({' '.join(what.split())[:200]}); what came before was read")
 
 
 def _series(path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn) -> Iterator[SampleBlock]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -153,12 +154,16 @@ def _tdms(path: Path) -> Iterator[list[Column]]:
     """National Instruments TDMS: `group/channel`, with the waveform's start and increment where it has them."""
     needed("nptdms", "tdms", path)
     from nptdms import TdmsFile
+    from nptdms.log import log_manager
 
+    log_manager.set_level(logging.CRITICAL)  # what it logs of damaged files is told by what comes of it
+    raw = path.open("rb")
     try:
-        file = TdmsFile.open(path)
+        file = TdmsFile.open(raw)
     except Exception as error:  # the library raises many kinds
+        raw.close()
         raise UnreadableRecording(f"{path}: not a TDMS file that can be read: {error}") from error
-    with file:
+    with raw, file:
         columns = []
         for group in file.groups():
             for channel in group.channels():

@@ -19,6 +19,7 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.structure import Branch, Structure
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import SpringDamper, find_law
 from sprung.model.laws.along import force_along
@@ -169,7 +170,7 @@ def test_scores_on_a_clean_recording_are_chi_square():
     for seed in range(6):
         problem = _problem(simulate(seed=10 + seed, seconds=12))
         fit = optimise(problem, Point(np.zeros(4), (), np.zeros(4)))
-        hits = screen(problem, fit, laws).hits
-        scores += [h.score for h in hits if h.family == "law"]
+        hits = screen(problem, fit, laws).candidates
+        scores += [h.score for h in hits if h.family is ELEMENT]
     assert np.mean(scores) < 2.5  # one-sided laws drop out when their sign is wrong
     assert np.max(scores) < 20

@@ -6,7 +6,7 @@ import pytest
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.laws import CLOCK_LEAD, find_law
-from sprung.model.laws.sensor_faults import delayed
+from sprung.model.laws.channel import delayed
 from sprung.model.system import MANCHESTER, load_system
 
 SYSTEM = load_system(MANCHESTER)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.report.report import (
-    Candidate,
+    CandidateRow,
     Finding,
     FitFigures,
     LawParameter,
@@ -55,7 +55,7 @@ def friction_report(system: System = SYSTEM) -> Report:
         noise_floor=fit(system, 0.030),
         localization={place: 5100.0, "car": 30.0},
         explained=0.993,
-        candidates=(Candidate(place, "coulomb_friction", 5100.0, 0.0, -5100.0),),
+        candidates=(CandidateRow(place, "coulomb_friction", 5100.0, 0.0, -5100.0),),
         evidence={
             "validation.time": np.arange(600) / system.sample_rate,
             "validation.measured": measured,

@@ -17,6 +17,7 @@ from sprung.model.laws.base import (
     observe,
 )
 from sprung.model.laws.bodies import EXTERNAL_FORCE, FLEXIBLE_MODE, MASS_CHANGE
+from sprung.model.laws.channel import SensorResponse
 from sprung.model.laws.damping import (
     COULOMB_FRICTION,
     DAMPER_ASYMMETRY,
@@ -98,6 +99,7 @@ __all__ = [
     "Observed",
     "ParameterSpec",
     "SensorLaw",
+    "SensorResponse",
     "SpringDamper",
     "SupportLaw",
     "body_laws",

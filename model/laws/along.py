@@ -1,20 +1,12 @@
-"""Forces of laws along whole trajectories, fast: memoryless laws in one call, Bouc-Wen from reversal to reversal."""
+"""Forces of laws along whole trajectories: in one call, by a law's own path, or step by step."""
 
 from __future__ import annotations
-
-import math
-from bisect import bisect_right
-from collections.abc import Callable
-from functools import lru_cache
 
 import numpy as np
 
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
-from sprung.model.laws.hysteresis import GAMMA
 from sprung.model.laws.trajectory import along
 from sprung.model.signals import FloatArray
-
-_FAR, _BLOWS = 60.0, 1.5  # ends of the growing functions
 
 
 def force_along(
@@ -28,99 +20,7 @@ def force_along(
     """Force of a law, N, along deflection and rate (T,) at times (T,) in s since the start of the recording."""
     if law.memory == 0:
         return np.asarray(law.force(Motion(deflection, rate, time + CLOCK_LEAD), parameters, element))
-    if law.name == "bouc_wen":
-        alpha, beta, exponent, *gamma = parameters
-        return alpha * bouc_wen_memory(deflection, beta, exponent, *gamma)
+    if law.path is not None:
+        return law.path(deflection, parameters)
     step = time[1] - time[0]
     return along(law, parameters, deflection, rate, sample_rate=1 / step, element=element, start=time[0] + CLOCK_LEAD)
-
-
-def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma: float = GAMMA) -> FloatArray:
-    """z of the Bouc-Wen law along a deflection (T,), from z = 0; rate independent.
-
-    Between two reversals of the motion, with x the way travelled and u = z in the direction of travel,
-    dx = du / (1 - a u^n) for u > 0, a = beta (1 + gamma), and du / (1 + b |u|^n) for u < 0, b = beta (1 - gamma).
-    So one function of u, the way X(u), and its inverse carry z from any reversal to the next.
-    """
-    ahead, behind = _Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent)
-    steps = np.diff(deflection)
-    direction = np.sign(steps)
-    direction[direction == 0] = 1.0
-    turns = np.flatnonzero(direction[1:] != direction[:-1]) + 1
-    starts = np.concatenate([[0], turns])  # first step of every monotone stretch
-    ends = np.concatenate([turns, [len(steps)]])
-    begin = np.array(_ways(ahead, behind, np.abs(deflection[ends] - deflection[starts])))
-    stretch = np.repeat(np.arange(len(starts)), ends - starts)
-    position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch])
-    z = np.zeros_like(deflection)
-    z[1:] = direction * np.where(position > 0, ahead.along(position), -behind.along(-position))
-    return z
-
-
-def _ways(ahead: _Side, behind: _Side, travelled: FloatArray) -> list[float]:
-    """The way X at which every monotone stretch begins: minus the z at which the one before ended."""
-    ways = []
-    u = 0.0
-    for length in travelled.tolist():
-        start = ahead.way(u) if u > 0 else -behind.way(-u)
-        ways.append(start)
-        end = start + length
-        u = -ahead.back(end) if end > 0 else behind.back(-end)
-    return ways
-
-
-class _Side:
-    """The way X(u) = integral du / (1 - a u^n) for u >= 0 and its inverse: of one float, and of arrays.
-
-    In units of |a|^(-1/n) it is one of two functions of n: towards saturation for a > 0, growing for a < 0.
-    """
-
-    def __init__(self, a: float, exponent: float) -> None:
-        self.unit = max(abs(a), 1e-12) ** (-1 / exponent)
-        self._way, self._back, self._along = _functions(exponent, a > 0)
-
-    def way(self, u: float) -> float:
-        return self.unit * self._way(u / self.unit)
-
-    def back(self, x: float) -> float:
-        return self.unit * self._back(x / self.unit)
-
-    def along(self, x: FloatArray) -> FloatArray:
-        return self.unit * self._along(np.maximum(x, 0) / self.unit)
-
-
-@lru_cache(maxsize=64)
-def _functions(
-    exponent: float, saturates: bool
-) -> tuple[Callable[[float], float], Callable[[float], float], Callable[[FloatArray], FloatArray]]:
-    """X(u), its inverse, and that of arrays, for dX = du / (1 - u^n) or du / (1 + u^n), u >= 0."""
-    if exponent == 1.0 and saturates:
-        return lambda u: -math.log(max(1 - u, 1e-12)), lambda x: -math.expm1(-x), lambda x: -np.expm1(-x)
-    if exponent == 1.0:
-        return math.log1p, lambda x: math.expm1(min(x, _FAR)), lambda x: np.expm1(np.minimum(x, _FAR))
-    if exponent == 2.0 and saturates:
-        return lambda u: math.atanh(min(u, 1 - 1e-15)), math.tanh, np.tanh
-    if exponent == 2.0:
-        return math.atan, lambda x: math.tan(min(x, _BLOWS)), lambda x: np.tan(np.minimum(x, _BLOWS))
-    u, way = _table(exponent, saturates)
-    us, ways = u.tolist(), way.tolist()
-    return lambda v: _between(v, us, ways), lambda x: _between(x, ways, us), lambda x: np.interp(x, way, u)
-
-
-def _between(value: float, x: list[float], y: list[float]) -> float:
-    """Linear interpolation of one number; quicker than through arrays.  Where x stands still, the last y."""
-    i = min(max(bisect_right(x, value), 1), len(x) - 1)
-    width = x[i] - x[i - 1]
-    share = (value - x[i - 1]) / width if width > 0 else 1.0
-    return y[i - 1] + min(max(share, 0.0), 1.0) * (y[i] - y[i - 1])
-
-
-def _table(exponent: float, saturates: bool) -> tuple[FloatArray, FloatArray]:
-    """X(u) on a fine grid, by the trapezoidal rule in a variable that resolves the approach to u = 1."""
-    if saturates:
-        u = -np.expm1(-np.linspace(0, 25, 6000))
-        slope = 1 / np.maximum(1 - u**exponent, 1e-14)
-    else:
-        u = np.concatenate([np.linspace(0, 3, 3000), np.geomspace(3, 1e3, 1000)[1:]])
-        slope = 1 / (1 + u**exponent)
-    return u, np.concatenate([[0.0], np.cumsum(np.diff(u) * (slope[1:] + slope[:-1]) / 2)])

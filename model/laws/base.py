@@ -11,17 +11,19 @@ broadcast, so that one call serves a whole record, a batch of candidates or one 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 
+from sprung.model.laws.channel import SensorResponse, passed, undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
 Where = Literal["element", "pair", "body", "sensor", "support", "axle"]  # "axle": both supports of one
+Channels = Literal["sensor", "support", "force"]
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
 CLOCK_LEAD = 5.0  # s; the clock of the laws starts this long before the first sample of a recording
@@ -99,10 +101,17 @@ class ParameterSpec:
         return bool(self.low <= value <= self.high)
 
 
+# Evidence that a law needs besides, because it contains a commoner one or imitates it: odds of 400 to 1
+RARE = 12.0
+
+
 class Parametrised:
     """What every law has: names of its parameters, and whether it admits values of them."""
 
     parameters: tuple[ParameterSpec, ...]
+    prior_cost: float = 0.0  # evidence by which the law must beat commoner ones
+    named: bool = True  # whether it is physics with a name
+    fault: bool = False  # whether it is one of the measurement, not of the system
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -110,6 +119,31 @@ class Parametrised:
 
     def admits(self, p: Sequence[float]) -> bool:
         return all(q.admits(float(value)) for q, value in zip(self.parameters, p, strict=True))
+
+
+class Maxwell(NamedTuple):
+    """A spring and a damper in series beside an element, force s' = stiffness v - s / time."""
+
+    stiffness: float  # N/m
+    time: float  # s, damper over spring
+    replaces: float  # N s/m, what of the element's own damper is in the branch
+
+
+class Reading(NamedTuple):
+    """An element as it was identified without a law."""
+
+    stiffness: float  # N/m
+    damping: float  # N s/m
+    nominal_damping: float  # N s/m, of the system file
+    frequency: float  # rad/s, rms rate over rms deflection
+
+
+class Restart(NamedTuple):
+    """Another start for a law that makes its element be misread: factors of the reading, and the law's parameters."""
+
+    stiffness: float
+    damping: float
+    parameters: tuple[float, ...]
 
 
 def empty_memory(motion: Motion, p: Values, element: SpringDamper) -> Any:
@@ -144,6 +178,13 @@ class ElementLaw(Parametrised):
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
     passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
     odd: bool = True  # force(-d, -v) = -force(d, v)
+    # A law that is a linear element with memory: parameters and the element's damping -> its branch
+    branch: Callable[[Values, float], Maxwell] | None = None
+    # Force along a whole deflection (T,), quicker than step by step; None: as the memory's rate says
+    path: Callable[[FloatArray, Values], FloatArray] | None = None
+    restarts: Callable[[Reading], tuple[Restart, ...]] | None = None  # besides the start that screening finds
+    prior_cost: float = 0.0
+    named: bool = True
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
@@ -184,6 +225,9 @@ class BodyLaw(Parametrised):
     confused_with: tuple[str, ...]
     sentence: str
     load: Callable[[FloatArray, Values], FloatArray] | None = None  # N over the laws' clock: one more force in u
+    scales: str = ""  # quantity of the body that the only parameter multiplies: no candidate where that is estimated
+    adds_motion: bool = False  # whether it brings a degree of freedom of its own
+    prior_cost: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -202,6 +246,7 @@ class SupportLaw(Parametrised):
     confused_with: tuple[str, ...]
     sentence: str
     where: Where = "support"  # "axle": both supports of one axle together
+    prior_cost: float = 0.0
 
     def movement(self, time: FloatArray, p: Values, highest: float = np.inf) -> tuple[FloatArray, FloatArray]:
         """What is added to the measured displacement (m) and velocity (m/s) at times on the laws' clock, each (T,).
@@ -216,20 +261,55 @@ class SupportLaw(Parametrised):
         return displacement.real, rate.real
 
 
+def _as_large_as_found(step: float, amplitude: float) -> float:
+    return max(abs(amplitude), 1e-9)
+
+
 @dataclass(frozen=True)
 class SensorLaw(Parametrised):
-    """A fault of a measurement: what it shows instead of the truth, along the last axis (samples)."""
+    """A fault of a measurement: what it shows instead of the truth.
+
+    The response is the law; what a series shows, its inverse and a candidate's sensitivity follow from it.
+    """
 
     name: str
     title: str
     parameters: tuple[ParameterSpec, ...]
-    distort: Callable[[FloatArray, Values, float], FloatArray]  # (truth (..., T), p, sample rate) -> shown
-    restore: Callable[[FloatArray, Values, float], FloatArray] | None  # its inverse; None: the signal is lost
     absent: tuple[float, ...]
     looks_like: str
     confused_with: tuple[str, ...]
     sentence: str
+    response: Callable[[Values], SensorResponse] | None = None  # None: not a function of the truth (noise, stuck)
+    at: tuple[Channels, ...] = ()  # which channels are screened for it
+    scale: Callable[[float, float], float] = _as_large_as_found  # of a step's length (s) and the amplitude found
+    forms: Mapping[str, SensorLaw] = field(default_factory=dict)  # other models of the same effect, by variant
     where: Where = "sensor"  # "axle": all inputs of one axle together
+    stuck: bool = False  # the channel repeats its first value
+    prior_cost: float = 0.0
+    fault: bool = True
+
+    def distort(self, truth: FloatArray, p: Values, sample_rate: float) -> FloatArray:
+        """What is shown of the truth (..., T) along the last axis."""
+        if self.stuck:
+            return np.broadcast_to(truth[..., :1], np.shape(truth)).copy()
+        return truth if self.response is None else passed(truth, self.response(p), sample_rate)
+
+    def restore(self, shown: FloatArray, p: Values, sample_rate: float) -> FloatArray:
+        """The truth of what is shown (..., T).  Errors: `ValueError` where nothing of it is left."""
+        if self.stuck:
+            raise ValueError(f"{self.name}: nothing is left of the signal")
+        return shown if self.response is None else undone(shown, self.response(p), sample_rate)
+
+    def combined(self, first: float, second: float) -> float:
+        """The only parameter of two faults one after the other."""
+        return first * second if self.absent[0] else first + second
+
+    def slope(self) -> SensorResponse:
+        """Derivative of the response by the first parameter, at none of the fault."""
+        if self.response is None:
+            raise ValueError(f"{self.name} has no response")
+        here, there = (self.response((self.absent[0] + step, *self.absent[1:])) for step in (0.0, 1.0))
+        return SensorResponse(*(b - a for a, b in zip(here, there, strict=True)))
 
 
 Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.laws import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper
-from sprung.model.laws.base import Values
+from sprung.model.laws.base import RARE, Values
 from sprung.model.signals import FloatArray
 
 UNKNOWN = "unknown"
@@ -34,6 +34,7 @@ SMALL: dict[str, _Basis] = {
     "d |v|": lambda x, y: [x * np.abs(y)],
     "|d| v": lambda x, y: [np.abs(x) * y],
 }
+_OTHERS = 8  # trials that are as likely before a recording as every small one: ripples and the map
 RIPPLES = (1.5, 2.2, 3.0, 4.0, 5.5, 7.5, 10.0)  # periods of a force ripple per 2 pi rms deflections
 
 
@@ -85,6 +86,8 @@ def static_law(basis: _Basis, seen: Observed) -> StaticLaw:
         sentence="a force that no law of the catalogue explains",
         passive=False,
         odd=False,
+        prior_cost=RARE + 2 * float(np.log(len(SMALL) + _OTHERS)),
+        named=False,
         basis=basis,
         scale_d=scale_d,
         scale_v=scale_v,

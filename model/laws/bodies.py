@@ -119,6 +119,7 @@ FLEXIBLE_MODE = BodyLaw(
     looks_like="a narrow resonance in all sensors of one body, in one pattern; follows the excitation's level",
     confused_with=("external_force", "series_stiffness"),
     sentence="the body has an elastic mode at {frequency} with {damping_ratio} of critical damping",
+    adds_motion=True,
 )
 
 
@@ -177,4 +178,5 @@ MASS_CHANGE = BodyLaw(
     looks_like="all accelerations of the body scale against the forces; stiffnesses and dampings seem off together",
     confused_with=("sensor_gain", "anti_roll_bar"),
     sentence="the body has {ratio} times its nominal mass",
+    scales="mass",
 )

@@ -6,12 +6,24 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import (
+    RARE,
+    ElementLaw,
+    Maxwell,
+    Motion,
+    Observed,
+    ParameterSpec,
+    Reading,
+    Restart,
+    SpringDamper,
+    Values,
+    grid,
+)
+from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray
 
-# Of the Bouc-Wen law as it is commonly written, z' = v - beta (abs(v) abs(z)^(n-1) z + gamma v abs(z)^n)
-GAMMA = 0.5
 # Corner frequencies, Hz, at which a branch with a spring and a damper in series is sought
+_STRONGER = 2.6  # a damper behind a spring over its reading, where nominal is no more
 _CORNERS = np.array([0.5, 1.2, 3.0, 6.0, 10.0, 16.0, 25.0, 40.0, 70.0])
 
 
@@ -33,6 +45,22 @@ def _series_decay(p: Values, element: SpringDamper) -> FloatArray:
 
 def _series_start(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return np.asarray(element.damping * motion.rate)[None]  # the branch without its spring
+
+
+def _series_branch(p: Values, damping: float) -> Maxwell:
+    return Maxwell(p[0], damping / p[0], damping)
+
+
+def _behind_a_spring(read: Reading) -> tuple[Restart, ...]:
+    """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
+
+    At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's
+    mean frequency, ks and the change of the spring follow from the assumed c and from the damping that was read.
+    """
+    assumed = max(_STRONGER * read.damping, read.nominal_damping)
+    ratio = float(np.sqrt(assumed / read.damping - 1))
+    softer = max(1 - read.frequency * read.damping * ratio / read.stiffness, 0.5)
+    return (Restart(softer, assumed / read.damping, (read.frequency * assumed / ratio,)),)
 
 
 SERIES_STIFFNESS = ElementLaw(
@@ -62,6 +90,8 @@ SERIES_STIFFNESS = ElementLaw(
     memory_rate=_series_rate,
     memory_decay=_series_decay,
     memory_start=_series_start,
+    branch=_series_branch,
+    restarts=_behind_a_spring,
 )
 
 
@@ -101,6 +131,8 @@ AIR_SPRING = ElementLaw(
     memory=1,
     memory_rate=_air_rate,
     memory_decay=_air_decay,
+    branch=lambda p, damping: Maxwell(p[0], p[1], 0.0),
+    prior_cost=RARE,
 )
 
 
@@ -117,6 +149,11 @@ def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     v, size = motion.rate, np.abs(z)
     level = beta * size**n
     return (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
+
+
+def _bouc_wen_path(deflection: FloatArray, p: Values) -> FloatArray:
+    alpha, beta, exponent, *gamma = p
+    return alpha * bouc_wen_memory(deflection, beta, exponent, *gamma)
 
 
 def _bouc_wen_shapes(seen: Observed) -> FloatArray:
@@ -152,6 +189,7 @@ _BOUC_WEN = ElementLaw(
     sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n})",
     memory=1,
     memory_rate=_bouc_wen_rate,
+    path=_bouc_wen_path,
 )
 # The loop's shape free: gamma below -1 stiffens while it is loaded, above 1 it hardly yields while it is unloaded
 _FREE = ParameterSpec("gamma", "1", -4.0, 4.0, "in z' = v - beta (abs(v) z + gamma v abs(z))", lambda seen: GAMMA)
@@ -162,6 +200,7 @@ BOUC_WEN = replace(
         parameters=(*_BOUC_WEN.parameters, _FREE),
         shapes=_free_shapes,
         absent=(*_BOUC_WEN.absent, GAMMA),
+        prior_cost=RARE,
         sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
         memory_formula="v - beta * abs(z)**n * (abs(v) * sign(z) + gamma * v)",
     ),

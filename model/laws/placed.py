@@ -82,6 +82,8 @@ def _placed(
 ) -> PlacedLaw:
     law = _law(effect, setting, kinds, catalogue)
     numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
+    if isinstance(law, SensorLaw) and "variant" in setting:
+        law = _form(law, str(setting["variant"]))
     given, wanted = set(numbers), set(law.names)
     if isinstance(law, ElementLaw) and law.wider is not None and given == set(law.wider.names):
         law, wanted = law.wider, given
@@ -133,6 +135,13 @@ def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: S
         if elsewhere
         else f"no such law; known here are {', '.join(known)}{_near(effect, known)}"
     )
+
+
+def _form(law: SensorLaw, variant: str) -> SensorLaw:
+    if variant not in law.forms:
+        known = f"it has {', '.join(law.forms)}" if law.forms else "it has none"
+        raise ValueError(f"variant: {law.name} has no {variant!r}; {known}")
+    return law.forms[variant]
 
 
 def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.laws.base import (
+    RARE,
     ElementLaw,
     Motion,
     ParameterSpec,
@@ -41,6 +42,7 @@ def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: 
         confused_with=("external_force", "wheel_flat" if name == "rail_joints" else "rail_joints"),
         sentence=sentence,
         where=where,
+        prior_cost=RARE,
     )
 
 
@@ -83,4 +85,5 @@ ANTI_ROLL_BAR = ElementLaw(
     confused_with=("mass_change", "flexible_mode"),
     sentence="an anti-roll bar of {stiffness} between the two sides",
     where="pair",
+    prior_cost=RARE,
 )

@@ -162,6 +162,7 @@ class LatentForce:
             sentence="a force that no law of the catalogue explains; its map is reported",
             passive=False,
             odd=False,
+            named=False,
         )
 
     def map(self, points: tuple[int, int] = (61, 41)) -> ForceMap:

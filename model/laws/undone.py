@@ -17,7 +17,7 @@ def undone(values: FloatArray, channels: Sequence[str], laws: Sequence[PlacedLaw
     result = values
     for placed in laws:
         law = placed.law
-        if not isinstance(law, SensorLaw) or law.restore is None:
+        if not isinstance(law, SensorLaw) or law.stuck:
             continue
         for column, name in enumerate(channels):
             if any(name == place or name.startswith(f"{place}.") for place in placed.places):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from sprung.model.laws import SpringDamper, find_law
-from sprung.model.laws.along import bouc_wen_memory, force_along
+from sprung.model.laws.along import force_along
+from sprung.model.laws.reversals import bouc_wen_memory
 from sprung.model.laws.trajectory import along
 
 

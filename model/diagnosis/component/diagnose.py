@@ -24,7 +24,7 @@ from sprung.model.diagnosis.component.words import finding_of, leftover_words, p
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, Errors, verdict_of
 from sprung.model.diagnosis.report.report import (
-    Candidate,
+    CandidateRow,
     Finding,
     FitFigures,
     ParameterValue,
@@ -226,17 +226,17 @@ def _figures(names: list[str], per_sensor: FloatArray) -> FitFigures:
     return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
 
 
-def _candidates(one: Judged) -> list[Candidate]:
-    rows: dict[str, Candidate] = {}
+def _candidates(one: Judged) -> list[CandidateRow]:
+    rows: dict[str, CandidateRow] = {}
     for step in one.found.steps:
         for ranked in (step.chosen, *step.rivals):
             delta = bic(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, int(ranked.count))
             p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, 180)
             rows.setdefault(
-                ranked.last.effect, Candidate(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
+                ranked.last.effect, CandidateRow(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
             )
     for effect, gain in one.found.screened.items():
-        rows.setdefault(effect, Candidate(one.record.element, effect, gain, chance(gain, 2, 180)))
+        rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, 180)))
     return list(rows.values())[:20]
 
 

@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from sprung.model.laws.along import bouc_wen_memory
-from sprung.model.laws.hysteresis import GAMMA
+from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray
 
 

@@ -45,8 +45,8 @@ def _baseline(system: System, signals: Signals, declared: Noise, split: int) -> 
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, rated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise)
-    n = 2 * system.mechanics.n
-    start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(n))
+    start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
+    start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):
         # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))

@@ -26,12 +26,12 @@ from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
-from sprung.model.diagnosis.screening.score import Hit
+from sprung.model.diagnosis.screening.families import INPUT
+from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.laws import ElementLaw
-from sprung.model.laws.basis import UNKNOWN
 from sprung.model.system import System
 
 # a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
@@ -118,8 +118,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     """Find, fit and accept one more finding; None when the rest is noise."""
     options = state.options
 
-    def new(hits: Iterable[Hit]) -> list[Hit]:
-        return [h for h in hits if h.family != "input" and not _repeats(state, h)]
+    def new(hits: Iterable[Candidate]) -> list[Candidate]:
+        return [h for h in hits if h.family is not INPUT and not _repeats(state, h)]
 
     hits = new(shortlist(state.last, options.alpha, options.multiplicity))
     if not hits:
@@ -127,17 +127,17 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
     trials = preferred([t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)])
-    trials.sort(key=lambda t: t.hit.family != "force")  # faults of the inputs first, of forces as of motions
+    trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
     if not trials:
         return None
     chosen = trials[0]
     if options.held_out and not state.held.still and state.held.compare(state.fit, chosen.fit).refuted:
         return None
-    tests = state.last.tests[chosen.hit.family] * len(state.last.tests) if options.multiplicity else 1
+    tests = state.last.tried(chosen.hit.family) if options.multiplicity else 1
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.alpha:
         return None
-    second = runner_up(state.problem, state.fit, new(state.last.hits), chosen, tried)
+    second = runner_up(state.problem, state.fit, new(state.last.candidates), chosen, tried)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
@@ -171,12 +171,12 @@ def _smoother(state: Investigation, fit: Fit) -> Fit:
     return surface if state.held.compare(fit, surface).gain > 0 else fit
 
 
-def _repeats(state: Investigation, hit: Hit) -> bool:
+def _repeats(state: Investigation, hit: Candidate) -> bool:
     """The same law at the same place, or physics at a place that is unknown already."""
     for term in state.fit.point.terms:
         if hit.term.key[:2] == term.key[:2]:
             return True
-        if hit.location == term.location and term.law.name == UNKNOWN:
+        if hit.location == term.location and not term.law.named:
             return True
     return False
 

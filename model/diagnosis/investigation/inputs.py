@@ -12,7 +12,8 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.course import InputFault, Nominal
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.score import Hit, Screening
+from sprung.model.diagnosis.screening.families import INPUT
+from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.system import System
@@ -30,20 +31,20 @@ def nominal(
     return Nominal(signals, problem, fit, screen(problem, fit, laws, project))
 
 
-def best_input_fault(screening: Screening, alpha: float) -> Hit | None:
+def best_input_fault(screening: Screening, alpha: float) -> Candidate | None:
     """The input fault that leads the screening, if one does."""
-    good = [h for h in screening.hits if screening.p_value(h) <= alpha]
+    good = [h for h in screening.candidates if screening.p_value(h) <= alpha]
     if not good:
         return None
     top = max(good, key=lambda h: h.score)
-    return top if top.family == "input" else None
+    return top if top.family is INPUT else None
 
 
 def compensate(
-    system: System, present: Nominal, hit: Hit, declared: Noise, project: bool
+    system: System, present: Nominal, hit: Candidate, declared: Noise, project: bool
 ) -> tuple[InputFault, Signals]:
     """The leading input fault, chosen among its rivals and estimated, and the signals without it."""
-    rivals = [h for h in present.screening.hits if h.family == "input" and h.term.key != hit.term.key]
+    rivals = [h for h in present.screening.candidates if h.family is INPUT and h.term.key != hit.term.key]
     rivals.sort(key=lambda h: -h.score)
     candidates = [hit, *[h for h in rivals if h.score > _RIVAL * hit.score][:_RIVALS]]
     tried = [_estimated(system, present, candidate.term, declared, project) for candidate in candidates]
@@ -60,21 +61,22 @@ def _estimated(
     Chi-square of sensors and redundant inputs without the fault, the fault, and its standard deviation.
     """
     value, std = term.parameters[0], 0.0
-    neutral = 1.0 if term.law.name == "sensor_gain" else 0.0
+    law = term.law
+    assert isinstance(law, SensorLaw)
     for _ in range(_ROUNDS):
         signals = compensated(present.signals, term.at(np.array([value])))
-        rest = nominal(system, signals, declared, present.split, (term.law,), project)
-        again = _of_key(rest.screening.hits, term)
+        rest = nominal(system, signals, declared, present.split, (law,), project)
+        again = _of_key(rest.screening.candidates, term)
         if again is None or again.score < _DONE:
             break
         change = again.term.parameters[0]
-        std = abs(change - neutral) / max(np.sqrt(again.score), 1e-12)
-        value = value * change if neutral else value + change
+        std = abs(change - law.absent[0]) / max(np.sqrt(again.score), 1e-12)
+        value = law.combined(value, change)
     total = rest.fit.chi_square + _redundant(present.problem.noise, rest.problem)
     return total, term.at(np.array([value])), float(std)
 
 
-def _of_key(hits: Iterable[Hit], term: Term) -> Hit | None:
+def _of_key(hits: Iterable[Candidate], term: Term) -> Candidate | None:
     return next((h for h in hits if h.term.key == term.key), None)
 
 
@@ -90,7 +92,7 @@ def _redundant(noise: Noise, problem: Problem) -> float:
 
 def compensated(signals: Signals, term: Term) -> Signals:
     """Signals with the fault of an input channel taken out."""
-    assert isinstance(term.law, SensorLaw) and term.law.restore is not None
+    assert isinstance(term.law, SensorLaw)
     if term.location in signals.force_names:
         force = signals.force.copy()
         i = signals.force_names.index(term.location)

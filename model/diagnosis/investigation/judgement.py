@@ -11,6 +11,7 @@ from sprung.model.diagnosis.investigation.course import Investigation, Judgement
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.verdict import RULES, Errors, bounded_noise, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.signals import FloatArray
 
@@ -39,7 +40,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     effects += [found.trial.term.law.name for found in state.found]
     verdict = verdict_of(effects, deciding)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
-    carried = verdict != "unknown_physics" or not state.found or state.found[0].trial.term.law.name == "unknown"
+    carried = verdict != "unknown_physics" or not state.found or not state.found[0].trial.named
     return Judgement(
         errors=errors,
         verdict=verdict,
@@ -89,7 +90,7 @@ def _unmeasured(state: Investigation, fit: Fit, force: FloatArray) -> float:
 
 def _place(state: Investigation) -> str:
     """Where the screening sees most of what is left."""
-    here = [hit for hit in state.last.hits if hit.family in ("law", "unnamed")] or list(state.last.hits)
+    here = [hit for hit in state.last.candidates if hit.family in (ELEMENT, UNNAMED)] or list(state.last.candidates)
     return max(here, key=lambda hit: hit.score).location if here else next(iter(state.system.elements), "")
 
 

@@ -17,11 +17,12 @@ from typing import Literal
 
 import numpy as np
 
+from sprung.model.laws import CATALOGUE
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
 SENSOR_FAULTS = frozenset(
-    {"sensor_gain", "sensor_lag", "sensor_bias", "sensor_noise", "sensor_stuck", "axle_delay"}
+    {law.name for law in CATALOGUE if law.fault}
     | {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position"}
 )
 NO_FAULTS = frozenset({"preload"})  # nuisances: reported, and no reason for any verdict

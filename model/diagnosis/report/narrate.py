@@ -17,7 +17,7 @@ from sprung.model.diagnosis.investigation.course import (
 )
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
 from sprung.model.diagnosis.report.report import (
-    Candidate,
+    CandidateRow,
     Finding,
     FitFigures,
     IdentifiedLaw,
@@ -87,7 +87,7 @@ def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     count = course.given + (len(course.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        if term.law.name != UNKNOWN:
+        if term.law.named:
             found.append(IdentifiedLaw(term.location, term.law.name, _law_parameters(fit, index)[0], term.variant))
     for fault in course.input_faults:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
@@ -135,7 +135,7 @@ def _findings(outcome: Outcome) -> list[Finding]:
 def _unknown_finding(outcome: Outcome) -> Finding:
     """What is left above the noise, at the place where it is seen best, without a name."""
     course, said = outcome.investigation, outcome.judgement
-    here = [hit for hit in course.last.hits if hit.location == said.place]
+    here = [hit for hit in course.last.candidates if hit.location == said.place]
     best = max(here, key=lambda hit: hit.score, default=None)
     tried = ""
     if course.found:
@@ -206,7 +206,7 @@ def _deviations(system: System, fit: Fit) -> FloatArray:
     """
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
     for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
-        if term.law.name != UNKNOWN or fit.forces is None:
+        if term.law.named or fit.forces is None:
             continue
         d, v = fit.forces.deflection[:, i], fit.forces.rate[:, i]
         force = np.std(fit.forces.force[:, i] + term.preload[0] * d + term.preload[1] * v)
@@ -231,7 +231,7 @@ def _law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], Flo
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
     sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
-    hidden = term.law.name == UNKNOWN
+    hidden = not term.law.named
     parameters = tuple(
         LawParameter(spec.name, float(value), float(s), spec.unit)
         for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
@@ -413,19 +413,19 @@ def _changes(outcome: Outcome) -> tuple[str, ...]:
     return tuple(words)
 
 
-def _candidates(course: Investigation) -> tuple[Candidate, ...]:
-    rows: dict[tuple[str, str], Candidate] = {}
+def _candidates(course: Investigation) -> tuple[CandidateRow, ...]:
+    rows: dict[tuple[str, str], CandidateRow] = {}
     for found in course.found:
         for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:
             key = (trial.term.location, trial.term.law.name)
             if key not in rows:
                 p = course.first.p_value(trial.hit)
-                rows[key] = Candidate(*key, trial.hit.score, p, trial.delta_bic())
-    for hit in course.first.hits:
+                rows[key] = CandidateRow(*key, trial.hit.score, p, trial.delta_bic())
+    for hit in course.first.candidates:
         if len(rows) >= 20:
             break
         rows.setdefault(
-            (hit.location, hit.effect), Candidate(hit.location, hit.effect, hit.score, course.first.p_value(hit))
+            (hit.location, hit.effect), CandidateRow(hit.location, hit.effect, hit.score, course.first.p_value(hit))
         )
     fitted = [c for c in rows.values() if c.delta_bic is not None]
     screened = [c for c in rows.values() if c.delta_bic is None]

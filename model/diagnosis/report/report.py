@@ -93,7 +93,7 @@ class FitFigures:
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class CandidateRow:
     """One row of the evidence table: a law at a place, as it was tried."""
 
     location: str
@@ -198,7 +198,7 @@ class Report:
     augmented_validation: FitFigures
     noise_floor: FitFigures
     localization: Mapping[str, float]  # location -> best score
-    candidates: tuple[Candidate, ...] = ()
+    candidates: tuple[CandidateRow, ...] = ()
     changes: tuple[str, ...] = ()  # parameters that left their nominal value, in words
     explained: float | None = None  # share of the excess error that the findings explain, held-out part
     unexplained: Unexplained = Unexplained()

@@ -18,12 +18,10 @@ from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
-from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SpringDamper, SupportLaw
+from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, SupportLaw
 from sprung.model.mechanics import VELOCITY
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-DELAY, BOTH = "delay", "lag and delay"  # variants of a sensor's lag, which is else of first order
 
 
 def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
@@ -136,12 +134,10 @@ class Forward:
         count = self.part.force.shape[1]
         gain, offset = np.ones(count), np.zeros(count)
         for term in self.terms:
-            i = self.faulty_force(term)
-            if i is not None:
-                if term.law.name == "sensor_gain":
-                    gain[i] *= term.parameters[0]
-                elif term.law.name == "sensor_bias":
-                    offset[i] += term.parameters[0]
+            i, response = self.faulty_force(term), response_of(term)
+            if i is not None and response is not None:
+                gain[i] *= response.gain
+                offset[i] += response.offset
         return gain, offset
 
     def faulty_force(self, term: Term) -> int | None:
@@ -150,15 +146,13 @@ class Forward:
         return names.index(term.location) if isinstance(term.law, SensorLaw) and term.location in names else None
 
     def fault_load(self, term: Term) -> ComplexArray:
-        """Load on the degrees of freedom per rise of a measured force's gain or offset, (F, n)."""
-        i = self.faulty_force(term)
-        assert i is not None
-        gain = self.force_faults[0][i]
-        if term.law.name == "sensor_gain":
-            change = -(self.force + self.part.grid.monomial_spectra @ self.force_polynomial)[:, i] / gain
-        else:
-            change = np.zeros(len(self.part.grid.omega), dtype=complex)
-            change[0] = -np.sqrt(self.part.grid.samples) / gain
+        """Load on the degrees of freedom per rise of the first parameter of a measured force's fault, (F, n)."""
+        i, law = self.faulty_force(term), term.law
+        if i is None or not isinstance(law, SensorLaw):
+            raise TypeError(f"{law.name} at {term.location} is no fault of a measured force")
+        gain, slope = self.force_faults[0][i], law.slope()
+        change = -slope.gain * (self.force + self.part.grid.monomial_spectra @ self.force_polynomial)[:, i] / gain
+        change[0] -= slope.offset * np.sqrt(self.part.grid.samples) / gain
         return change[:, None] * self.plant.structure.F[:, i]
 
     @property
@@ -199,20 +193,17 @@ class Forward:
     @cached_property
     def faults(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Gain, time constant of a lag (s), pure delay (s) and offset of every present sensor, each (S,)."""
-        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in (1.0, 0.0, 0.0, 0.0))
+        gain, lag, delay, offset = (np.full(len(self.sensors), value) for value in SensorResponse())
         names = [self.system.sensors[i] for i in self.sensors]
         for term in self.terms:
-            if not isinstance(term.law, SensorLaw) or term.location not in names:
+            response = response_of(term)
+            if response is None or term.location not in names:
                 continue
             i = names.index(term.location)
-            if term.law.name == "sensor_gain":
-                gain[i] *= term.parameters[0]
-            elif term.law.name == "sensor_lag":
-                (delay if term.variant == DELAY else lag)[i] += term.parameters[0]
-                if term.variant == BOTH:
-                    delay[i] += term.parameters[1]
-            elif term.law.name == "sensor_bias":
-                offset[i] += term.parameters[0]
+            gain[i] *= response.gain
+            lag[i] += response.lag
+            delay[i] += response.delay
+            offset[i] += response.offset
         return gain, lag, delay, offset
 
     @cached_property
@@ -297,6 +288,14 @@ class Forward:
         other = replace(self, part=part, start_force=start_force)
         other.__dict__["plant"] = self.plant
         return other
+
+
+def response_of(term: Term) -> SensorResponse | None:
+    """What a faulty channel shows of the truth; None for other laws."""
+    law = term.law
+    if not isinstance(law, SensorLaw) or law.response is None:
+        return None
+    return law.response(term.parameters)
 
 
 def _loads(term: Term) -> bool:

@@ -107,17 +107,15 @@ def supports(system: System) -> list[str]:
 
 def branch_of(term: Term, element: int, damping: float) -> Branch | None:
     """The branch that a law with linear memory puts beside an element; None: the law is not linear."""
-    if term.law.name == "series_stiffness":
-        return Branch(element, term.parameters[0], damping / term.parameters[0], damping)
-    if term.law.name == "air_spring":
-        stiffness, time = term.parameters
-        return Branch(element, stiffness, time, 0.0)
-    return None
+    law = term.law
+    if not isinstance(law, ElementLaw) or law.branch is None:
+        return None
+    return Branch(element, *law.branch(term.parameters, damping))
 
 
 def is_waveform(term: Term) -> bool:
     """Whether the law's force is found along the trajectory, in the loop."""
-    return isinstance(term.law, ElementLaw) and term.law.name not in ("series_stiffness", "air_spring")
+    return isinstance(term.law, ElementLaw) and term.law.branch is None
 
 
 def split(terms: tuple[Term, ...]) -> tuple[list[Term], list[Term], list[Term], list[Term]]:

@@ -9,30 +9,31 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from scipy import stats
 from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.screening.score import Hit, Projector, ScalarResponse
+from sprung.model.diagnosis.screening.families import LINE, MASS, MODE
+from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
 
 _RATIOS = (0.01, 0.03)  # damping ratios of trial modes
 _LOWEST = 1.0  # Hz, of trial modes
+_COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
 _HIGHEST = 0.4  # of the sample rate
 
 
-def body_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best trial of every body law at every body, and how many were tried."""
     system = projector.problem.system
     for law in laws:
         if not isinstance(law, BodyLaw):
             continue
         for index, name in enumerate(system.bodies):
-            if law.name == "mass_change":
-                if f"{name}.mass" not in {p.name for p in system.parameters}:
+            if law.scales:
+                if f"{name}.{law.scales}" not in {p.name for p in system.parameters}:
                     yield _mass(projector, law, index, name), 1
             elif law.load is not None:
                 yield _line(projector, law, index, name)
@@ -40,7 +41,7 @@ def body_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit
                 yield from _modes(projector, law, index, name)
 
 
-def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Hit:
+def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Candidate:
     fit, grid = projector.fit, projector.grid
     structure = fit.forward.plant.structure
     dofs = structure.body_of_dof == index
@@ -50,10 +51,10 @@ def _mass(projector: Projector, law: BodyLaw, index: int, name: str) -> Hit:
     score, amplitude = projector.score(column, (spread, 0.0))
     ratio = float(np.clip(1 + amplitude, 0.2, 5.0))
     term = Term(law, name, (ratio,), variant="", scales=(0.1,))
-    return Hit(term, score, 1, "mass", float(stats.chi2.sf(score, 1)))
+    return Candidate(term, score, MASS)
 
 
-def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Hit, int]]:
+def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterator[tuple[Candidate, int]]:
     """Elastic modes of a body, per shape: first order in the participation."""
     fit, grid = projector.fit, projector.grid
     system = projector.problem.system
@@ -85,7 +86,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
         amplitude = amplitudes[i]
         values = (float(frequencies[i]), float(ratios[i]), float(min(max(amplitude, 1e-9), 5.0)))
         term = Term(law, name, values, variant, scales=(1.0, 1.0, max(float(amplitude), 1e-6)))
-        yield Hit(term, float(score[i]), 1, "mode", float(stats.chi2.sf(score[i], 1))), len(frequencies)
+        yield Candidate(term, float(score[i]), MODE), len(frequencies)
 
 
 def _mode_grid(sample_rate: float) -> tuple[FloatArray, FloatArray]:
@@ -98,7 +99,7 @@ def _mode_grid(sample_rate: float) -> tuple[FloatArray, FloatArray]:
     return np.concatenate(frequencies), np.concatenate(ratios)
 
 
-def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Hit, int]:
+def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Candidate, int]:
     """The strongest line of a force on one degree of freedom of a body.
 
     At a bin's frequency a sine fills that bin; half way between two it fills both, in opposite phase.  Scores are
@@ -126,7 +127,7 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Hi
             best = (float(scores[i]), i / 2, variant)
     score, bin_number, variant = best
     if not variant:
-        return Hit(Term(law, name, law.absent), 0.0, 2, "line", 1.0), count
+        return Candidate(Term(law, name, law.absent), 0.0, LINE), count
     return _refined_line(projector, law, name, variant, bin_number, score), count
 
 
@@ -134,7 +135,9 @@ def _local_median(scores: FloatArray, reach: int = 24) -> FloatArray:
     return median_filter(scores, size=2 * reach + 1, mode="nearest")
 
 
-def _refined_line(projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float) -> Hit:
+def _refined_line(
+    projector: Projector, law: BodyLaw, name: str, variant: str, bin_number: float, rough: float
+) -> Candidate:
     """Frequency, amplitude and phase of a line by exact columns near the bin."""
     grid = projector.grid
     dof = projector.problem.system.mechanics.dofs.index(f"{name}.{variant}")
@@ -154,4 +157,4 @@ def _refined_line(projector: Projector, law: BodyLaw, name: str, variant: str, b
     amplitude = float(np.hypot(sine, cosine))
     values = (amplitude, float(frequency), float(np.arctan2(cosine, sine)))
     term = Term(law, name, values, variant, scales=(max(amplitude, 1e-9), 1.0, 1.0))
-    return Hit(term, min(score, rough * 2.5), 2, "line", float(stats.chi2.sf(min(score, rough * 2.5), 2)))
+    return Candidate(term, min(score, _COLOUR * rough), LINE)

@@ -6,20 +6,20 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.terms import WIDER, Term, branch_of, is_waveform
+from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.screening.places import places
-from sprung.model.diagnosis.screening.score import Hit, Projector, ScalarResponse
+from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
 from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import static_law, trials
 from sprung.model.signals import FloatArray
 
 
-def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best shape of every element law at every element or pair, and how many shapes were tried."""
     system = projector.problem.system
     d_all, v_all = projector.fit.element_motion
@@ -33,7 +33,7 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
             port = absent.port(system)
             channels[location] = ScalarResponse(projector, projector.of_force[:, :, : len(port)] @ port)
 
-    def best(absent: Term) -> tuple[Hit, int]:
+    def best(absent: Term) -> tuple[Candidate, int]:
         return _best_shape(projector, absent, d_all, v_all, channels[absent.location])
 
     yield from share(best, candidates, WORKERS)
@@ -44,7 +44,7 @@ def element_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[
 
 def _best_shape(
     projector: Projector, nothing: Term, d_all: FloatArray, v_all: FloatArray, channel: ScalarResponse
-) -> tuple[Hit, int]:
+) -> tuple[Candidate, int]:
     grid, law = projector.grid, nothing.element_law
     port = nothing.port(projector.problem.system)
     d, v = d_all @ port, v_all @ port
@@ -52,7 +52,7 @@ def _best_shape(
     scales = tuple(max(abs(q.typical(seen)), 1e-12) for q in law.parameters)
     trials = law.shapes(seen)
     nothing = replace(nothing, scales=scales)
-    absent = Hit(nothing, 0.0, 1, "law", 1.0)
+    absent = Candidate(nothing, 0.0, ELEMENT)
     if not len(trials):
         return absent, 0
     terms = [nothing.at(trial) for trial in trials]
@@ -70,24 +70,23 @@ def _best_shape(
     if law.strength is not None and found[law.strength] != law.absent[law.strength]:
         absent_value = law.absent[law.strength]
         beyond = max(1.0, (asked[law.strength] - absent_value) / (found[law.strength] - absent_value))
-    return Hit(term, float(scores[i]), 1, "law", float(stats.chi2.sf(scores[i], 1)), float(beyond)), len(trials)
+    return Candidate(term, float(scores[i]), ELEMENT, float(beyond)), len(trials)
 
 
 def _unnamed(
     projector: Projector, location: str, d: FloatArray, v: FloatArray, channel: ScalarResponse
-) -> Iterator[tuple[Hit, int]]:
+) -> Iterator[tuple[Candidate, int]]:
     """Static forces without a name at one element."""
     grid = projector.grid
     seen, _ = _seen(projector, location, d, v)
     for name, basis in trials().items():
         law = static_law(basis, seen)
-        count = len(law.parameters)
         scales = tuple(q.typical(seen) for q in law.parameters)
         values = np.column_stack(law.values(d, v))
         spectra = grid.coarse_spectrum(values)[grid.band].T
         score, amplitudes = channel.joint(spectra)
         term = Term(law, location, tuple(float(a) for a in amplitudes), name, scales=scales)
-        yield Hit(term, score, count, "unnamed", float(stats.chi2.sf(score, count))), 1
+        yield Candidate(term, score, UNNAMED), 1
 
 
 def _seen(projector: Projector, location: str, d: FloatArray, v: FloatArray) -> tuple[Observed, SpringDamper]:

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 
 import numpy as np
 import scipy.fft
-from scipy import stats
 from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.screening.families import HARMONIC
 from sprung.model.diagnosis.screening.places import wheelsets
-from sprung.model.diagnosis.screening.score import Hit, Projector, ScalarResponse
+from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, Law, SupportLaw
 from sprung.model.signals import FloatArray
 
@@ -30,7 +30,7 @@ _MEDIAN = 1.386  # of chi-square with two degrees of freedom
 _COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
 
 
-def harmonic_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
+def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best movement of every such law at every support or axle, and how many were tried."""
     system = projector.problem.system
     for law in laws:
@@ -39,8 +39,8 @@ def harmonic_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple
                 yield _best(projector, law, location)
 
 
-def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, int]:
-    absent = Hit(Term(law, location, law.absent), 0.0, 1, "comb", 1.0)
+def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Candidate, int]:
+    absent = Candidate(Term(law, location, law.absent), 0.0, HARMONIC)
     names = supports(projector.problem.system)
     at = [names.index(name) for name in location.split("|")]
     channel = ScalarResponse(projector, projector.of_support[:, :, at].sum(axis=2))
@@ -55,7 +55,7 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Hit, in
     values, exact = _refined(projector.grid, law, channel, float(fundamentals[i]), best[i] / _PHASES)
     score = min(exact, _COLOUR * float(scores[i]))
     term = Term(law, location, values, scales=(max(values[0], 1e-9), 1.0, 0.1))
-    return Hit(term, score, 1, "comb", float(stats.chi2.sf(score, 1))), tests
+    return Candidate(term, score, HARMONIC), tests
 
 
 def _products(grid: Grid, law: SupportLaw, channel: ScalarResponse) -> tuple[FloatArray, FloatArray, FloatArray]:

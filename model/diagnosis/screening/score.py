@@ -12,25 +12,39 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy import stats
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.families import Family
 from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
-class Hit:
-    """One candidate as screened."""
+class Candidate:
+    """A law at a place, as screened."""
 
     term: Term  # with the amplitude that the screening found
     score: float  # chi-square
-    freedom: int
-    family: str  # which group of tests it belongs to: "law", "comb", "mode", "line", "mass", "sensor", "input"
-    p_single: float
+    family: Family
     beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
-    step: FloatArray | None = None  # what the fit's parameters and state would move by, (P + p + 2n,)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of the score."""
+        return len(self.term.parameters) if self.family.freedom is None else self.family.freedom
+
+    @property
+    def p_single(self) -> float:
+        """Chance of such a score if this alone had been tried."""
+        return float(stats.chi2.sf(self.score, self.freedom))
+
+    @property
+    def strength(self) -> float:
+        """Score less what chance gives: comparable between families."""
+        return self.score - 2.0 * (self.freedom - 1) - self.family.look_elsewhere
 
     @property
     def location(self) -> str:
@@ -45,17 +59,21 @@ class Hit:
 class Screening:
     """All candidates, best first, with p-values corrected for everything that was tried."""
 
-    hits: tuple[Hit, ...]  # the best shape of every law at every place
-    tests: dict[str, int]  # how many were tried per family
+    candidates: tuple[Candidate, ...]  # the best shape of every law at every place
+    tests: dict[Family, int]  # how many were tried
 
-    def p_value(self, hit: Hit) -> float:
-        """Bonferroni over the family, then over the families."""
-        return float(min(1.0, hit.p_single * self.tests[hit.family] * len(self.tests)))
+    def tried(self, family: Family) -> int:
+        """Bonferroni's number: tests of the family, times the families."""
+        return self.tests[family] * len(self.tests)
+
+    def p_value(self, candidate: Candidate) -> float:
+        """Corrected for everything that was tried."""
+        return float(min(1.0, candidate.p_single * self.tried(candidate.family)))
 
     def localization(self) -> dict[str, float]:
         best: dict[str, float] = {}
-        for hit in self.hits:
-            best[hit.location] = max(best.get(hit.location, 0.0), hit.score)
+        for one in self.candidates:
+            best[one.location] = max(best.get(one.location, 0.0), one.score)
         return dict(sorted(best.items(), key=lambda item: -item[1]))
 
 

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.screening.bodies import body_hits
-from sprung.model.diagnosis.screening.elements import element_hits
-from sprung.model.diagnosis.screening.harmonics import harmonic_hits
-from sprung.model.diagnosis.screening.score import Hit, Projector, Screening
-from sprung.model.diagnosis.screening.sensors import measurement_hits
+from sprung.model.diagnosis.screening.bodies import body_candidates
+from sprung.model.diagnosis.screening.elements import element_candidates
+from sprung.model.diagnosis.screening.families import ELEMENT, Family
+from sprung.model.diagnosis.screening.harmonics import harmonic_candidates
+from sprung.model.diagnosis.screening.score import Candidate, Projector, Screening
+from sprung.model.diagnosis.screening.sensors import measurement_candidates
 from sprung.model.laws import Law
 
-GROUPS = (element_hits, harmonic_hits, body_hits, measurement_hits)
+GROUPS = (element_candidates, harmonic_candidates, body_candidates, measurement_candidates)
 
 
 def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True) -> Screening:
     """Score every candidate on the residual of a fit, by the smallest chance of such a score first."""
     projector = Projector(problem, fit, project)
-    hits: list[Hit] = []
-    tests: dict[str, int] = {}
+    found: list[Candidate] = []
+    tests: dict[Family, int] = {}
     for group in GROUPS:
-        for hit, count in group(projector, laws):
-            tests[hit.family] = tests.get(hit.family, 0) + count
-            if hit.score > 0:
-                hits.append(hit)
-    hits.sort(key=lambda h: (h.p_single, -h.score))
-    return Screening(tuple(hits), tests or {"law": 1})
+        for candidate, count in group(projector, laws):
+            tests[candidate.family] = tests.get(candidate.family, 0) + count
+            if candidate.score > 0:
+                found.append(candidate)
+    found.sort(key=lambda one: (one.p_single, -one.score))
+    return Screening(tuple(found), tests or {ELEMENT: 1})

@@ -2,35 +2,59 @@
 
 A wrong sensor is wrong alone: its residual is a copy (gain), a derivative (lag) or a constant (bias), while the
 other sensors on the same rigid body and the bodies that it would act on contradict it; the projection and the joint
-whitening of `Projector` do that weighing.  Input channels have a witness of their own, the second measurement of the
-same support (`measured`).
+whitening of `Projector` do that weighing.  Input channels have a redundant measurement, the second one of the same
+support (`record.signals`).
+
+To first order a channel shows, beside the truth y, dp times  (dG - s (d lag + d delay)) y + d offset, with the
+derivatives of the law's response by its parameter p.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from sprung.model.diagnosis.record.spectra import ComplexArray
-from sprung.model.diagnosis.response.forward import BOTH, DELAY
 from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.screening.families import FORCE, INPUT, SENSOR, Family
 from sprung.model.diagnosis.screening.places import wheelsets
-from sprung.model.diagnosis.screening.score import Hit, Projector
-from sprung.model.laws import Law, ParameterSpec, SensorLaw
+from sprung.model.diagnosis.screening.score import Candidate, Projector
+from sprung.model.laws import Law, SensorLaw, SensorResponse
+from sprung.model.laws.base import Channels
 from sprung.model.signals import FloatArray
 
 
-def measurement_hits(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Hit, int]]:
-    """Gain, lag and bias of every sensor and input channel."""
-    by_name = {law.name: law for law in laws if isinstance(law, SensorLaw)}
-    yield from _sensor_hits(projector, by_name)
-    yield from _input_hits(projector, by_name)
+def measurement_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
+    """Every fault of a measurement at every sensor and input channel that may have it."""
+    faults = [law for law in laws if isinstance(law, SensorLaw) and law.response is not None]
+
+    def at(channel: Channels) -> list[SensorLaw]:
+        return [law for law in faults if channel in law.at]
+
+    yield from _of_sensors(projector, at("sensor"))
+    yield from _of_supports(projector, at("support"))
+    for law in faults:
+        if law.where == "axle":
+            yield from _of_axles(projector, law)
+    yield from _of_forces(projector, at("force"))
 
 
-def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
+def _candidate(
+    projector: Projector, law: SensorLaw, place: str, score: float, amplitude: float, family: Family, variant: str = ""
+) -> Candidate:
+    """A fault whose first parameter leaves its neutral value by an amplitude."""
+    scale = law.scale(projector.grid.step, amplitude)
+    values = (law.absent[0] + amplitude, *law.absent[1:])
+    return Candidate(Term(law, place, values, variant, scales=(scale,) * len(values)), score, family)
+
+
+def _factor(slope: SensorResponse, jw: ComplexArray) -> ComplexArray:
+    """Change of what is shown per truth, (F,)."""
+    return slope.gain - jw * (slope.lag + slope.delay)
+
+
+def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
     problem, fit, grid = projector.problem, projector.fit, projector.grid
     band = grid.band
     truth = problem.shown_of_smoothed(fit.forward, fit.spectrum)[band]
@@ -40,36 +64,21 @@ def _sensor_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[t
     own = np.eye(len(problem.sensors))[:, None, :, None] * fit.forward.of_inputs[band]  # of one sensor each
     for i, index in enumerate(problem.sensors):
         name = problem.system.sensors[index]
-        for effect, signal in (
-            ("sensor_gain", truth[:, i]),
-            ("sensor_lag", -jw * truth[:, i]),
-            ("sensor_bias", constant),
-        ):
-            if effect not in laws or (effect == "sensor_bias" and problem.part.rated[i]):
+        for law in laws:
+            slope = law.slope()
+            factor = _factor(slope, jw)
+            if problem.part.rated[i] and not np.any(factor):
                 continue  # a position that is compared by its rate shows no bias
+            signal = factor * truth[:, i] + slope.offset * constant
             column = projector.pack(projector.factor[:, :, i] * signal[:, None])
-            copied = {"sensor_gain": 1.0, "sensor_lag": -jw[:, None, None]}.get(effect, 0.0)
-            score, amplitude = projector.score(column, (projector.spread(column, own[i] * copied), 0.0))
-            start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
-            scale = {"sensor_gain": 0.1, "sensor_lag": 0.1 * grid.step}.get(effect, max(abs(amplitude), 1e-9))
-            term = Term(laws[effect], name, (float(start),), scales=(scale,))
-            yield Hit(term, score, 1, "sensor", float(stats.chi2.sf(score, 1))), 1
-            if effect == "sensor_lag":
-                for other in (
-                    Term(laws[effect], name, (float(start),), DELAY, scales=(scale,)),
-                    Term(_with_delay(laws[effect]), name, (float(start), 0.0), BOTH, scales=(scale, scale)),
-                ):
-                    yield Hit(other, 0.999 * score, 1, "sensor", float(stats.chi2.sf(0.999 * score, 1))), 1
+            determinant = projector.spread(column, own[i] * factor[:, None, None])
+            score, amplitude = projector.score(column, (determinant, 0.0))
+            for variant, form in [*law.forms.items(), ("", law)]:  # alike to first order
+                yield _candidate(projector, form, name, score, amplitude, SENSOR, variant), 1
 
 
-def _with_delay(law: SensorLaw) -> SensorLaw:
-    """A first-order lag with a transport delay besides."""
-    delay = ParameterSpec("delay", "s", -1.0, 1.0, "transport delay besides the lag", lambda seen: 0.001)
-    return replace(law, parameters=(*law.parameters, delay))
-
-
-def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
-    """Gain and lag of the channels of supports that are measured twice, and gain of forces."""
+def _of_supports(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
+    """Faults of the channels of supports that are measured twice."""
     problem, grid = projector.problem, projector.grid
     part, noise = problem.part, problem.noise
     band = grid.band
@@ -81,65 +90,50 @@ def _input_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tu
         precision_v = (omega / noise.velocity[support]) ** 2
         share_d = precision_d / (precision_d + precision_v)
         integrated = noise.velocity[support] / np.maximum(omega, omega[1])
-        spread = np.hypot(noise.displacement[support], integrated)
+        level = np.hypot(noise.displacement[support], integrated)
         periodic = part.support[band, support]
-        witness = part.redundancy[band, at]
+        shown = _pack(part.redundancy[band, at] / level, grid.weight)
         for channel, share, sign in (("displacement", share_d, -1.0), ("velocity", 1 - share_d, 1.0)):
-            for effect, signal in (("sensor_gain", periodic), ("sensor_lag", -1j * omega * periodic)):
-                if effect not in laws:
-                    continue
+            for law in laws:
+                signal = _factor(law.slope(), 1j * omega) * periodic
                 column = projector.pack(-G[:, :, support] * (share * signal)[:, None])
-                beside = _pack(sign * signal / spread, grid.weight)
-                shown = _pack(witness / spread, grid.weight)
+                beside = _pack(sign * signal / level, grid.weight)
                 score, amplitude = projector.score(column, (float(beside @ shown), float(beside @ beside)))
-                start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
-                scale = 0.1 if effect == "sensor_gain" else 0.1 * grid.step
-                term = Term(laws[effect], f"{names[support]}.{channel}", (float(start),), scales=(scale,))
-                yield Hit(term, score, 1, "input", float(stats.chi2.sf(score, 1))), 1
-    if "axle_delay" in laws:
-        yield from _axle_hits(projector, laws["axle_delay"])
-    yield from _force_hits(projector, laws)
+                yield _candidate(projector, law, f"{names[support]}.{channel}", score, amplitude, INPUT), 1
 
 
-def _axle_hits(projector: Projector, law: SensorLaw) -> Iterator[tuple[Hit, int]]:
-    """Both wheels of an axle late together, all that is measured of them: no witness but the vehicle."""
+def _of_axles(projector: Projector, law: SensorLaw) -> Iterator[tuple[Candidate, int]]:
+    """Both wheels of an axle wrong together, all that is measured of them: nothing redundant but the vehicle."""
     part, grid = projector.problem.part, projector.grid
     system = projector.problem.system
     names = supports(system)
+    factor = _factor(law.slope(), 1j * grid.omega[grid.band])
     for location in wheelsets(system):
         at = [names.index(wheel) for wheel in location.split("|")]
-        late = 1j * grid.omega[grid.band, None] * part.support[grid.band][:, at]
-        score, amplitude = projector.score(
-            projector.pack(np.einsum("fsa,fa->fs", projector.of_support[:, :, at], late))
-        )
-        term = Term(law, location, (float(amplitude),), scales=(0.1 * grid.step,))
-        yield Hit(term, score, 1, "input", float(stats.chi2.sf(score, 1))), 1
+        moved = -factor[:, None] * part.support[grid.band][:, at]
+        column = projector.pack(np.einsum("fsa,fa->fs", projector.of_support[:, :, at], moved))
+        yield _candidate(projector, law, location, *projector.score(column), INPUT), 1
 
 
-def _force_hits(projector: Projector, laws: dict[str, SensorLaw]) -> Iterator[tuple[Hit, int]]:
-    """Gain and offset of measured forces."""
+def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Candidate, int]]:
+    """Faults of measured forces: the true force is the measured one less what the fault adds."""
     problem, fit, grid = projector.problem, projector.fit, projector.grid
     part, band = problem.part, grid.band
     names = [n for n, s in problem.system.file.inputs.items() if s.kind == "force"]
     plant = fit.forward.plant
     for i, name in enumerate(names):
         direction = plant.structure.F[:, i]
-        response = projector.of_load @ direction
-        effects = []
-        if "sensor_gain" in laws:
-            effects.append(("sensor_gain", projector.pack(-response * part.force[band, i, None])))
-        if "sensor_bias" in laws:
-            load = np.zeros((part.force_polynomial.shape[0], len(direction)))
-            load[0] = -direction  # the true force is the measured one less the offset
-            q = plant.polynomial_response(load)
-            shown = plant.polynomial_sensors(q, np.zeros_like(part.support_polynomial))
-            spectrum = (grid.monomial_spectra @ shown)[band] * fit.forward.sensor_factor[band]
-            effects.append(("sensor_bias", projector.pack((projector.factor @ spectrum[:, :, None])[:, :, 0])))
-        for effect, column in effects:
-            score, amplitude = projector.score(column)
-            start = 1.0 + amplitude if effect == "sensor_gain" else amplitude
-            term = Term(laws[effect], name, (float(start),), scales=(max(abs(amplitude), 1e-9),))
-            yield Hit(term, score, 1, "force", float(stats.chi2.sf(score, 1))), 1
+        load = np.zeros((part.force_polynomial.shape[0], len(direction)))
+        load[0] = -direction
+        q = plant.polynomial_response(load)
+        steady = plant.polynomial_sensors(q, np.zeros_like(part.support_polynomial))
+        spectrum = (grid.monomial_spectra @ steady)[band] * fit.forward.sensor_factor[band]
+        of_offset = (projector.factor @ spectrum[:, :, None])[:, :, 0]
+        of_gain = -(projector.of_load @ direction) * part.force[band, i, None]
+        for law in laws:
+            slope = law.slope()
+            column = projector.pack(slope.gain * of_gain + slope.offset * of_offset)
+            yield _candidate(projector, law, name, *projector.score(column), FORCE), 1
 
 
 def _pack(spectrum: ComplexArray, weight: FloatArray) -> FloatArray:

@@ -25,20 +25,16 @@ from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
-from sprung.model.diagnosis.response.forward import BOTH
 from sprung.model.diagnosis.response.point import Point, advance
-from sprung.model.diagnosis.response.terms import WIDER, Term, is_waveform
-from sprung.model.diagnosis.screening.score import Hit, Screening
-from sprung.model.laws import ElementLaw
-from sprung.model.laws.basis import SMALL, UNKNOWN
+from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.screening.score import Candidate, Screening
+from sprung.model.laws import BodyLaw, ElementLaw
+from sprung.model.laws.base import Reading, Restart
 from sprung.model.signals import FloatArray
 
 _LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
 _WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
-_UNNAMED_COST = 12.0  # an unnamed force must beat every named law by this
 _UNNAMED_RATIO = 1.3  # and explain this many times as much
-# laws that contain a commoner one, or imitate it: they must beat it by the same
-_RARE = frozenset({"air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"})
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
@@ -57,7 +53,7 @@ _CHANCE = 4.0  # standard deviations by which what is noise exceeds it
 class Trial:
     """A candidate with everything refitted around it."""
 
-    hit: Hit
+    hit: Candidate
     fit: Fit
     gain: float  # twice the log-likelihood ratio against the model without it
     worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
@@ -76,7 +72,7 @@ class Trial:
 
     @property
     def named(self) -> bool:
-        return self.term.law.name != UNKNOWN
+        return self.term.law.named
 
     def p_value(self, tests: int) -> float:
         """Chance of such a gain among so many candidates, noise levels unknown."""
@@ -88,22 +84,22 @@ class Trial:
         return -self.gain + len(self.term.parameters) * float(np.log(self.fit.count))
 
 
-def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Hit]:
+def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Candidate]:
     """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
-    good = [h for h in screening.hits if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
+    good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
         return []
-    good.sort(key=_strength, reverse=True)
-    top = _strength(good[0])
+    good.sort(key=lambda h: h.strength, reverse=True)
+    top = good[0].strength
     place = good[0].location
-    chosen: list[Hit] = []
+    chosen: list[Candidate] = []
     unnamed: dict[str, int] = {}
     for hit in good:
-        s = _strength(hit)
+        s = hit.strength
         share = _CLOSE if hit.location == place else 0.6
         if s < share * top and s < top - _NEAR:
             continue
-        if hit.family == "unnamed":
+        if not hit.term.law.named:
             unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
             if unnamed[hit.location] > 2:
                 continue
@@ -113,32 +109,25 @@ def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> 
     return chosen
 
 
-def _strength(hit: Hit) -> float:
-    """Score less what chance gives its degrees of freedom; input faults are weighed by the same measure."""
-    extra = 4.0 if hit.family == "unnamed" else 0.0
-    extra += 22.0 if hit.family in ("line", "comb") else 0.0
-    return hit.score - 2.0 * (hit.freedom - 1) - extra
-
-
 def compete(
     problem: Problem,
     base: Fit,
-    hits: list[Hit],
+    hits: list[Candidate],
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Trial]:
     """Fits of the hits around the present model, best evidence first."""
     places = sorted({hit.location for hit in hits})
     progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
 
-    def begun(chosen: list[Hit]) -> list[Trial]:
+    def begun(chosen: list[Candidate]) -> list[Trial]:
         tried = share(lambda hit: _begun(problem, base, hit), chosen, WORKERS)
         return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
         return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
 
-    trials = begun([hit for hit in hits if hit.family != "unnamed"])
-    trials += begun([hit for hit in hits if hit.family == "unnamed" and _may_lead(problem, hit, trials)])
+    trials = begun([hit for hit in hits if hit.term.law.named])
+    trials += begun([hit for hit in hits if not hit.term.law.named and _may_lead(problem, hit, trials)])
     trials = _graded(problem, base, trials)
     if not trials:
         return []
@@ -172,28 +161,28 @@ def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     return trials
 
 
-def runner_up(problem: Problem, base: Fit, hits: list[Hit], chosen: Trial, tried: list[Trial]) -> Trial | None:
+def runner_up(problem: Problem, base: Fit, hits: list[Candidate], chosen: Trial, tried: list[Trial]) -> Trial | None:
     """The best candidate with another law, at the same place before others; a hit is fitted where none was."""
     rivals = [t for t in tried if t.term.law.name != chosen.term.law.name and t.gain > 0]
     if rivals:
         return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
     fitted = {t.hit.term.key for t in tried}
     others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
-    for hit in sorted(others, key=_strength, reverse=True)[:_FURTHER]:
+    for hit in sorted(others, key=lambda h: h.strength, reverse=True)[:_FURTHER]:
         trial = _begun(problem, base, hit)
         if trial is not None and trial.gain > 0:
             return replace(trial, finished=False)
     return None
 
 
-def _begun(problem: Problem, base: Fit, hit: Hit) -> Trial | None:
+def _begun(problem: Problem, base: Fit, hit: Candidate) -> Trial | None:
     """A hit fitted far enough to see what it is worth, from the best of several starts."""
     starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
     tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
     return max(tried, key=lambda t: t.evidence, default=None)
 
 
-def _may_lead(problem: Problem, unnamed: Hit, named: list[Trial]) -> bool:
+def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
     it promises is explained.  With one law alone it stays as what that one was chosen before."""
     if problem.follows or len(named) < 2:
@@ -212,11 +201,12 @@ def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     return sorted(trials, key=lambda t: -t.evidence)
 
 
-def start_of(base: Fit, hit: Hit) -> Point:
+def start_of(base: Fit, hit: Candidate) -> Point:
     """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
     point = base.point
     state = point.state
-    if hit.family == "mode":  # one more degree of freedom, at the end of q and of q'
+    law = hit.term.law
+    if isinstance(law, BodyLaw) and law.adds_motion:  # one more degree of freedom, at the end of q and of q'
         n = (len(state) - len(base.forward.plant.structure.branches)) // 2
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
     if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
@@ -227,52 +217,40 @@ def start_of(base: Fit, hit: Hit) -> Point:
     return Point(point.theta, (*point.terms, hit.term), state, near)
 
 
-def _further_starts(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
+def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
     """Starts at other values of the element than those that were read without the law."""
-    if hit.effect == "series_stiffness":
-        return _behind_a_spring(problem, base, hit)
-    name = f"{hit.location}.damping"
-    names = [p.name for p in problem.system.parameters]
-    if hit.beyond == 1.0 or name not in names or not isinstance(hit.term.law, ElementLaw):
+    law, names = hit.term.law, [p.name for p in problem.system.parameters]
+    at = {quantity: f"{hit.location}.{quantity}" for quantity in ("stiffness", "damping")}
+    if not isinstance(law, ElementLaw) or at["damping"] not in names:
         return []
-    # A law in shares of the damper asks for more than all of it: the damper is stronger than it was read.
     start = start_of(base, hit)
-    theta = start.theta.copy()
-    theta[names.index(name)] += np.log(_STRONGER * hit.beyond)
-    term = hit.term.at(hit.term.law.scaled(hit.term.parameters, 1 / _STRONGER))
-    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
-
-
-def _behind_a_spring(problem: Problem, base: Fit, hit: Hit) -> list[Point]:
-    """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
-
-    At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's
-    mean frequency, ks and the change of the spring follow from the assumed c and from the damping that was read.
-    """
-    names = [p.name for p in problem.system.parameters]
-    damping, stiffness = (f"{hit.location}.{quantity}" for quantity in ("damping", "stiffness"))
-    if damping not in names:
+    if law.restarts is not None:
+        restarts = law.restarts(_reading(problem, base, hit.location))
+    elif hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
+        values = law.scaled(hit.term.parameters, 1 / _STRONGER)
+        restarts = (Restart(1.0, _STRONGER * hit.beyond, tuple(values)),)
+    else:
         return []
-    at = names.index(damping)
-    nominal = problem.system.parameters[at].nominal
-    element = problem.system.elements.index(hit.location)
-    deflection, rate = base.element_motion
-    frequency = float(np.std(rate[:, element]) / np.std(deflection[:, element]))
-    start = start_of(base, hit)
-    read = nominal * float(np.exp(start.theta[at]))
-    assumed = max(2.6 * read, nominal)
-    ratio = np.sqrt(assumed / read - 1)
-    theta = start.theta.copy()
-    theta[at] += np.log(assumed / read)
-    if stiffness in names:
-        k = names.index(stiffness)
-        value = problem.system.parameters[k].nominal * np.exp(theta[k])
-        theta[k] += np.log(max(1 - frequency * read * ratio / value, 0.5))
-    term = hit.term.at(np.array([frequency * assumed / ratio]))
-    return [replace(start, theta=theta, terms=(*base.point.terms, term))]
+    points = []
+    for restart in restarts:
+        theta = start.theta.copy()
+        for quantity, factor in (("stiffness", restart.stiffness), ("damping", restart.damping)):
+            if at[quantity] in names:
+                theta[names.index(at[quantity])] += np.log(factor)
+        term = hit.term.at(np.array(restart.parameters))
+        points.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
+    return points
 
 
-def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
+def _reading(problem: Problem, base: Fit, location: str) -> Reading:
+    """An element as the present model has it; its damping is estimated."""
+    element, read = problem.system.elements.index(location), base.forward.element_at(location)
+    nominal = next(p.nominal for p in problem.system.parameters if p.name == f"{location}.damping")
+    deflection, rate = (motion[:, element] for motion in base.element_motion)
+    return Reading(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
+
+
+def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
     """The term at the strength that, with everything else moving along, the base's residual asks for.
 
     The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
@@ -280,7 +258,7 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
     """
     start = start_of(base, hit)
     law = hit.term.law
-    if not isinstance(law, ElementLaw) or law.strength is None or law.name == UNKNOWN:
+    if not isinstance(law, ElementLaw) or law.strength is None or not law.named:
         return start
     hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
     faint = start_of(base, replace(hit, term=hint))
@@ -306,7 +284,7 @@ def joint_start(problem: Problem, base: Fit, hit: Hit) -> Point:
     return start
 
 
-def _try(problem: Problem, base: Fit, hit: Hit, start: Point, iterations: int) -> Trial | None:
+def _try(problem: Problem, base: Fit, hit: Candidate, start: Point, iterations: int) -> Trial | None:
     fit = try_optimise(problem, start, iterations, base.whitener)
     return None if fit is None else _judged(problem, base, hit, fit)
 
@@ -322,7 +300,7 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     return _judged(problem, base, trial.hit, fit)
 
 
-def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit, quiet: float = _QUIET) -> Trial:
+def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = _QUIET) -> Trial:
     sensors = len(problem.sensors)
     if problem.follows:  # how noisy the forces are is what candidates differ in
         gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
@@ -330,7 +308,7 @@ def _judged(problem: Problem, base: Fit, hit: Hit, fit: Fit, quiet: float = _QUI
     else:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet))
-    dear = cost(fit, len(hit.term.parameters)) + _prior_cost(hit) + _unusual(fit.point.terms[-1])
+    dear = cost(fit, len(hit.term.parameters)) + hit.term.law.prior_cost + _unusual(fit.point.terms[-1])
     freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(hit, fit, gain, worth, gain - dear, freedom)
 
@@ -379,11 +357,3 @@ def _unusual(term: Term) -> float:
         relative = max(abs(value) / scale, 1e-12)
         total += _UNUSUAL * float(np.log(max(1.0, low / relative, relative / high)))
     return total
-
-
-def _prior_cost(hit: Hit) -> float:
-    if hit.term.variant in (BOTH, WIDER) or hit.effect in _RARE:
-        return _UNNAMED_COST
-    if hit.family != "unnamed":
-        return 0.0
-    return _UNNAMED_COST + (2 * float(np.log(len(SMALL) + 8)))

@@ -1,0 +1,28 @@
+"""Groups of candidates that are screened alike: one row each, what is particular to it in the row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Family:
+    """One group of score tests.  Corrections for what was tried are made inside a family, then over the families."""
+
+    name: str
+    freedom: int | None = 1  # of the chi-square of its score; None: one per parameter of the candidate
+    # score that the best of its many trials reaches by chance, and that a candidate of it counts for less
+    look_elsewhere: float = 0.0
+    rank: int = 1  # faults of the inputs (0) come before all that is simulated from them
+
+
+ELEMENT = Family("law")
+UNNAMED = Family("unnamed", freedom=None, look_elsewhere=4.0)  # one of a few shapes of a static force
+HARMONIC = Family("comb", look_elsewhere=22.0)  # thousands of frequencies and phases: 2 log of their number
+LINE = Family("line", freedom=2, look_elsewhere=22.0)  # alike
+MODE = Family("mode")
+MASS = Family("mass")
+SENSOR = Family("sensor")
+INPUT = Family("input", rank=0)  # channels of supports, compensated before anything else
+FORCE = Family("force", rank=0)  # measured forces, fitted as a law is
+FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, SENSOR, INPUT, FORCE)

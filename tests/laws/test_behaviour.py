@@ -1,0 +1,48 @@
+"""What a law carries beside its force: branch, path, other starts, prior cost."""
+
+import numpy as np
+import pytest
+
+from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, find_law
+from sprung.model.laws.along import force_along
+from sprung.model.laws.base import RARE, Reading
+from sprung.model.laws.trajectory import along
+
+TIME = np.arange(4000) / 1000
+D = 3e-3 * np.sin(2 * np.pi * 1.3 * TIME) + 1e-3 * np.sin(2 * np.pi * 4.1 * TIME + 1)
+V = np.gradient(D, TIME)
+
+
+@pytest.mark.parametrize(("name", "p"), [("series_stiffness", (1.2e6,)), ("air_spring", (3e5, 0.2))])
+def test_a_branch_is_the_law_that_its_memory_integrates(name, p):
+    law, element = find_law(name), SpringDamper(4e5, 2e4)
+    branch = law.branch(p, element.damping)
+    stepped = along(law, p, D, V, sample_rate=1000.0, element=element)
+    s = 2j * np.pi * np.fft.rfftfreq(len(D), 1e-3)
+    settled = slice(len(D) // 2, None)
+    impedance = branch.stiffness * branch.time / (1 + s * branch.time) - branch.replaces  # per rate
+    periodic = np.fft.irfft(impedance * np.fft.rfft(V), len(D))
+    assert np.corrcoef(stepped[settled], periodic[settled])[0, 1] > 0.995
+
+
+@pytest.mark.parametrize("law", [law for law in CATALOGUE if isinstance(law, ElementLaw) and law.path])
+def test_a_path_is_the_law_that_its_memory_integrates(law):
+    p, element = (9e4, 300.0, 1.0), SpringDamper(4e5, 2e4)
+    slow = along(law, p, D, V, sample_rate=1000.0, element=element)
+    np.testing.assert_allclose(force_along(law, p, D, V, TIME, element), slow, atol=3e-3 * np.abs(slow).max())
+
+
+def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike():
+    read = Reading(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0)
+    (restart,) = find_law("series_stiffness").restarts(read)
+    c, (ks,) = restart.damping * read.damping, restart.parameters
+    r = read.frequency * c / ks
+    assert c / (1 + r**2) == pytest.approx(read.damping)
+    softer = 1 - read.frequency * c * r / (1 + r**2) / read.stiffness
+    assert restart.stiffness == pytest.approx(max(softer, 0.5))
+
+
+def test_laws_that_contain_commoner_ones_must_beat_them():
+    rare = {law.name for law in CATALOGUE if law.prior_cost == RARE}
+    assert rare == {"air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"}
+    assert find_law("bouc_wen").wider.prior_cost == RARE

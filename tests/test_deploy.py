@@ -1,0 +1,176 @@
+"""Dashboards and rules: made by code, every query answered by a real Prometheus that scrapes a running service."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shutil
+import socket
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.parse
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+import uvicorn
+import yaml
+
+from sprung.model.signals import Tally
+from sprung.model.system import System
+from sprung.service.api.app import create_app
+from sprung.service.core import Core, build_core
+from sprung.service.engine import Engine
+from sprung.service.live import FeedStatus
+from sprung.service.settings import Settings
+from tests.service_fakes import make_window
+
+DEPLOY = Path(__file__).parent.parent / "deploy"
+RULES = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.yml").read_text())["groups"][0]["rules"]
+MAY_BE_EMPTY = {"Alarms"}  # an annotation: alarms that opened within the last minute
+
+
+def made() -> ModuleType:
+    """The module that makes the dashboards."""
+    spec = importlib.util.spec_from_file_location("make", DEPLOY / "grafana" / "make.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_committed_dashboards_are_what_the_code_makes() -> None:
+    make = made()
+    kept = {path.name for path in (DEPLOY / "grafana" / "dashboards").glob("*.json")}
+    assert kept == set(make.DASHBOARDS)
+    for name in kept:
+        assert (DEPLOY / "grafana" / "dashboards" / name).read_text() == make.text(name), "run deploy/grafana/make.py"
+
+
+def test_panels_do_not_lie_on_each_other_and_the_fleet_leads_to_vehicles() -> None:
+    for name, build in made().DASHBOARDS.items():
+        taken: set[tuple[int, int]] = set()
+        for panel in build()["panels"]:
+            at = panel["gridPos"]
+            cells = {(at["x"] + i, at["y"] + j) for i in range(at["w"]) for j in range(at["h"])}
+            assert not cells & taken and at["x"] + at["w"] <= 24, (name, panel["title"])
+            taken |= cells
+    assert "/d/sprung-vehicle?var-vehicle=" in made().text("fleet.json")
+
+
+def test_every_rule_is_tested_firing_and_not_firing() -> None:
+    tests = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.test.yml").read_text())["tests"]
+    cases = [case for test in tests for case in test["alert_rule_test"]]
+    for rule in RULES:
+        fired = {bool(case["exp_alerts"]) for case in cases if case["alertname"] == rule["alert"]}
+        assert fired == {True, False}, rule["alert"]
+    silent = [case["eval_time"] for case in cases if case["alertname"] == "SprungVehicleSilent" and case["exp_alerts"]]
+    assert max(int(text.removesuffix("m")) for text in silent) > 24 * 60
+
+
+def test_compose_tells_somebody_and_has_no_usual_password() -> None:
+    services = yaml.safe_load((DEPLOY / "docker-compose.yaml").read_text())["services"]
+    assert "alertmanager" in services and all(":" in service["image"] for service in services.values())
+    assert "?" in services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]
+    assert all("mem_limit" in service for service in services.values())
+
+
+@pytest.mark.skipif(shutil.which("amtool") is None, reason="needs amtool, of the package prometheus-alertmanager")
+def test_the_configuration_of_alertmanager_is_one() -> None:
+    command = ["amtool", "check-config", str(DEPLOY / "prometheus" / "alertmanager.yml")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+class Bus:
+    """A live feed as the service lists it."""
+
+    def status(self) -> FeedStatus:
+        return FeedStatus("socketcan:can0", "a", "receiving", "", 0.01, 0, 0, 0, 0, 1)
+
+
+@pytest.fixture
+def core(engine: Engine, tmp_path: Path) -> Core:
+    built = build_core(Settings(data_dir=tmp_path), engine)
+    built.feeds.append(Bus())  # type: ignore[arg-type]
+    return built
+
+
+@pytest.fixture
+def prometheus(core: Core, system: System, tmp_path: Path) -> Iterator[str]:
+    """The address of a Prometheus that has scraped an alarmed vehicle for a while."""
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        thread.join(0.05)
+    target = f"127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    jobs = [{"job_name": "sprung", "static_configs": [{"targets": [target]}]}]
+    config = {"global": {"scrape_interval": "1s", "evaluation_interval": "1s"}, "scrape_configs": jobs}
+    config["rule_files"] = [str(DEPLOY / "prometheus" / "sprung.rules.yml")]  # type: ignore[assignment]
+    (tmp_path / "prometheus.yml").write_text(yaml.safe_dump(config))
+    command = ["prometheus", f"--config.file={tmp_path}/prometheus.yml", f"--storage.tsdb.path={tmp_path}/tsdb"]
+    with subprocess.Popen(
+        [*command, f"--web.listen-address=127.0.0.1:{port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as process:
+        try:
+            replay(core, system)
+            yield f"http://127.0.0.1:{port}"
+        finally:
+            process.terminate()
+    server.should_exit = True
+    thread.join(20)
+
+
+def replay(core: Core, system: System) -> None:
+    """A vehicle that changes while it is scraped; some windows are dropped, some messages corrupt."""
+    count = core.tally_counter("file")
+    for step in range(10):
+        level = 0.0 if step < 5 else 0.3
+        windows = [make_window(system, 20 * step + i, level) for i in range(18)]
+        windows += [make_window(system, 20 * step + 18 + i, level, "dropped") for i in range(2)]
+        core.metrics.observe(core.pipeline.process("a", windows).seconds)
+        count(Tally(used=100 * step, corrupt=step))
+        time.sleep(1.0)
+
+
+def ask(address: str, query: str) -> list[Any]:
+    """What Prometheus answers to a query; fails where it refuses it."""
+    url = f"{address}/api/v1/query?{urllib.parse.urlencode({'query': query})}"
+    try:
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            found = json.load(answer)
+    except urllib.error.HTTPError as error:
+        raise AssertionError(f"{query}: {error.read().decode()}") from error
+    result: list[Any] = found["data"]["result"]
+    return result
+
+
+@pytest.mark.skipif(shutil.which("prometheus") is None, reason="needs prometheus, of the package of that name")
+def test_every_query_of_panels_variables_and_rules_is_answered(prometheus: str) -> None:
+    empty = []
+    for name, build in made().DASHBOARDS.items():
+        board = build()
+        queries = [(p["title"], t["expr"]) for p in board["panels"] for t in p["targets"]]
+        queries += [(a["name"], a["expr"]) for a in board["annotations"]["list"]]
+        for variable in board["templating"]["list"]:
+            series = re.match(r"label_values\((.*), \w+\)", variable["query"])
+            queries += [(variable["name"], series[1])] if series else []
+        for title, expr in queries:
+            query = expr.replace("$vehicle", "a").replace('="$element"', '=~".*"').replace("$element", ".*")
+            if not ask(prometheus, query) and title not in MAY_BE_EMPTY:
+                empty.append((name, title, query))
+    assert empty == []
+    for rule in RULES:
+        ask(prometheus, rule["expr"])
+        for metric in re.findall(r"sprung_\w+", rule["expr"]):
+            assert ask(prometheus, metric), (rule["alert"], metric)
+    assert {alert["metric"]["alertname"] for alert in ask(prometheus, "ALERTS")} >= {"SprungSuspensionChanged"}
