@@ -33,6 +33,7 @@ class Layout:
     names: tuple[str, ...]  # of the columns; "1", "2", ... when there is no header
     units: tuple[str | None, ...]  # of the columns, as a row of units or the header says
     headed: bool
+    numeric: tuple[bool, ...]  # which columns hold numbers or times
 
 
 def cells(line: str, separator: str | None) -> list[str]:
@@ -106,7 +107,7 @@ def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, L
     understood = sum(good[i][c] or rows[i][c].lower() in MISSING for i in data for c in range(width))
     others = sum(len(row) not in (0, width) for row in rows[first:])
     score = understood - 2.0 * others - 0.5 * sum(len(data) * (not n) for n in numeric)
-    return score, _layout(lines, rows, first, width, separator, comma)
+    return score, _layout(lines, rows, first, tuple(numeric), separator, comma)
 
 
 def _is_data(row: list[str], good: list[bool], numeric: list[bool]) -> bool:
@@ -116,9 +117,15 @@ def _is_data(row: list[str], good: list[bool], numeric: list[bool]) -> bool:
 
 
 def _layout(
-    lines: list[str], rows: list[list[str]], first: int, width: int, separator: str | None, comma: bool
+    lines: list[str],
+    rows: list[list[str]],
+    first: int,
+    numeric: tuple[bool, ...],
+    separator: str | None,
+    comma: bool,
 ) -> Layout:
     """Header and units from the lines before the first row of data."""
+    width = len(numeric)
     above = [(i, row) for i, row in enumerate(rows[:first]) if len(row) == width and any(row)]
     marked = [  # the header may itself be a comment
         (i, cells(lines[i].lstrip().lstrip("".join(COMMENTS)).strip(), separator))
@@ -127,21 +134,27 @@ def _layout(
     ]
     heads = above or [(i, row) for i, row in marked if len(row) == width]
     if not heads:
-        return Layout(separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False)
+        return Layout(separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False, numeric)
     names = heads[-1][1]
     units: list[str | None] = [None] * width
     if len(heads) > 1 and _are_units(heads[-1][1]):
-        names, units = heads[-2][1], [cell.strip("[]() ") or None for cell in heads[-1][1]]
+        names, units = heads[-2][1], [_bare(cell) for cell in heads[-1][1]]
     elif len(heads) > 2 and _are_units(heads[-2][1]):  # another row below the units
-        names, units = heads[-3][1], [cell.strip("[]() ") or None for cell in heads[-2][1]]
+        names, units = heads[-3][1], [_bare(cell) for cell in heads[-2][1]]
     units = [unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True)]
-    return Layout(separator, comma, first, tuple(names), tuple(units), True)
+    return Layout(separator, comma, first, tuple(names), tuple(units), True, numeric)
 
 
 def _are_units(row: list[str]) -> bool:
     """Whether most of a row's cells are names of units."""
     texts = [cell.strip("[]() ") for cell in row if cell.strip("[]() ")]
     return bool(texts) and 2 * sum(is_unit(text) or "volt" in text.lower() for text in texts) > len(texts)
+
+
+def _bare(cell: str) -> str | None:
+    """A unit without the brackets around it."""
+    text = cell.strip()
+    return (text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()") else text) or None
 
 
 def is_unit(text: str) -> bool:

@@ -130,6 +130,16 @@ class Recording:
         return self.account.incomplete
 
 
+def kind_of(path: Path) -> str:
+    """The extension of a file that can be read; raises UnreadableRecording when there is no such file or reader."""
+    extension = path.suffix.lower()
+    if extension not in EXTENSIONS:
+        raise UnreadableRecording(f"{path}: cannot read files of this kind; known are {' '.join(EXTENSIONS)}")
+    if not path.is_file():
+        raise UnreadableRecording(f"{path}: no such file")
+    return extension
+
+
 def open_recording(
     path: str | Path,
     channels: Sequence[Channel],
@@ -147,11 +157,7 @@ def open_recording(
     recording began whose times count from 0; without it such times stay as they are.
     """
     path = Path(path)
-    extension = path.suffix.lower()
-    if extension not in EXTENSIONS:
-        raise UnreadableRecording(f"{path}: cannot read files of this kind; known are {' '.join(EXTENSIONS)}")
-    if not path.is_file():
-        raise UnreadableRecording(f"{path}: no such file")
+    extension = kind_of(path)
     account = Account()
     if extension == ".mcap":
         source = mcaptopics.blocks(path, channels, account, time_source)

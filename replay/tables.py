@@ -204,8 +204,9 @@ def column_blocks(
     found = find_columns(path, names, channels, account)
     by_time: dict[Any, list[tuple[int, Column]]] = {}
     for place, at in found:
-        by_time.setdefault(_time_of(path, columns[at], columns, time), []).append((place, columns[at]))
-    series = [_Series(key, members, time, account) for key, members in by_time.items()]
+        of_time = time_of(path, columns[at], columns, time)
+        by_time.setdefault((of_time, columns[at].length), []).append((place, columns[at]))
+    series = [_Series(of_time, members, time, account) for (of_time, _), members in by_time.items()]
     while any(one.more() for one in series):
         waiting = [one for one in series if one.more()]
         horizon = min(one.last for one in waiting)
@@ -219,7 +220,7 @@ def column_blocks(
         yield SampleBlock(block.time[order], block.channel[order], block.value[order])
 
 
-def _time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | Clock:
+def time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | Clock:
     """The times of a column: what the system file says, a time column of its length in its group or anywhere, else
     its own clock."""
     if time.rate is not None:
@@ -256,7 +257,7 @@ class _Series:
         self, time: Column | Clock, members: list[tuple[int, Column]], key: TimeColumn, account: Account
     ) -> None:
         self.time, self.members, self.account = time, members, account
-        self.length = min(column.length for _, column in members)
+        self.length = members[0][1].length
         unit = None
         if isinstance(time, Column):
             unit = seconds_of(time.unit) or seconds_of(unit_in(time.name.rsplit("/", 1)[-1])[1])

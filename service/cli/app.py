@@ -210,6 +210,34 @@ def compare(
 
 
 @app.command()
+def inspect(
+    file: File,
+    system: Annotated[Path | None, typer.Option("--system", help="Take `time:` from this system file.")] = None,
+    dbc: Dbc = None,
+    time_column: Annotated[str | None, typer.Option("--time-column", help="Where a table keeps the time.")] = None,
+    time_unit: Annotated[str | None, typer.Option("--time-unit", help="Of that column: s, ms, us, ns ...")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Hz, of a table without times.")] = None,
+    write_system: Annotated[
+        Path | None, typer.Option("--write-system", help="Write the skeleton of a system file here.")
+    ] = None,
+    json_lines: Json = False,
+) -> int:
+    """What a recording holds: signals, rates, units, gaps, ranges, spectra."""
+    from sprung.service.cli.inspect import run
+
+    return run(
+        file,
+        system_file=system,
+        dbc=dbc,
+        column=time_column,
+        unit=time_unit,
+        rate=rate,
+        write_system=write_system,
+        json_lines=json_lines,
+    )
+
+
+@app.command()
 def system(
     file: Annotated[Path | None, typer.Argument(help="System file; default: the Manchester vehicle.")] = None,
     json_lines: Json = False,

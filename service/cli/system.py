@@ -37,7 +37,7 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
         for path in export(system, out):
             print(path)
         return 0
-    told = identifiability(system)
+    told = identifiability(system) if system.bodies else np.full(len(system.parameters), np.nan)
     if json_lines:
         print(json.dumps(_as_dict(system, told), indent=None))
         return 0
@@ -49,6 +49,10 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
         f"{len(system.inputs)} input signals, {len(system.elements)} elements, {len(system.sensors)} sensors; "
         f"{system.window} samples at {system.sample_rate:g} Hz; digest {system.digest}"
     )
+    if not system.bodies:
+        console.print(_elements(system))
+        console.print("A component test: no mass moves; sprung diagnose fits the element along its measured motion.")
+        return 0
     console.print(_bodies(system))
     console.print(_elements(system))
     console.print(_modes(system))
@@ -113,15 +117,15 @@ def _as_dict(system: System, told: Any) -> dict[str, Any]:
         "inputs": [channel.name for channel in system.inputs],
         "modes": [
             {"frequency": m.frequency, "damping_ratio": m.damping_ratio, "body": m.body}
-            for m in system.mechanics.modes(system.bodies)
+            for m in (system.mechanics.modes(system.bodies) if system.bodies else ())
         ],
         "parameters": [
             {
                 "name": p.name,
                 "unit": p.unit,
                 "nominal": p.nominal,
-                "window_std": float(std),
-                "identifiable": bool(std < KNOWN_SHARE * PRIOR_STD),
+                "window_std": float(std) if system.bodies else None,
+                "identifiable": bool(std < KNOWN_SHARE * PRIOR_STD) if system.bodies else None,
             }
             for p, std in zip(system.parameters, np.asarray(told), strict=True)
         ],
