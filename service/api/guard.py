@@ -1,0 +1,220 @@
+"""Before any route: who asks, from where, how often, and whether he may; and the headers that keep browsers honest."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import time
+from collections import OrderedDict
+from collections.abc import Mapping
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import quote, urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from sprung.service.api.problems import Problem, problem_response
+from sprung.service.api.scopes import VEHICLE_PATH, Need, need_of
+from sprung.service.settings import Settings
+from sprung.service.tokens import Actor, Refused, Tokens
+
+COOKIE = "sprung_session"
+UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
+BURST_SECONDS = 2.0  # of the permitted rate that may come at once
+MOST_CLIENTS = 10_000
+
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+DOCS_POLICY = POLICY.replace("style-src 'self'", "style-src 'self' 'unsafe-inline'")
+# a report is one self-contained page: its style and pictures are in it, and it runs nothing of another origin
+REPORT_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
+    "frame-ancestors 'none'; sandbox allow-popups allow-top-navigation-by-user-activation"
+)
+HEADERS = {
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "same-origin",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+}
+
+
+class Guard:
+    """ASGI middleware, the outermost."""
+
+    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
+        self.app = app
+        self._settings = settings
+        self._tokens = tokens
+        self._limiter = Limiter(settings.client_requests_per_second)
+        self._local = is_loopback(settings.host)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        path, headers = scope["path"], Headers(scope=scope)
+
+        async def with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                self._complete(path, scope, MutableHeaders(scope=message))
+            await send(message)
+
+        try:
+            need = need_of(scope["method"], path)
+            self._check_host(headers)
+            actor, by_cookie = self._actor(scope, headers, need)
+            self._limiter.take(actor.name if actor.name != "local" else _address(scope))
+            self._check_browser(scope, headers, need, by_cookie)
+            self._check_scope(actor, need, path)
+        except Problem as problem:
+            response = problem_response(problem, path)
+            if problem.status == 401 and _wants_page(headers) and scope["method"] == "GET":
+                response.status_code = 303
+                response.headers["location"] = f"/signin?to={quote(path)}"
+            await response(scope, receive, with_headers)
+            return
+        scope["sprung.actor"] = actor
+        await self.app(scope, receive, with_headers)
+
+    @property
+    def required(self) -> bool:
+        """Whether requests need a token."""
+        return not self._settings.open and (not self._local or self._tokens.any)
+
+    def _actor(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
+        """Who asks, and whether a browser said so by itself (with a cookie, or because nobody needs to)."""
+        given = headers.get("authorization", "")
+        kind, _, text = given.partition(" ")
+        try:
+            if given and kind.lower() == "bearer":
+                return self._tokens.actor(text.strip()), False
+            if not self.required:
+                return Actor(), True
+            session = session_of(headers)
+            if session is not None:
+                return self._tokens.session(session), True
+        except Refused as refused:
+            if not need.scope:
+                return Actor("nobody", frozenset()), True
+            raise _unauthorized(str(refused)) from None
+        if not need.scope:
+            return Actor("nobody", frozenset()), True
+        raise _unauthorized("a token is needed: send `Authorization: Bearer ...`, or sign in")
+
+    def _check_host(self, headers: Headers) -> None:
+        """Against pages whose host name was pointed at this machine: they would read everything as their own."""
+        host = host_of(headers.get("host", ""))
+        allowed = self._settings.allowed_hosts
+        if allowed and host not in allowed:
+            raise Problem(421, "this host name is not served here; allow it with SPRUNG_ALLOWED_HOSTS")
+        if allowed or self.required or "." not in host.rstrip(".") or host.endswith(".localhost") or _is_address(host):
+            return
+        if host != self._settings.host:
+            raise Problem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
+
+    def _check_browser(self, scope: Scope, headers: Headers, need: Need, by_cookie: bool) -> None:
+        """Against pages of others that make a browser send: they cannot send a token, and they cannot hide."""
+        if scope["method"] not in UNSAFE:
+            return
+        if by_cookie:
+            if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
+                raise Problem(403, "requests of other sites are not taken")
+            origin = headers.get("origin")
+            if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
+                raise Problem(403, "requests of other origins are not taken")
+        kind = headers.get("content-type", "").split(";")[0].strip().lower()
+        length = headers.get("content-length")
+        sent = "transfer-encoding" in headers or (length is not None and length != "0")
+        if sent and kind not in need.body:
+            raise Problem(415, f"send {' or '.join(need.body)}", headers={"Accept-Post": ", ".join(need.body)})
+
+    def _check_scope(self, actor: Actor, need: Need, path: str) -> None:
+        if need.scope and not actor.may(need.scope):
+            raise Problem(403, f"this needs the scope `{need.scope}`; the token has {', '.join(sorted(actor.scopes))}")
+        if need.scope and actor.fleet and not need.by_fleet:
+            raise Problem(403, f"this shows all vehicles; the token is for those that begin with {actor.fleet!r}")
+        vehicle = VEHICLE_PATH.match(path)
+        if vehicle is not None and not actor.sees(vehicle[1]):
+            raise Problem(404, f"nothing is known of vehicle {vehicle[1][:128]!r}")
+
+    def _complete(self, path: str, scope: Scope, headers: MutableHeaders) -> None:
+        for name, value in HEADERS.items():
+            headers.setdefault(name, value)
+        policy = DOCS_POLICY if path == "/docs" else REPORT_POLICY if path.endswith("/page") else POLICY
+        headers.setdefault("Content-Security-Policy", policy)
+        if not path.startswith("/static/"):
+            headers.setdefault("Cache-Control", "no-store")
+        if scope.get("scheme") == "https":
+            headers.setdefault("Strict-Transport-Security", "max-age=31536000")
+
+
+class Limiter:
+    """A token bucket a client: `rate` requests a second, twice as many at once."""
+
+    def __init__(self, rate: float) -> None:
+        self._rate = rate
+        self._most = max(1.0, BURST_SECONDS * rate)
+        self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def take(self, client: str) -> None:
+        """Raises a 429 Problem when a client asks too often."""
+        now = time.monotonic()
+        left, at = self._left.pop(client, (self._most, now))
+        left = min(self._most, left + (now - at) * self._rate)
+        refused = left < 1.0
+        self._left[client] = (left if refused else left - 1.0, now)
+        while len(self._left) > MOST_CLIENTS:
+            self._left.popitem(last=False)
+        if refused:
+            wait = str(math.ceil((1.0 - left) / self._rate))
+            raise Problem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})
+
+
+def session_of(headers: Mapping[str, str]) -> str | None:
+    """The session that a browser's cookie names."""
+    try:
+        cookie = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return None
+    return None if cookie is None else cookie.value
+
+
+def host_of(header: str) -> str:
+    """The name or address in a Host header, without its port."""
+    name = header.rsplit("]", 1)[0].lstrip("[") if header.startswith("[") else header.rsplit(":", 1)[0]
+    return name.lower()
+
+
+def is_loopback(host: str) -> bool:
+    """Whether an address is reached from this machine only."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host.lower() == "localhost"
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _address(scope: Scope) -> str:
+    return scope["client"][0] if scope.get("client") else ""
+
+
+def _wants_page(headers: Headers) -> bool:
+    return "text/html" in headers.get("accept", "")
+
+
+def _unauthorized(detail: str) -> Problem:
+    return Problem(401, detail, headers={"WWW-Authenticate": 'Bearer realm="sprung"'})
+
+

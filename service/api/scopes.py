@@ -1,0 +1,67 @@
+"""What a request needs: by method and path, so that a route which nobody thought of needs the most."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+PUBLIC = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Need:
+    """What a request needs."""
+
+    scope: str  # PUBLIC: nothing
+    by_fleet: bool = False  # a token of one fleet may ask: the route keeps to it
+    body: tuple[str, ...] = ("application/json",)  # types of body that it takes
+
+
+FORM = ("multipart/form-data",)
+NEEDS: dict[tuple[str, str], Need] = {
+    ("GET", "/health/live"): Need(PUBLIC),
+    ("GET", "/health/ready"): Need(PUBLIC),
+    ("GET", "/signin"): Need(PUBLIC),
+    ("POST", "/signin"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
+    ("POST", "/signout"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
+    ("GET", "/static/{path}"): Need(PUBLIC),
+    ("GET", "/docs"): Need("read", by_fleet=True),
+    ("GET", "/openapi.json"): Need("read", by_fleet=True),
+    ("POST", "/identify"): Need("ingest", by_fleet=True),
+    ("POST", "/recordings"): Need("ingest", by_fleet=True, body=FORM),
+    ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", *FORM)),
+    ("GET", "/jobs/{id}"): Need("read", by_fleet=True),
+    ("DELETE", "/jobs/{id}"): Need("operate", by_fleet=True),
+    ("GET", "/reports/{id}"): Need("read", by_fleet=True),
+    ("GET", "/reports/{id}/page"): Need("read", by_fleet=True),
+    ("GET", "/vehicles/{id}"): Need("read", by_fleet=True),
+    ("GET", "/vehicles/{id}/{part}"): Need("read", by_fleet=True),
+    ("GET", "/pages/vehicles/{id}"): Need("read", by_fleet=True),
+    ("POST", "/vehicles/{id}/{deed}"): Need("operate", by_fleet=True),
+    ("PATCH", "/vehicles/{id}"): Need("operate", by_fleet=True),
+    ("DELETE", "/vehicles/{id}"): Need("admin", by_fleet=True),
+    ("GET", "/audit"): Need("admin"),
+    ("GET", "/tokens"): Need("admin"),
+    ("POST", "/tokens"): Need("admin"),
+    ("DELETE", "/tokens/{id}"): Need("admin"),
+    ("GET", "/debug/profile"): Need("admin"),
+}
+READ, ADMIN = Need("read"), Need("admin")
+VEHICLE_PATH = re.compile(r"^/(?:pages/)?vehicles/([^/]+)")
+
+
+def _pattern(template: str) -> re.Pattern[str]:
+    inner = re.escape(template).replace(r"\{path\}", ".+")
+    return re.compile("^" + re.sub(r"\\\{\w+\\\}", "[^/]+", inner) + "/?$")
+
+
+_PATTERNS = [(method, _pattern(template), need) for (method, template), need in NEEDS.items()]
+
+
+def need_of(method: str, path: str) -> Need:
+    """What a request needs; reading needs `read`, and anything else that is not listed `admin`."""
+    method = "GET" if method in ("HEAD", "OPTIONS") else method
+    for listed, pattern, need in _PATTERNS:
+        if listed == method and pattern.match(path):
+            return need
+    return READ if method == "GET" else ADMIN

@@ -1,0 +1,193 @@
+"""Who may ask: bearer tokens with scopes, a fleet and an end; and sessions of people who signed in with one.
+
+A token is `sprung_ID_SECRET`.  The secret has 256 bits and is made here, so its SHA-256 tells nothing and needs no salt
+or stretching; the store holds only that.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import hmac
+import secrets
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sprung.service.errors import NotFound, UserError
+from sprung.service.store import Store, audit, tokens
+from sprung.service.store.tokens import TokenRow
+from sprung.service.times import NANOSECONDS, now_ns
+
+SCOPES = ("read", "ingest", "operate", "admin")
+IMPLIED = {"admin": {"read", "ingest", "operate", "admin"}, "operate": {"operate", "read"}}
+PREFIX = "sprung"
+REMEMBER_SECONDS = 5.0  # for which a token that was revoked may still be taken
+MOST_REMEMBERED = 1000
+SESSION_SECONDS = 12 * 3600.0
+MOST_SESSIONS = 1000
+DAY = 86_400 * NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True)
+class Actor:
+    """Who sends a request, and what he may do."""
+
+    name: str = "local"
+    scopes: frozenset[str] = frozenset(SCOPES)
+    fleet: str = ""  # vehicles whose ids begin so; empty: all
+
+    def may(self, scope: str) -> bool:
+        """Whether a scope allows it, by itself or as part of a greater one."""
+        return any(scope in IMPLIED.get(held, {held}) for held in self.scopes)
+
+    def sees(self, vehicle: str | None) -> bool:
+        """Whether a vehicle (None: of no vehicle in particular) is of his fleet."""
+        return not self.fleet or (vehicle is not None and vehicle.startswith(self.fleet))
+
+
+class Refused(Exception):
+    """A token that is no good; the message says why."""
+
+
+class Tokens:
+    """Safe to share between threads."""
+
+    def __init__(self, store: Store, admin_token: str | None = None, clock: Callable[[], int] = now_ns) -> None:
+        """admin_token: one more secret that allows everything, from the settings."""
+        self._store = store
+        self._admin = None if admin_token is None else digest_of(admin_token)
+        self._clock = clock
+        self._known: OrderedDict[str, tuple[float, TokenRow | None]] = OrderedDict()
+        self._sessions: OrderedDict[str, tuple[float, str]] = OrderedDict()
+        self._counted: tuple[float, bool] = (-1e9, False)
+        self._lock = threading.Lock()
+
+    def create(
+        self, name: str, scopes: Sequence[str], fleet: str = "", days: float | None = None, by: str = "local"
+    ) -> tuple[str, TokenRow]:
+        """A new token: its text, which is shown once, and its row.  Raises UserError."""
+        unknown = [scope for scope in scopes if scope not in SCOPES]
+        if unknown or not scopes:
+            raise UserError(f"scope {', '.join(unknown) or 'is missing'}: known are {', '.join(SCOPES)}")
+        if not name or len(name) > 128 or len(fleet) > 128:
+            raise UserError("a token needs a name, and name and fleet have at most 128 characters")
+        if days is not None and not 0 < days < 36_500:
+            raise UserError("a token lasts for more than 0 and less than 36500 days")
+        token_id, secret = secrets.token_hex(6), secrets.token_urlsafe(32)
+        text = f"{PREFIX}_{token_id}_{secret}"
+        now = self._clock()
+        expires = None if days is None else now + round(days * DAY)
+        row = TokenRow(token_id, digest_of(text), name, list(scopes), fleet, now, expires, None, None)
+        with self._store.write() as connection:
+            tokens.add(connection, row)
+            detail = {"name": name, "scopes": list(scopes), "fleet": fleet}
+            audit.record(connection, by, "create token", token_id, detail, now)
+        self._forget()
+        return text, row
+
+    def rotate(self, token_id: str, hours: float = 24.0, by: str = "local") -> tuple[str, TokenRow]:
+        """A new token like an old one, which ends in `hours`.  Raises NotFound."""
+        with self._store.read() as connection:
+            old = tokens.get(connection, token_id)
+        if old is None or old.revoked_ns is not None:
+            raise NotFound(f"no token {token_id[:40]!r}")
+        now = self._clock()
+        left = None if old.expires_ns is None else max((old.expires_ns - old.created_ns) / DAY, 1e-6)
+        text, row = self.create(old.name, old.scopes, old.fleet, left, by)
+        with self._store.write() as connection:
+            tokens.expire(connection, token_id, now + round(hours * 3600 * NANOSECONDS))
+        self._forget()
+        return text, row
+
+    def revoke(self, token_id: str, by: str = "local") -> None:
+        """Make a token worthless.  Raises NotFound."""
+        now = self._clock()
+        with self._store.write() as connection:
+            if not tokens.revoke(connection, token_id, now):
+                raise NotFound(f"no token {token_id[:40]!r} that is not revoked")
+            audit.record(connection, by, "revoke token", token_id, None, now)
+        self._forget()
+
+    def rows(self) -> list[TokenRow]:
+        """Every token, the newest first."""
+        with self._store.read() as connection:
+            return tokens.list_all(connection)
+
+    @property
+    def any(self) -> bool:
+        """Whether there is or was a token: then requests need one, also when all have been revoked."""
+        if self._admin is not None:
+            return True
+        at, found = self._counted
+        if not found and time.monotonic() - at > REMEMBER_SECONDS:
+            with self._store.read() as connection:
+                found = tokens.count(connection) > 0
+            self._counted = (time.monotonic(), found)
+        return found
+
+    def actor(self, text: str) -> Actor:
+        """Who a token belongs to.  Raises Refused."""
+        digest = digest_of(text)
+        if self._admin is not None and hmac.compare_digest(digest, self._admin):
+            return Actor("admin", frozenset({"admin"}))
+        parts = text.split("_", 2)
+        row = self._row(parts[1]) if len(parts) == 3 and parts[0] == PREFIX and len(parts[1]) == 12 else None
+        if row is None or not hmac.compare_digest(digest, row.digest):
+            raise Refused("the token is not known")
+        return self._valid(row)
+
+    def sign_in(self, text: str) -> str:
+        """A session of the token's owner.  Raises Refused."""
+        self.actor(text)
+        session = secrets.token_urlsafe(32)
+        with self._lock:
+            self._sessions[digest_of(session)] = (time.monotonic() + SESSION_SECONDS, text)
+            while len(self._sessions) > MOST_SESSIONS:
+                self._sessions.popitem(last=False)
+        return session
+
+    def sign_out(self, session: str) -> None:
+        """End a session."""
+        with self._lock:
+            self._sessions.pop(digest_of(session), None)
+
+    def session(self, session: str) -> Actor:
+        """Whose session it is; ends with its token.  Raises Refused."""
+        with self._lock:
+            ends, text = self._sessions.get(digest_of(session), (0.0, ""))
+        if ends < time.monotonic():
+            raise Refused("the session is over; sign in again")
+        return self.actor(text)
+
+    def _valid(self, row: TokenRow) -> Actor:
+        if row.revoked_ns is not None:
+            raise Refused("the token was revoked")
+        if row.expires_ns is not None and row.expires_ns <= self._clock():
+            raise Refused("the token has expired")
+        return Actor(row.name, frozenset(row.scopes), row.fleet)
+
+    def _row(self, token_id: str) -> TokenRow | None:
+        now = time.monotonic()
+        with self._lock:
+            at, row = self._known.get(token_id, (-1e9, None))
+        if now - at < REMEMBER_SECONDS:
+            return row
+        with self._store.read() as connection:
+            row = tokens.get(connection, token_id)
+        with self._lock:
+            self._known[token_id] = (now, row)
+            while len(self._known) > MOST_REMEMBERED:
+                self._known.popitem(last=False)
+        return row
+
+    def _forget(self) -> None:
+        with self._lock:
+            self._known.clear()
+        self._counted = (-1e9, False)
+
+
+def digest_of(text: str) -> str:
+    """SHA-256 in hex."""
+    return hashlib.sha256(text.encode()).hexdigest()
