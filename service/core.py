@@ -31,6 +31,7 @@ from sprung.service.ring import Rings
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.windows import latest_window
+from sprung.service.tokens import Tokens
 from sprung.service.views import VehicleView, vehicle_view
 from sprung.service.vitals import Vitals
 
@@ -57,6 +58,7 @@ class Core:
     operations: Operations
     batcher: Batcher
     notices: Notices
+    tokens: Tokens
     stopping: threading.Event
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
 
@@ -130,6 +132,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         Operations(settings, pipeline, board),
         batcher,
         notices,
+        Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
         stopping,
         feeds,
     )

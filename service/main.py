@@ -20,6 +20,7 @@ from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
+from sprung.service.api.guard import is_loopback
 from sprung.service.api.server import make_server
 from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
@@ -61,6 +62,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         listening = stack.enter_context(_listen(settings))
         core = build_core(settings, engine)
         stack.callback(core.close)
+        notice = access_notice(settings, core.tokens.any)
         core.feeds = [live_feed(core, text, feeds.vehicle) for text in feeds.buses]
         files = threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)
 
@@ -79,6 +81,8 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         host, port = listening.getsockname()[:2]
         scheme = "http" if settings.tls_certificate is None else "https"
         announce(f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}")
+        if notice:
+            announce_access(notice)
         try:
             server = make_server(create_app(core, start, stop), settings, core.stopping.set)
         except (OSError, ssl.SSLError) as error:
@@ -86,6 +90,26 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         # uvicorn raises the signal that stopped it again when it is done: for a service that is a good end
         stack.callback(signal.signal, signal.SIGTERM, signal.signal(signal.SIGTERM, _exit))
         server.run(sockets=[listening])
+
+
+def access_notice(settings: Settings, tokens: bool) -> str:
+    """What to say about a service that asks for no token; empty where it does.  Raises UserError where that is not
+    wanted."""
+    if settings.open:
+        return "requests need no token, as SPRUNG_OPEN says: whoever reaches this address may do anything"
+    if tokens:
+        return ""
+    if not is_loopback(settings.host):
+        raise UserError(
+            f"{settings.host} can be reached by others, and there is no token: make one with `sprung token create`, "
+            "set SPRUNG_ADMIN_TOKEN, or say SPRUNG_OPEN=true behind a proxy that asks for sign-in"
+        )
+    return "requests need no token, as only this machine reaches the address; `sprung token create` changes that"
+
+
+def announce_access(notice: str) -> None:
+    """One line on stderr."""
+    print(f"sprung: {notice}", file=sys.stderr, flush=True)
 
 
 def _exit(_number: int, _frame: FrameType | None) -> NoReturn:

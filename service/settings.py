@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field, ValidationError
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from sprung.service.errors import UserError
@@ -43,6 +43,11 @@ class Settings(BaseSettings):
     port: int = Field(default=8000, ge=0, le=65535)
     max_body_bytes: int = Field(default=2_000_000, gt=0)  # one window of 28 channels is about 60 kB
     max_upload_bytes: int = Field(default=2_000_000_000, gt=0)
+    admin_token: SecretStr | None = None  # one more token that allows everything, of at least 20 characters
+    open: bool = False  # take requests without tokens on any address: only behind something that asks for them
+    allowed_hosts: tuple[
+        str, ...
+    ] = ()  # host names that are served, as a JSON list; none: any, where tokens are needed
     connections: int = Field(default=1000, gt=0)  # in all; fewer where the system allows fewer open files
     client_connections: int = Field(default=256, gt=0)  # of one address
     header_seconds: float = Field(default=10.0, gt=0)  # in which a request's header must come
@@ -87,6 +92,13 @@ class Settings(BaseSettings):
     retention_windows_days: float = Field(default=30.0, gt=0)  # counted from when a window was stored
     retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
     retention_uploads_days: float = Field(default=7.0, gt=0)
+
+    @field_validator("admin_token")
+    @classmethod
+    def _long_enough(cls, value: SecretStr | None) -> SecretStr | None:
+        if value is not None and len(value.get_secret_value()) < 20:
+            raise ValueError("a token that can be guessed is none; give at least 20 characters")
+        return value
 
     @property
     def store_url(self) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Annotated, TypeVar
 
 from fastapi import Depends, Request
@@ -14,6 +13,9 @@ from sqlalchemy import Connection
 
 from sprung.service.api.problems import Problem
 from sprung.service.core import Core
+from sprung.service.store import audit
+from sprung.service.times import now_ns
+from sprung.service.tokens import Actor
 
 T = TypeVar("T")
 
@@ -25,13 +27,6 @@ def get_core(request: Request) -> Core:
 
 
 CoreOf = Annotated[Core, Depends(get_core)]
-
-
-@dataclass(frozen=True, slots=True)
-class Actor:
-    """Who sends a request."""
-
-    name: str = "local"
 
 
 def get_actor(request: Request) -> Actor:
@@ -53,10 +48,27 @@ async def read(core: Core, query: Callable[[Connection], T]) -> T:
     return await run_in_threadpool(work)
 
 
+async def note(core: Core, actor: Actor, action: str, target: str, detail: dict[str, str | None] | None = None) -> None:
+    """Write a deed into the audit log."""
+
+    def work() -> None:
+        with core.store.write() as connection:
+            audit.record(connection, actor.name, action, target, detail, now_ns())
+
+    await run_in_threadpool(work)
+
+
 def known_vehicle(found: bool, vehicle: str) -> None:
     """404 for a vehicle of which nothing was stored."""
     if not found:
         raise Problem(404, f"nothing is known of vehicle {vehicle[:128]!r}")
+
+
+def own_vehicle(actor: Actor, vehicle: str | None) -> None:
+    """403 for a vehicle of another fleet, and for work of which nobody knows whose vehicle it is about."""
+    if not actor.sees(vehicle):
+        what = "name the vehicle" if vehicle is None else f"vehicle {vehicle[:128]!r} is of another fleet"
+        raise Problem(403, f"{what}; the token is for those that begin with {actor.fleet!r}")
 
 
 _ANY: TypeAdapter[object] = TypeAdapter(object)

@@ -11,6 +11,7 @@ from fastapi.concurrency import run_in_threadpool
 from sprung import __version__
 from sprung.service.api import (
     actions,
+    admin,
     diagnose,
     docs,
     events,
@@ -24,6 +25,7 @@ from sprung.service.api import (
     signals,
 )
 from sprung.service.api.description import PROBLEMS, describe
+from sprung.service.api.guard import Guard
 from sprung.service.api.head import HeadAsGet
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
@@ -67,9 +69,9 @@ def create_app(
     app.state.core = core
     problems.install(app)
     describe(app)
-    parts = (identify, fleet, history, signals, actions, lists, events, recordings, diagnose, health, docs)
-    for part in (*parts, fleet_page, vehicle_page, work_pages):
-        app.include_router(part.router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
+    parts = (identify, admin, fleet, history, signals, actions, lists, events, recordings, diagnose, health, docs)
+    for router in (*(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)), admin.pages):
+        app.include_router(router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
     app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes
     system = core.engine.system
@@ -79,4 +81,5 @@ def create_app(
         paths={"/recordings": uploads, "/diagnose": uploads},
     )
     app.add_middleware(HeadAsGet)
+    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens)
     return app

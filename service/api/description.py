@@ -13,6 +13,7 @@ MEDIA = "application/problem+json"
 ERRORS = {
     404: ("Not Found", "No such thing.", "nothing is known of vehicle 'car-99'"),
     413: ("Content Too Large", "The body is past the limit.", "the body is longer than 2000000 bytes"),
+    421: ("Misdirected Request", "The host name is not served here.", "this host name is not served here"),
     415: ("Unsupported Media Type", "Another kind of body is needed.", "send multipart/form-data or JSON"),
     400: ("Bad Request", "What came is no HTTP that can be understood.", "invalid request"),
     401: ("Unauthorized", "A token is needed, or the one that was sent is wrong or expired.", "a token is needed"),
@@ -32,7 +33,7 @@ def _problem(status: int) -> dict[str, Any]:
     return {"description": text, "content": {MEDIA: {"schema": schema, "example": example}}}
 
 
-PROBLEMS: dict[int | str, dict[str, Any]] = {status: _problem(status) for status in (422, 503)}
+PROBLEMS: dict[int | str, dict[str, Any]] = {status: _problem(status) for status in (401, 403, 415, 421, 422, 429, 503)}
 
 
 def describe(app: FastAPI) -> None:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from sqlalchemy import Connection
 
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import Problem, from_validation
@@ -22,6 +22,7 @@ from sprung.service.core import Core
 from sprung.service.errors import NotFound
 from sprung.service.store import fleet, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
+from sprung.service.tokens import Actor
 
 router = APIRouter(tags=["diagnosis"])
 PAGE = "report.html"
@@ -40,7 +41,7 @@ BODY = {
 @router.post(
     "/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics", response_model=models.Job
 )
-async def diagnose(request: Request, core: CoreOf, once: OnceOf) -> Response:
+async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -> Response:
     """Accepts a job: of an uploaded file (multipart, as in `POST /recordings`), of a recording that was uploaded
     before (`{"recording": id}`), or of the last minute of a vehicle (`{"vehicle": id}`).  The job's result names
     the report."""
@@ -49,20 +50,21 @@ async def diagnose(request: Request, core: CoreOf, once: OnceOf) -> Response:
         core.jobs.reserve()
         kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
         if kind == "multipart/form-data":
-            job = await _of_upload(request, core)
+            job = await _of_upload(request, core, actor)
         elif kind == "application/json":
-            job = await _of_reference(request, core)
+            job = await _of_reference(request, core, actor)
         else:
             raise Problem(415, "send multipart/form-data with a file, or application/json")
+        await note(core, actor, "diagnose", job.id, {"vehicle": job.vehicle_id})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
     return await once.answer(act)
 
 
 @router.get("/reports/{id}", summary="A mismatch report", response_model=dict[str, Any])
-async def report(request: Request, core: CoreOf, id: str) -> Response:
+async def report(request: Request, core: CoreOf, actor: ActorOf, id: str) -> Response:
     """The report as JSON, or its page where the client prefers `text/html`."""
-    row = await _report(core, id)
+    row = await _report(core, actor, id)
     accepted = request.headers.get("accept", "")
     if "text/html" in accepted and "application/json" not in accepted:
         return RedirectResponse(f"/reports/{row.id}/page", 303)
@@ -70,25 +72,26 @@ async def report(request: Request, core: CoreOf, id: str) -> Response:
 
 
 @router.get("/reports/{id}/page", summary="A mismatch report as a page", response_class=FileResponse)
-async def report_page(core: CoreOf, id: str) -> Response:
+async def report_page(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """A self-contained page with the pictures."""
-    row = await _report(core, id)
+    row = await _report(core, actor, id)
     path = core.settings.reports / row.id / PAGE  # the id is the store's, not the client's
     if not path.is_file():
         raise NotFound(f"the page of report {row.id} is no longer kept")
     return FileResponse(path, media_type="text/html")
 
 
-async def _of_upload(request: Request, core: Core) -> JobRow:
+async def _of_upload(request: Request, core: Core, actor: Actor) -> JobRow:
     found = await receive(request, core.settings, core.store)
     try:
+        own_vehicle(actor, found.vehicle)
         return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)
     except BaseException:
         discard(core.settings, found.row)
         raise
 
 
-async def _of_reference(request: Request, core: Core) -> JobRow:
+async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
     try:
         body = DiagnoseBody.model_validate_json(await request.body())
     except ValidationError as error:
@@ -98,23 +101,24 @@ async def _of_reference(request: Request, core: Core) -> JobRow:
         raise Problem(422, detail, [{"field": "recording", "detail": detail}])
     if body.recording is None:
         vehicle = str(body.vehicle)
+        own_vehicle(actor, vehicle)
         known_vehicle(await read(core, lambda c: fleet.vehicle_exists(c, vehicle)), vehicle)
         return await run_in_threadpool(core.diagnoses.from_excerpt, vehicle)
     recording = body.recording
 
     def query(connection: Connection) -> RecordingRow:
         row = work.get_recording(connection, recording)
-        if row is None:
+        if row is None or not actor.sees(row.vehicle_id):
             raise NotFound(f"no recording {recording!r}")
         return row
 
     return await run_in_threadpool(core.diagnoses.from_recording, await read(core, query), None)
 
 
-async def _report(core: Core, report_id: str) -> ReportRow:
+async def _report(core: Core, actor: Actor, report_id: str) -> ReportRow:
     def query(connection: Connection) -> ReportRow:
         row = work.get_report(connection, report_id)
-        if row is None:
+        if row is None or not actor.sees(row.vehicle_id):
             raise NotFound(f"no report {report_id[:36]!r}")
         return row
 

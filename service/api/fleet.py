@@ -9,7 +9,7 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import After, Id, Limit, with_cursor
 from sprung.service.core import Core
 from sprung.service.store import fleet, status
@@ -26,6 +26,7 @@ SHOWN_ALARMS = 1000  # active ones of one vehicle
 @router.get("/vehicles", summary="The fleet", response_model=models.Vehicles)
 async def vehicles(
     core: CoreOf,
+    actor: ActorOf,
     limit: Limit = 100,
     after: After = None,
     sort: Annotated[Sort, Query(description="`urgency`: those that need attention first")] = "id",
@@ -36,7 +37,7 @@ async def vehicles(
     retired: Annotated[bool, Query(description="those out of service instead")] = False,
 ) -> Response:
     """A page of vehicles; `next` is the `after` of the following page, null at the end."""
-    wanted = Wanted(q, health, silent_before(core) if silent else None, acknowledged, retired)
+    wanted = Wanted(q, health, silent_before(core) if silent else None, acknowledged, retired, actor.fleet)
 
     def query(connection: Connection) -> dict[str, Any]:
         begin = after if after is None or sort != "id" or ":" in after else f":{after}"

@@ -13,7 +13,7 @@ from fastapi.responses import Response
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response
+from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
 from sprung.service.api.bodies import WindowBody, read_window, start_of
 from sprung.service.api.problems import Problem
 from sprung.service.engine import Engine
@@ -33,7 +33,9 @@ BODY = {
 
 
 @router.post("/identify", openapi_extra=BODY, summary="Identify one window", response_model=models.Identified)
-async def identify(request: Request, core: CoreOf, states: bool = False, track: bool = False) -> Response:
+async def identify(
+    request: Request, core: CoreOf, actor: ActorOf, states: bool = False, track: bool = False
+) -> Response:
     """Parameters of one window, with standard deviations and how well the model fits.
 
     `states=true` adds the simulated states.  `track=true` stores the window and feeds the vehicle's tracker; the
@@ -45,6 +47,8 @@ async def identify(request: Request, core: CoreOf, states: bool = False, track: 
     if track and head.vehicle is None:
         detail = "is needed to track"
         raise Problem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
+    if track:
+        own_vehicle(actor, head.vehicle)
     now = now_ns()
     start = start_of(head, now)
     try:

@@ -10,7 +10,7 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.service.api import models
-from sprung.service.api.access import CoreOf, json_response, read
+from sprung.service.api.access import ActorOf, CoreOf, json_response, note, own_vehicle, read
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.uploads import BODY, discard, receive
 from sprung.service.errors import NotFound
@@ -28,7 +28,7 @@ router = APIRouter(tags=["recordings"])
     summary="Upload a recording",
     response_model=models.Job,
 )
-async def upload(request: Request, core: CoreOf, once: OnceOf) -> Response:
+async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -> Response:
     """Replays the recording (MCAP, BLF, ASC, candump log, MF4, CSV and others) into the store as a job; the answer says
     where to ask for it.
 
@@ -39,22 +39,24 @@ async def upload(request: Request, core: CoreOf, once: OnceOf) -> Response:
         core.jobs.reserve()
         found = await receive(request, core.settings, core.store)
         try:
+            own_vehicle(actor, found.vehicle)
             job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle)
         except BaseException:
             discard(core.settings, found.row)
             raise
+        await note(core, actor, "upload", job.id, {"name": found.row.name, "vehicle": found.vehicle})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
     return await once.answer(act)
 
 
 @router.get("/jobs/{id}", summary="A job", response_model=models.Job)
-async def job(core: CoreOf, id: str) -> Response:
+async def job(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """Where a job stands; `state` is queued, running, done or failed."""
 
     def query(connection: Connection) -> JobRow:
         row = work.get_job(connection, id)
-        if row is None:
+        if row is None or not actor.sees(row.vehicle_id):
             raise NotFound(f"no job {id[:36]!r}")
         return row
 
@@ -62,10 +64,13 @@ async def job(core: CoreOf, id: str) -> Response:
 
 
 @router.delete("/jobs/{id}", summary="Cancel a job", response_model=models.Job)
-async def cancel(core: CoreOf, id: str) -> Response:
+async def cancel(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """A job that waits or runs is given up; it is then `failed`, and its error says that it was cancelled.  What it
     stored before stays."""
-    return json_response(job_dict(await run_in_threadpool(core.jobs.cancel, id, "a user")))
+    await job(core, actor, id)
+    row = await run_in_threadpool(core.jobs.cancel, id, actor.name)
+    await note(core, actor, "cancel job", id)
+    return json_response(job_dict(row))
 
 
 def job_dict(row: JobRow) -> dict[str, Any]:

@@ -264,3 +264,52 @@ def bench(
     from sprung.service.cli.bench import run
 
     return run(name, context.args)
+
+
+token = typer.Typer(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
+app.add_typer(token, name="token")
+
+
+@token.command("create")
+def token_create(
+    name: Annotated[str, typer.Argument(help="Who or what it is for.")],
+    scope: Annotated[str, typer.Option("--scope", help="Of read, ingest, operate, admin, with commas.")] = "read",
+    fleet: Annotated[str, typer.Option("--fleet", help="Only vehicles whose ids begin so.")] = "",
+    days: Annotated[float, typer.Option("--days", min=0, help="Until it ends; 0: never.")] = 365.0,
+    store: StoreUrl = None,
+) -> int:
+    """Make a token and print it."""
+    from sprung.service.cli.token import create
+
+    return create(name, scope, fleet, days, store)
+
+
+@token.command("list")
+def token_list(json_lines: Json = False, store: StoreUrl = None) -> int:
+    """List the tokens, without what they are worth."""
+    from sprung.service.cli.token import show
+
+    return show(json_lines, store)
+
+
+@token.command("rotate")
+def token_rotate(
+    token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
+    hours: Annotated[float, typer.Option("--hours", min=0, help="For which the old one is still good.")] = 24.0,
+    store: StoreUrl = None,
+) -> int:
+    """Make a token like an old one, and let that end."""
+    from sprung.service.cli.token import rotate
+
+    return rotate(token_id, hours, store)
+
+
+@token.command("revoke")
+def token_revoke(
+    token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
+    store: StoreUrl = None,
+) -> int:
+    """Make a token worthless."""
+    from sprung.service.cli.token import revoke
+
+    return revoke(token_id, store)

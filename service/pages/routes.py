@@ -11,7 +11,7 @@ from fastapi import APIRouter, Query
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
-from sprung.service.api.access import CoreOf, read
+from sprung.service.api.access import ActorOf, CoreOf, read
 from sprung.service.api.fleet import silent_before
 from sprung.service.pages.drawing import columns, small_view
 from sprung.service.pages.render import render
@@ -39,6 +39,7 @@ SORTS = (
 @router.get("/")
 async def fleet_page(
     core: CoreOf,
+    actor: ActorOf,
     q: Annotated[str, Query(max_length=128)] = "",
     sort: Sort = "urgency",
     health: str = "",
@@ -50,7 +51,12 @@ async def fleet_page(
     """The fleet, those that need attention first."""
     before = silent_before(core)
     wanted = Wanted(
-        q.strip(), health if health in HEALTH else None, before if silent else None, False if open else None, retired
+        q.strip(),
+        health if health in HEALTH else None,
+        before if silent else None,
+        False if open else None,
+        retired,
+        actor.fleet,
     )
 
     def query(connection: Connection) -> tuple[list[status.FleetRow], dict[str, int]]:
@@ -67,7 +73,7 @@ async def fleet_page(
             rows=rows,
             counts=counts,
             wanted=wanted,
-            searching=wanted != Wanted(),
+            searching=wanted != Wanted(fleet=actor.fleet),
             health=HEALTH,
             system=core.engine.system.name,
             sort=sort,

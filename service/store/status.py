@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
@@ -70,6 +70,7 @@ class Wanted:
     silent_since: int | None = None  # only those from which nothing came since then, ns
     acknowledged: bool | None = None  # False: only those with alarms that nobody has acknowledged
     retired: bool = False  # those out of service instead of those in service
+    fleet: str = ""  # only those whose ids begin so
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +195,7 @@ def cursor(sort: Sort, row: FleetRow) -> str:
 
 def health_counts(connection: Connection, wanted: Wanted) -> dict[str, int]:
     """How many vehicles are in each state of health, whatever health is asked for."""
-    anyhow = Wanted(wanted.search, None, wanted.silent_since, wanted.acknowledged, wanted.retired)
+    anyhow = replace(wanted, health=None)
     query = _filtered(select(fleet_status.c.health, func.count()), anyhow).group_by(fleet_status.c.health)
     return dict.fromkeys(HEALTHS, 0) | {health: count for health, count in connection.execute(query)}
 
@@ -225,6 +226,8 @@ def _filtered(query: Select[Any], wanted: Wanted) -> Select[Any]:
     table = fleet_status
     query = query.select_from(table.join(vehicles, vehicles.c.id == table.c.vehicle_id))
     query = query.where(vehicles.c.retired_ns.is_not(None) if wanted.retired else vehicles.c.retired_ns.is_(None))
+    if wanted.fleet:
+        query = query.where(func.substr(table.c.vehicle_id, 1, len(wanted.fleet)) == wanted.fleet)
     if wanted.search:
         text = wanted.search.lower()
         found = func.lower(vehicles.c.id).contains(text, autoescape=True)

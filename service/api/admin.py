@@ -1,0 +1,159 @@
+"""Signing in, tokens, the audit log, and a look at what the process does."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import time
+from collections import Counter
+from types import FrameType
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from pydantic import Field
+
+from sprung.service.api.access import ActorOf, CoreOf, json_response, read
+from sprung.service.api.bodies import Strict
+from sprung.service.api.guard import COOKIE, session_of
+from sprung.service.pages.render import render
+from sprung.service.store import audit
+from sprung.service.store.tokens import TokenRow
+from sprung.service.times import optional_iso, to_iso
+from sprung.service.tokens import SESSION_SECONDS, Refused
+
+router = APIRouter(tags=["operation"])
+pages = APIRouter(include_in_schema=False)
+SAMPLE_SECONDS = 0.01
+MOST_STACKS = 2000
+
+
+class TokenBody(Strict):
+    """A token to be made."""
+
+    name: Annotated[str, Field(min_length=1, max_length=128)]
+    scopes: Annotated[list[str], Field(min_length=1, max_length=4, description="read, ingest, operate, admin")]
+    fleet: Annotated[str, Field(max_length=128, description="vehicles whose ids begin so; empty: all")] = ""
+    days: Annotated[float | None, Field(gt=0, lt=36_500, description="until it ends; null: never")] = 365.0
+
+
+@pages.get("/signin")
+async def sign_in_page(to: Annotated[str, Query(max_length=500)] = "/") -> HTMLResponse:
+    """A form for a token."""
+    return HTMLResponse(render("signin.html", to=_inside(to), wrong=""))
+
+
+@pages.post("/signin")
+async def sign_in(request: Request, core: CoreOf) -> Response:
+    """Take a token, give a session."""
+    form = await request.form(max_fields=4)
+    to = _inside(str(form.get("to", "/")))
+    try:
+        session = await run_in_threadpool(core.tokens.sign_in, str(form.get("token", "")).strip())
+    except Refused as refused:
+        await asyncio.sleep(0.5)  # whoever guesses has time
+        return HTMLResponse(render("signin.html", to=to, wrong=str(refused)), 401)
+    response = RedirectResponse(to, 303)
+    secure = request.url.scheme == "https"
+    response.set_cookie(COOKIE, session, max_age=int(SESSION_SECONDS), httponly=True, samesite="strict", secure=secure)
+    return response
+
+
+@pages.post("/signout")
+async def sign_out(request: Request, core: CoreOf) -> Response:
+    """End the session."""
+    session = session_of(request.headers)
+    if session is not None:
+        core.tokens.sign_out(session)
+    response = RedirectResponse("/signin", 303)
+    response.delete_cookie(COOKIE)
+    return response
+
+
+@router.get("/tokens", summary="Access tokens", response_model=list[dict[str, Any]])
+async def tokens(core: CoreOf) -> Response:
+    """Every token, the newest first; what they are worth is not kept anywhere."""
+    return json_response([token_dict(row) for row in await run_in_threadpool(core.tokens.rows)])
+
+
+@router.post("/tokens", status_code=201, summary="Make a token", response_model=dict[str, Any])
+async def create_token(core: CoreOf, actor: ActorOf, body: TokenBody) -> Response:
+    """The answer holds the token; it is shown this once."""
+    text, row = await run_in_threadpool(core.tokens.create, body.name, body.scopes, body.fleet, body.days, actor.name)
+    return json_response(token_dict(row) | {"token": text}, 201)
+
+
+@router.delete("/tokens/{id}", summary="Revoke a token", response_model=dict[str, str])
+async def revoke_token(core: CoreOf, actor: ActorOf, id: str) -> Response:
+    """It is worth nothing within five seconds."""
+    await run_in_threadpool(core.tokens.revoke, id, actor.name)
+    return json_response({"revoked": id})
+
+
+@router.get("/audit", summary="Who did what", response_model=list[dict[str, Any]])
+async def audit_log(
+    core: CoreOf, limit: Annotated[int, Query(ge=1, le=1000)] = 100, before: Annotated[int | None, Query(ge=0)] = None
+) -> Response:
+    """The newest deeds first; `before`: older than the one with this id."""
+    rows = await read(core, lambda connection: audit.entries(connection, limit, before))
+    found = [
+        {
+            "id": r.id,
+            "time": to_iso(r.time_ns),
+            "actor": r.actor,
+            "action": r.action,
+            "target": r.target,
+            "detail": r.detail,
+        }
+        for r in rows
+    ]
+    return json_response(found)
+
+
+@pages.get("/debug/profile")
+async def profile(seconds: Annotated[float, Query(gt=0, le=30)] = 3.0) -> PlainTextResponse:
+    """Stacks of every thread, looked at a hundred times a second, one line each with its count: the format that flame
+    graphs are drawn from."""
+    return PlainTextResponse(await run_in_threadpool(stacks, seconds))
+
+
+def stacks(seconds: float) -> str:
+    """Folded stacks of the threads of this process."""
+    own, names = threading.get_ident(), {}
+    counts: Counter[str] = Counter()
+    end = time.monotonic() + seconds
+    while time.monotonic() < end:
+        names = {thread.ident: thread.name for thread in threading.enumerate()}
+        for ident, frame in sys._current_frames().items():
+            if ident != own:
+                counts[f"{names.get(ident, ident)};{_folded(frame)}"] += 1
+        time.sleep(SAMPLE_SECONDS)
+    return "".join(f"{stack} {count}\n" for stack, count in counts.most_common(MOST_STACKS))
+
+
+def _folded(frame: FrameType | None) -> str:
+    found: list[str] = []
+    while frame is not None:
+        found.append(f"{frame.f_globals.get('__name__', '?')}.{frame.f_code.co_name}")
+        frame = frame.f_back
+    return ";".join(reversed(found))
+
+
+def token_dict(row: TokenRow) -> dict[str, Any]:
+    """JSON of a token, without anything that it is worth."""
+    return {
+        "id": row.id,
+        "name": row.name,
+        "scopes": row.scopes,
+        "fleet": row.fleet,
+        "created": to_iso(row.created_ns),
+        "expires": optional_iso(row.expires_ns),
+        "revoked": optional_iso(row.revoked_ns),
+    }
+
+
+def _inside(to: str) -> str:
+    """A path of this service: not of another one."""
+    return to if to.startswith("/") and not to.startswith(("//", "/\\")) else "/"

@@ -1,0 +1,70 @@
+"""`sprung token`."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from sprung.service.errors import UserError
+from sprung.service.settings import settings_with
+from sprung.service.store import open_store
+from sprung.service.times import optional_iso, to_iso
+from sprung.service.tokens import Tokens
+
+
+@contextmanager
+def opened(store: str | None) -> Iterator[Tokens]:
+    """The tokens of a store."""
+    found = open_store(settings_with({"store": store}).store_url)
+    try:
+        yield Tokens(found)
+    finally:
+        found.close()
+
+
+def create(name: str, scopes: str, fleet: str, days: float, store: str | None) -> int:
+    """Make a token and print it; it cannot be shown again."""
+    with opened(store) as tokens:
+        wanted = [scope.strip() for scope in scopes.split(",") if scope.strip()]
+        text, row = tokens.create(name, wanted, fleet, days or None)
+    ends = "does not end" if row.expires_ns is None else f"ends {to_iso(row.expires_ns)}"
+    print(text)
+    print(f"token {row.id} of {name}: {', '.join(row.scopes)}; {ends}; it is shown this once", file=sys.stderr)
+    return 0
+
+
+def rotate(token_id: str, hours: float, store: str | None) -> int:
+    """Make a token like an old one, and let that end."""
+    with opened(store) as tokens:
+        try:
+            text, row = tokens.rotate(token_id, hours)
+        except LookupError as error:
+            raise UserError(str(error)) from None
+    print(text)
+    print(f"token {row.id} takes the place of {token_id}, which ends in {hours:g} h", file=sys.stderr)
+    return 0
+
+
+def revoke(token_id: str, store: str | None) -> int:
+    """Make a token worthless."""
+    with opened(store) as tokens:
+        try:
+            tokens.revoke(token_id)
+        except LookupError as error:
+            raise UserError(str(error)) from None
+    return 0
+
+
+def show(json_lines: bool, store: str | None) -> int:
+    """List the tokens."""
+    with opened(store) as tokens:
+        rows = tokens.rows()
+    for row in rows:
+        state = "revoked" if row.revoked_ns is not None else optional_iso(row.expires_ns) or "no end"
+        if json_lines:
+            print(json.dumps({"id": row.id, "name": row.name, "scopes": row.scopes, "fleet": row.fleet, "ends": state}))
+        else:
+            print(f"{row.id}  {row.name:24s} {','.join(row.scopes):24s} {row.fleet or 'all vehicles':20s} {state}")
+    return 0
