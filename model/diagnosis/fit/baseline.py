@@ -43,7 +43,7 @@ def baseline(system: System, signals: Signals, declared: Noise, split: int) -> t
 def _baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
-    part = transform(first, noise, rated=drifting(system, signals.sensor_index))
+    part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise)
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
@@ -69,7 +69,7 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
             settled += 1
             noise = sensor_noise(fit.forward, fit.spectrum, noise)
         renewed = replace(problem, noise=noise)
-        enough = settled == (2 if problem.follows else 1)
+        enough = settled == (2 if problem.process_noise else 1)
         again = try_optimise(renewed, fit.point, 6 if enough else 2)
         if again is None:
             break

@@ -9,11 +9,11 @@ import numpy as np
 from sprung.model.diagnosis.fit.columns import Columns
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
-from sprung.model.diagnosis.fit.tangent import Taken, law_change, port_motions, step_of, tangent
+from sprung.model.diagnosis.fit.tangent import SmootherCorrection, law_change, port_motions, step_of, tangent
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import is_waveform
@@ -86,7 +86,7 @@ def _of_theta(
         else:
             packed.add_force(i, problem.system.elements.index(parameter.element), theta_forces[:, i])
     slopes = np.zeros(P + p)
-    if problem.follows:
+    if problem.process_noise:
         slopes[:P] = _log_det_slopes(forward, whitener)
     laws = 0 if forces is None else len(forces.terms)
     law_forces = np.zeros((len(forward.part.grid.omega), p, laws), dtype=complex)
@@ -130,10 +130,10 @@ def _add_laws_answers(
     along = port_motions(forward, forces, known.theta_forces, known.loads, known.law_forces, states)
     for column, motion in known.shifts.items():
         along[..., column] = motion
-    taken = Taken(whitener, forward, forces) if problem.follows else None
-    if taken is not None:
-        along = along - taken.motion(known.packed.whitened)
-    extra = tangent(forward, forces, along, taken)
+    correction = SmootherCorrection(whitener, forward, forces) if problem.process_noise else None
+    if correction is not None:
+        along = along - correction.motion(known.packed.whitened)
+    extra = tangent(forward, forces, along, correction)
     for k, port in enumerate(forces.ports):
         for column in range(extra.shape[2]):
             known.packed.add_port(column, port, extra[:, k, column])
@@ -178,11 +178,11 @@ def _difference(
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
     other, other_forward, other_forces = problem.predict(
-        replace(point, terms=terms, near=near_of(forces)), working.inputs
+        replace(point, terms=terms, warm_start=warm_start_of(forces)), working.inputs
     )
     free = other_forward.free_rows() - forward.free_rows()
     change = (other - shown + problem.part.grid.forward(free @ point.state)) / step
-    if not problem.follows:
+    if not problem.process_noise:
         return Change(change)
     log_det = (Whitener.of(other_forward, problem.noise).log_det - working.whitener.log_det) / step
     if forces is None or other_forces is None:

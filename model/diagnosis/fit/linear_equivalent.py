@@ -1,4 +1,8 @@
-"""The equivalent linear law, which the plant carries so that only the curvature is left to the iteration."""
+"""Equivalent linearisation of laws: the plant carries it, so that only the curvature is left to the iteration.
+
+The stiffness and damping nearest to the law's force along its motion in least squares (statistical
+linearisation, Roberts and Spanos 2003; for one harmonic the describing function).
+"""
 
 from __future__ import annotations
 
@@ -21,7 +25,7 @@ _SETTLED = 1e-3  # largest change of an equivalent stiffness or damping, as a sh
 _NEAR = 0.2  # the same where the loop converges anyway
 
 
-def preloaded(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> Point:
+def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> Point:
     """The point with the laws' equivalent stiffness and damping moved into the plant.
 
     The equivalent depends on the motion that the law shapes, so the two are iterated until the loop converges; a
@@ -35,15 +39,15 @@ def preloaded(problem: Problem, point: Point, inputs: SmoothedInputs | None) -> 
         if forces is None:
             return point
         start = particular_start(forward, forces)
-        terms, near, change = _moved(forward, forces, point)
-        point = replace(point, terms=terms, near=tuple(near.T))
-        if change < _SETTLED or problem.follows:
+        terms, force, change = _moved(forward, forces, point)
+        point = replace(point, terms=terms, warm_start=tuple(force.T))
+        if change < _SETTLED or problem.process_noise:
             break
         # the free state counts from the plant's particular solution, which has changed: keep motion and true state
         moved = problem.forward(point, inputs)
         loop = moved.loop(point.state)
         if loop is not None:
-            point = replace(point, state=start + point.state - particular_start(moved, loop.answer(near)))
+            point = replace(point, state=start + point.state - particular_start(moved, loop.answer(force)))
         if forces.converged and change < _NEAR:
             break
     return point
@@ -56,20 +60,20 @@ def _carried(term: Term) -> bool:
 
 def _moved(forward: Forward, forces: LawForces, point: Point) -> tuple[tuple[Term, ...], FloatArray, float]:
     """Terms with their present equivalents, the laws' forces without them (4N, m), and the largest relative change."""
-    terms, change, near = [], 0.0, forces.force.copy()
+    terms, change, force = [], 0.0, forces.force.copy()
     for term in point.terms:
         if _carried(term):
             k, c = _equivalent(forward, forces, term)
-            more_k, more_c = k - term.preload[0], c - term.preload[1]
+            more_k, more_c = k - term.equivalent[0], c - term.equivalent[1]
             i = forces.index(term)
-            near[:, i] -= more_k * forces.deflection[:, i] + more_c * forces.rate[:, i]
+            force[:, i] -= more_k * forces.deflection[:, i] + more_c * forces.rate[:, i]
             element = forward.element_of(term)
             size = abs(float(element.stiffness)) + 1e-12, abs(float(element.damping)) + 1e-12
             change = max(change, abs(more_k) / (size[0] + abs(k)), abs(more_c) / (size[1] + abs(c)))
-            terms.append(replace(term, preload=(k, c)))
+            terms.append(replace(term, equivalent=(k, c)))
         else:
             terms.append(term)
-    return tuple(terms), near, change
+    return tuple(terms), force, change
 
 
 def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float, float]:
@@ -86,5 +90,5 @@ def _equivalent(forward: Forward, forces: LawForces, term: Term) -> tuple[float,
     k = max(k, -0.9 * element.stiffness) if element.stiffness else 0.0  # a body that floats stays afloat
     c = max(c, -0.9 * element.damping) if element.damping else max(c, 0.0)
     if not forces.converged:
-        k, c = (k + term.preload[0]) / 2, (c + term.preload[1]) / 2
+        k, c = (k + term.equivalent[0]) / 2, (c + term.equivalent[1]) / 2
     return float(k), float(c)

@@ -59,7 +59,7 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Nois
     """Levels of the sensors from the residual (F, S) of a fit."""
     band = forward.part.grid.band
     residual = spectrum[band][1:]
-    variance = noise.sensor_variance(forward.part.grid, forward.part.rated)[band][1:] / noise.sensors**2
+    variance = noise.sensor_variance(forward.part.grid, forward.part.differentiated)[band][1:] / noise.sensors**2
     for _ in range(_ROUNDS):
         factor = Whitener.of(forward, noise).factor[1:]
         precision = factor.conj().transpose(0, 2, 1) @ factor

@@ -17,14 +17,14 @@ from functools import cached_property
 import numpy as np
 
 from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
-from sprung.model.diagnosis.fit.linear_equivalent import preloaded
+from sprung.model.diagnosis.fit.linear_equivalent import with_equivalents
 from sprung.model.diagnosis.fit.problem import Problem, law_forces
 from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened, scale_of, smoothed
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.motion import Motions
 from sprung.model.diagnosis.response.point import Point, advance, held_back
 from sprung.model.diagnosis.response.terms import Term
@@ -150,7 +150,7 @@ def optimise(
             left = promised
             break
         rise = proposed.value - state.value
-        if 0 <= rise < _SMOOTHING * float(state.lin.residual @ state.lin.residual) and not problem.follows:
+        if 0 <= rise < _SMOOTHING * float(state.lin.residual @ state.lin.residual) and not problem.process_noise:
             state = replace(state, working=working, value=_value_under(problem, state, working))
         if proposed.value < state.value:
             left = state.value - proposed.value
@@ -159,7 +159,7 @@ def optimise(
             if size < tolerance or left < _SMALL * max(1.0, size):
                 break
             if count in (2, 4):
-                state = replace(state, point=preloaded(problem, state.point, state.working.inputs))
+                state = replace(state, point=with_equivalents(problem, state.point, state.working.inputs))
         else:
             left = promised
             damping = max(damping * 30, 100 * _DAMPING[0])
@@ -170,16 +170,18 @@ def optimise(
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:
     """The start with its laws' equivalents in the plant, and what its residual is weighed by."""
-    if problem.follows:
+    if problem.process_noise:
         point, working = along_measured_motion(problem, start)
-        return along_measured_motion(problem, preloaded(problem, point, working.inputs))
-    return opened(problem, preloaded(problem, start, None), whitener)
+        return along_measured_motion(problem, with_equivalents(problem, point, working.inputs))
+    return opened(problem, with_equivalents(problem, start, None), whitener)
 
 
 def _state(problem: Problem, point: Point, working: Working) -> _State:
     """The model linearised at a point.  Objective: twice the negative log-posterior, up to a constant."""
     lin = linearise(problem, point, working)
-    return _State(replace(point, near=near_of(lin.forces)), working, lin, _value(lin.residual, lin.log_det, point))
+    return _State(
+        replace(point, warm_start=warm_start_of(lin.forces)), working, lin, _value(lin.residual, lin.log_det, point)
+    )
 
 
 def _value(residual: FloatArray, log_det: float, point: Point) -> float:
@@ -191,7 +193,7 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
     inputs, point = working.inputs, state.point
     if inputs is None:
         return state.value
-    forward = state.lin.forward.driven_by(inputs.part, point.near)
+    forward = state.lin.forward.driven_by(inputs.part, point.warm_start)
     shown = problem.shown(forward, law_forces(forward, point, inputs))
     free = problem.free_columns(forward) @ point.state
     return _value(working.whitener(problem.part.sensors - shown - free, problem.part), state.lin.log_det, point)
@@ -245,7 +247,7 @@ def _finish(problem: Problem, state: _State, left: float, count: int) -> Fit:
     slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)
     covariance = covariance * slopes * slopes[:, None]
     return Fit(
-        point=replace(point, near=near_of(lin.forces)),
+        point=replace(point, warm_start=warm_start_of(lin.forces)),
         chi_square=float(lin.residual @ lin.residual),
         log_det=lin.log_det,
         log_det_slope=lin.log_det_slope,

@@ -41,14 +41,14 @@ class Problem:
     noise: Noise
 
     @property
-    def follows(self) -> bool:
+    def process_noise(self) -> bool:
         """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
-        return self.noise.follows
+        return self.noise.process_noise
 
     def forward(self, point: Point, inputs: SmoothedInputs | None = None) -> Forward:
         """The model at a point under the measured inputs, or under smoothed ones."""
         part = self.part if inputs is None else inputs.part
-        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.near)
+        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start)
 
     def predict(
         self, point: Point, inputs: SmoothedInputs | None = None

@@ -13,7 +13,7 @@ from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
+from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.signals import FloatArray
 
@@ -32,7 +32,7 @@ class Working:
 
 def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> tuple[Point, Working]:
     """A point and what its residual is weighed by, before any residual is known."""
-    if problem.follows:
+    if problem.process_noise:
         return along_measured_motion(problem, point)
     return point, Working(whitener or Whitener.of(problem.forward(point), problem.noise))
 
@@ -43,7 +43,7 @@ def smoothed(problem: Problem, point: Point, working: Working, spectrum: Complex
     What of the residual the inputs' noise explains is taken for it.  Returns the point, where the system has measured
     forces with its starting state fitted anew.
     """
-    if problem.follows:
+    if problem.process_noise:
         return along_measured_motion(problem, point)
     # the noise of supports is small: the last residual tells it well enough
     return point, replace(working, inputs=SmoothedInputs(_smoothed(problem.part, working.whitener, spectrum)))
@@ -57,7 +57,7 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
     other; they are iterated like the forces of a free run.
     """
     part = problem.part
-    forward = problem.forward(replace(point, near=()))
+    forward = problem.forward(replace(point, warm_start=()))
     whitener = Whitener.of(forward, problem.noise)  # noise goes through the plant as it is now
     free = problem.free_columns(forward)
     columns = whitener(free, part)
@@ -74,15 +74,15 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
         state, inputs = explained(None)
         return replace(point, state=state), Working(whitener, SmoothedInputs(inputs))
 
-    def along(force: FloatArray, loop: Loop = loop) -> FloatArray:
+    def along(force: FloatArray, loop: HarmonicBalance = loop) -> FloatArray:
         state, inputs = explained(loop.answer(force))
         driven = loop.driven(forward.driven_by(inputs).fine_motion(loop.ports, state))
         return driven.law(*driven.motion(force))
 
-    start = np.column_stack(point.near) if point.near else along(np.zeros((len(loop.d0), len(loop.terms))))
+    start = np.column_stack(point.warm_start) if point.warm_start else along(np.zeros((len(loop.d0), len(loop.terms))))
     force, _ = fixed_point(along, start, _FOLLOWED)
     state, inputs = explained(loop.answer(force))
-    return replace(point, state=state, near=tuple(force.T)), Working(whitener, SmoothedInputs(inputs, force))
+    return replace(point, state=state, warm_start=tuple(force.T)), Working(whitener, SmoothedInputs(inputs, force))
 
 
 def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
@@ -91,7 +91,7 @@ def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
     whitened = (whitener.factor @ spectrum[band, :, None])[:, :, 0]
     size = np.mean(np.abs(whitened) ** 2, axis=1)
     local = np.convolve(np.pad(size, _WIDTH // 2, mode="edge"), np.ones(_WIDTH) / _WIDTH, mode="valid")
-    shift = np.einsum("fis,fs->fi", whitener.blame, whitened)
+    shift = np.einsum("fis,fs->fi", whitener.smoother_gain, whitened)
     support, force = part.support.copy(), part.force.copy()
     count = support.shape[1]
     support[band] += shift[:, :count] / np.maximum(1.0, local)[:, None]

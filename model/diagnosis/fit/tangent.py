@@ -111,19 +111,21 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
     return swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
 
 
-def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Taken | None) -> ComplexArray:
+def tangent(
+    forward: Forward, forces: LawForces, motions: FloatArray, correction: SmootherCorrection | None
+) -> ComplexArray:
     """Spectra (F, m, columns) of the forces by which the laws answer small motions along their ports.
 
-    The law's tangent along the trajectory, less the preload that the plant carries, closed over the plant:
+    The law's tangent along the trajectory, less its equivalent, which the plant carries, closed over the plant:
     f = s (d0 + D f) with the slopes s over time, solved for all columns at once.  Laws with memory have no tangent
-    in one instant; for them the preload stands.
+    in one instant; for them the equivalent stands.
     """
     plant, grid = forward.plant, forward.part.grid
     slopes = np.stack([_slopes(forward, forces, i) for i in range(len(forces.terms))], axis=2)  # (2, N, m)
     ports = forward.plant.structure.widened(forces.ports)
     compliance = plant.compliance(ports, ports)
-    if taken is not None:
-        compliance[grid.band] -= taken.deflection @ taken.seen
+    if correction is not None:
+        compliance[grid.band] -= correction.deflection @ correction.seen
     jw = 1j * grid.omega[:, None, None]
     if not plant.floats:  # single precision is ample for what is solved to a few thousandths, and quick
         slopes, motions = slopes.astype(np.float32), motions.astype(np.float32)
@@ -134,8 +136,8 @@ def tangent(forward: Forward, forces: LawForces, motions: FloatArray, taken: Tak
         if plant.floats:
             spectrum = grid.forward(force)
             d, v = _floating(forward, ports, ports, spectrum)
-            if taken is not None:
-                d, v = (d, v) - taken.motion(taken.seen @ spectrum[grid.band])
+            if correction is not None:
+                d, v = (d, v) - correction.motion(correction.seen @ spectrum[grid.band])
             return force - along_d * d - along_v * v
         moved = compliance @ grid.forward(force)
         return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
@@ -175,7 +177,7 @@ def _gmres(apply: Callable[[FloatArray], FloatArray], right: FloatArray) -> Floa
 
 
 def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
-    """Derivatives of a law's force by deflection and rate along the trajectory, less the preload, (2, N)."""
+    """Derivatives of a law's force by deflection and rate along the trajectory, less its equivalent's, (2, N)."""
     term = forces.terms[i]
     grid = forward.part.grid
     law = term.element_law
@@ -185,7 +187,7 @@ def _slopes(forward: Forward, forces: LawForces, i: int) -> FloatArray:
     time = grid.start + grid.fine_time
     element = forward.element_of(term)
     result = np.empty((2, grid.samples))
-    for k, (signal, load) in enumerate(((d, term.preload[0]), (v, term.preload[1]))):
+    for k, (signal, load) in enumerate(((d, term.equivalent[0]), (v, term.equivalent[1]))):
         step = 1e-3 * float(np.std(signal)) + 1e-300
         moves = ((step, 0.0), (-step, 0.0)) if k == 0 else ((0.0, step), (0.0, -step))
         up, down = (force_along(law, term.parameters, d + a, v + b, time, element) for a, b in moves)
@@ -207,7 +209,7 @@ def law_force(forward: Forward, term: Term, forces: LawForces) -> FloatArray:
     )
 
 
-class Taken:
+class SmootherCorrection:
     """What of a motion along the laws' ports the smoothed inputs take back.
 
     Inputs are smoothed anew when a value moves, so that the motion moves only as far as sensors and inputs allow: where
@@ -219,11 +221,11 @@ class Taken:
         band = self.grid.band
         ports = forward.plant.structure.widened(forces.ports)
         inputs = plant.deflection_of_inputs[band]
-        self.deflection = ports @ inputs @ whitener.blame  # of whitened sensor signals, (F, m, S)
+        self.deflection = ports @ inputs @ whitener.smoother_gain  # of whitened sensor signals, (F, m, S)
         self.rate = 1j * self.grid.omega[band, None, None] * self.deflection
         if plant.floats:
             steady = ports @ plant.structure.H @ plant.steady_rate @ plant.structure.F
-            self.rate[0] = steady @ whitener.blame[0, plant.structure.G.shape[1] :]
+            self.rate[0] = steady @ whitener.smoother_gain[0, plant.structure.G.shape[1] :]
         shown = plant.sensor_of_force[band] * forward.sensor_factor[band, :, None]
         self.seen = whitener.factor @ shown @ ports.T  # whitened sensor signals per force along the ports
 

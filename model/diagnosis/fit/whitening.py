@@ -17,7 +17,7 @@ class Whitener:
     """Inverse Cholesky factors of the residual's covariance on the compared bins."""
 
     factor: ComplexArray  # (F, S, S)
-    blame: ComplexArray  # whitened residual to the inputs' share of it, supports then forces, (F, inputs, S)
+    smoother_gain: ComplexArray  # whitened residual to the inputs' share of it, supports then forces, (F, inputs, S)
     weight: FloatArray  # of the bins among real numbers, (F,)
 
     @property
@@ -28,7 +28,7 @@ class Whitener:
 
     def log_det_slope(self, change: ComplexArray) -> float:
         """Rise of `log_det` per unit of a change (F, S, inputs) of what the sensors show of the inputs."""
-        return 2 * float(self.weight**2 @ np.real(np.einsum("fst,fti,fis->f", self.factor, change, self.blame)))
+        return 2 * float(self.weight**2 @ np.real(np.einsum("fst,fti,fis->f", self.factor, change, self.smoother_gain)))
 
     @classmethod
     def of(cls, forward: Forward, noise: Noise) -> Whitener:
@@ -41,7 +41,7 @@ class Whitener:
         weighted = G * variance[:, None, :]
         R = weighted @ G.conj().transpose(0, 2, 1)
         index = np.arange(R.shape[1])
-        R[:, index, index] += noise.sensor_variance(part.grid, part.rated)[band]
+        R[:, index, index] += noise.sensor_variance(part.grid, part.differentiated)[band]
         factor = np.linalg.inv(np.linalg.cholesky(R))
         return cls(factor, (factor @ weighted).conj().transpose(0, 2, 1), part.grid.weight)
 

@@ -107,8 +107,8 @@ def _without_input_faults(
 
 def _on_everything(state: Investigation) -> Fit:
     """The model fitted to the whole recording, once it has been judged; the first part's where that goes astray."""
-    rated = drifting(state.system, state.signals.sensor_index)
-    part = transform(state.signals, state.problem.noise, rated=rated)
+    differentiated = drifting(state.system, state.signals.sensor_index)
+    part = transform(state.signals, state.problem.noise, differentiated=differentiated)
     problem = replace(state.problem, part=part)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
     return fit if fit is not None and fit.reduced < _ASTRAY * state.fit.reduced else state.fit
@@ -185,12 +185,12 @@ def _minor(state: Investigation, trial: Trial) -> bool:
     """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
-            least = _MINOR_FOLLOWED if state.problem.follows else _MINOR_ELSEWHERE
+            least = _MINOR_FOLLOWED if state.problem.process_noise else _MINOR_ELSEWHERE
             if trial.gain < least * found.trial.gain:
                 return True
         elif not trial.named:
             return True
-        elif state.problem.follows:
+        elif state.problem.process_noise:
             left = float(np.sum(state.fit.noise.force**2))
             if trial.worth < min(_MINOR_BESIDE * found.trial.worth, _MOST_LEFT * left):
                 return True

@@ -30,7 +30,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     expected = floor / np.where(size > 0, size, 1.0)
     errors = Errors(before.per_sensor, after.per_sensor, realised_floor(expected, after))
-    lost = state.problem.follows and after.nrmse > RULES.strange
+    lost = state.problem.process_noise and after.nrmse > RULES.strange
     deciding = errors
     if lost:
         shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]

@@ -71,7 +71,7 @@ class Noise:
     least: FloatArray  # of the sensors' levels: far below what was declared, another noise has taken their place, (S,)
 
     @property
-    def follows(self) -> bool:
+    def process_noise(self) -> bool:
         """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
         return len(self.force) > 0
 
@@ -79,13 +79,13 @@ class Noise:
         """Variance of the fused displacement per bin, shape (F, supports)."""
         return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)
 
-    def sensor_variance(self, grid: Grid, rated: np.ndarray) -> FloatArray:
+    def sensor_variance(self, grid: Grid, differentiated: np.ndarray) -> FloatArray:
         """Variance of the compared sensor signals per bin, (F, S); of positions compared by their rates, of the rate.
 
         The noise of the record's two ends, where the rate's line is anchored, spreads over all bins alike.
         """
         ends = 2 / (grid.samples * grid.step**2)
-        return self.sensors**2 * np.where(rated, grid.omega[:, None] ** 2 + ends, 1.0)
+        return self.sensors**2 * np.where(differentiated, grid.omega[:, None] ** 2 + ends, 1.0)
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Part:
     force: ComplexArray  # (F, forces)
     force_polynomial: FloatArray
     sensors: ComplexArray  # (F, S), whole signal
-    rated: np.ndarray  # sensors that measure a position and are compared by its rate, (S,)
+    differentiated: np.ndarray  # sensors that measure a position and are compared by its rate, (S,)
     redundancy: ComplexArray  # V / j w - D_d of the supports with both, zero at zero frequency, (F, pairs)
     pairs: np.ndarray  # which supports, shape (pairs,)
     displacement: ComplexArray  # of the displacement channel alone, without polynomial, (F, supports)
@@ -165,16 +165,16 @@ def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
     return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
 
 
-def transform(signals: Signals, noise: Noise, rated: np.ndarray | None = None) -> Part:
+def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None = None) -> Part:
     """Spectra of a part.
 
-    `rated`: sensors whose series are compared by their rates (`drifting`), (S,).
+    `differentiated`: sensors whose series are compared by their rates (`drifting`), (S,).
     """
     grid = Grid(signals.samples, 1 / signals.sample_rate, signals.start)
-    rated = np.zeros(signals.sensors.shape[1], dtype=bool) if rated is None else rated
+    differentiated = np.zeros(signals.sensors.shape[1], dtype=bool) if differentiated is None else differentiated
     sensors = signals.sensors
-    if rated.any():
-        sensors = np.where(rated, rate_of(sensors, grid), sensors)
+    if differentiated.any():
+        sensors = np.where(differentiated, rate_of(sensors, grid), sensors)
     omega = grid.omega[:, None]
     has_rate = np.isfinite(noise.velocity)
     d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
@@ -204,7 +204,7 @@ def transform(signals: Signals, noise: Noise, rated: np.ndarray | None = None) -
         force=grid.forward(signals.force - grid.monomials @ force_polynomial),
         force_polynomial=force_polynomial,
         sensors=grid.forward(sensors),
-        rated=rated,
+        differentiated=differentiated,
         redundancy=redundancy,
         pairs=pairs,
         displacement=D,

@@ -209,7 +209,7 @@ def _deviations(system: System, fit: Fit) -> FloatArray:
         if term.law.named or fit.forces is None:
             continue
         d, v = fit.forces.deflection[:, i], fit.forces.rate[:, i]
-        force = np.std(fit.forces.force[:, i] + term.preload[0] * d + term.preload[1] * v)
+        force = np.std(fit.forces.force[:, i] + term.equivalent[0] * d + term.equivalent[1] * v)
         for j, parameter in enumerate(system.parameters):
             if parameter.element == term.location and parameter.quantity != "mass":
                 along = np.std(d if parameter.quantity == "stiffness" else v)

@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
 from sprung.model.diagnosis.response.frf import Plant
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop, fixed_point
+from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, SupportLaw
@@ -58,14 +58,14 @@ class Forward:
     @cached_property
     def plant(self) -> Plant:
         structure = structure_of(self.system, self.sensors, self.theta, self.terms)
-        structure = replace(structure, sensor_kind=np.where(self.part.rated, VELOCITY, structure.sensor_kind))
+        structure = replace(structure, sensor_kind=np.where(self.part.differentiated, VELOCITY, structure.sensor_kind))
         waveform, linear, _, _ = split(self.terms)
         stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
         for term in waveform:
             if "|" not in term.location:
                 e = self.system.elements.index(term.location)
-                stiffness[e] += term.preload[0]
-                damping[e] += term.preload[1]
+                stiffness[e] += term.equivalent[0]
+                damping[e] += term.equivalent[1]
         places = [self.system.elements.index(term.location) for term in linear]
         found = [branch_of(term, e, structure.damping[e]) for term, e in zip(linear, places, strict=True)]
         branches = tuple(branch for branch in found if branch is not None)
@@ -274,14 +274,14 @@ class Forward:
         start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
         return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start))
 
-    def loop(self, state: FloatArray) -> Loop | None:
+    def loop(self, state: FloatArray) -> HarmonicBalance | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""
         waveform, *_ = split(self.terms)
         if not waveform:
             return None
         ports = np.array([term.port(self.system) for term in waveform])
         elements = [self.element_of(term) for term in waveform]
-        return Loop(self.plant, waveform, ports, elements, self.fine_motion(ports, state))
+        return HarmonicBalance(self.plant, waveform, ports, elements, self.fine_motion(ports, state))
 
     def driven_by(self, part: Part, start_force: tuple[FloatArray, ...] = ()) -> Forward:
         """The same model under other inputs; `start_force`: its laws' forces nearby."""

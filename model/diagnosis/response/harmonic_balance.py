@@ -2,8 +2,9 @@
 
     d = d_linear + D f,   f = law(d, d')        over the whole record at once
 
-by a fixed-point iteration with Anderson acceleration (Walker and Ni 2011) on an oversampled grid, around the
-equivalent linear law (`Term.preload`, carried by the plant), so that only the law's curvature is left to it.
+Harmonic balance by alternating frequency and time (Cameron and Griffin 1989): the plant answers in frequency, the laws
+in time on an oversampled grid, to a fixed point with Anderson acceleration (Walker and Ni 2011), around the laws'
+equivalent linearisation (`Term.equivalent`, carried by the plant), so that only the law's curvature is left to it.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _REACH = 4.0  # a trajectory this many times the linear one's reach is an iterat
 
 @dataclass(frozen=True)
 class LawForces:
-    """Solution of the loop for m laws; forces without the preload that the plant carries."""
+    """Solution of the loop for m laws; forces without the equivalents that the plant carries."""
 
     terms: list[Term]
     ports: FloatArray  # (m, E)
@@ -49,12 +50,12 @@ class LawForces:
         return next(i for i, own in enumerate(self.terms) if own.key == term.key)
 
 
-def near_of(forces: LawForces | None) -> tuple[FloatArray, ...]:
+def warm_start_of(forces: LawForces | None) -> tuple[FloatArray, ...]:
     """The laws' forces as a start for a solution nearby, each (4N,)."""
     return () if forces is None else tuple(forces.force.T)
 
 
-class Loop:
+class HarmonicBalance:
     """Laws and the motion along their ports under the laws' forces, on the oversampled axis.
 
     terms (m,) at elements with the springs and dampers `elements`, along ports (m, E) of the plant; d0 and v0 (4N, m)
@@ -84,7 +85,7 @@ class Loop:
         self.d0, self.v0 = d0, v0
         self.reach = _REACH * np.abs(d0).max(axis=0), _REACH * np.abs(v0).max(axis=0)
 
-    def driven(self, motion: tuple[FloatArray, FloatArray]) -> Loop:
+    def driven(self, motion: tuple[FloatArray, FloatArray]) -> HarmonicBalance:
         """The same loop under other inputs or from another state: deflection and rate without the laws' forces."""
         other = copy(self)
         other._drive(*motion)
@@ -96,8 +97,8 @@ class Loop:
         d, v = np.clip(d, -self.reach[0], self.reach[0]), np.clip(v, -self.reach[1], self.reach[1])
         columns = [
             force_along(t.element_law, t.parameters, d[:, i], v[:, i], time, self.elements[i])
-            - t.preload[0] * d[:, i]
-            - t.preload[1] * v[:, i]
+            - t.equivalent[0] * d[:, i]
+            - t.equivalent[1] * v[:, i]
             for i, t in enumerate(self.terms)
         ]
         return np.column_stack(columns)

@@ -17,7 +17,7 @@ class Point:
     theta: FloatArray  # (P,)
     terms: tuple[Term, ...]
     state: FloatArray  # (2n + b,)
-    near: tuple[FloatArray, ...] = ()  # the laws' forces on a trajectory nearby, each (4N,), to start from
+    warm_start: tuple[FloatArray, ...] = ()  # the laws' forces on a trajectory nearby, each (4N,), to start from
 
 
 def advance(point: Point, step: FloatArray) -> Point:
@@ -28,7 +28,7 @@ def advance(point: Point, step: FloatArray) -> Point:
         count = len(term.parameters)
         terms.append(term.advanced(step[at : at + count]))
         at += count
-    return Point(theta, tuple(terms), point.state + step[at:], point.near)
+    return Point(theta, tuple(terms), point.state + step[at:], point.warm_start)
 
 
 def held_back(point: Point, step: FloatArray) -> np.ndarray:

@@ -22,7 +22,7 @@ class Term:
     location: str  # element, body, support, sensor or input channel; "left|right" of a pair or an axle
     parameters: tuple[float, ...]
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
-    preload: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
+    equivalent: tuple[float, float] = (0.0, 0.0)  # stiffness and damping of the law's equivalent, kept by the plant
 
     scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
     fixed: tuple[bool, ...] = ()  # parameters that the system file holds; as `parameters`, none if left out

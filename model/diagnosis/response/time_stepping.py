@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.frf import Plant
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, Loop
+from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, Motion, SpringDamper
 from sprung.model.laws.base import Values
@@ -29,7 +29,7 @@ _SETTLED = 1e-3
 
 
 def march_forces(forward: Forward, state: FloatArray, first: int | None = None) -> FloatArray:
-    """Force of every law along its trajectory less its preload, (OVERSAMPLING N, laws).
+    """Force of every law along its trajectory less its equivalent, (OVERSAMPLING N, laws).
 
     state (2n + b,): the free motion at the first sample, as `forward` counts it.  From sample `first` on, the forces
     up to there being known: those that `forward` starts from.  By default over the whole trajectory, which is periodic.
@@ -46,7 +46,7 @@ def march_forces(forward: Forward, state: FloatArray, first: int | None = None) 
     return force
 
 
-def _periodic(loop: Loop) -> FloatArray:
+def _periodic(loop: HarmonicBalance) -> FloatArray:
     """Forces over the whole trajectory, which begins where it ends."""
     begin = np.zeros(loop.plant.structure.states)
     for _ in range(_ROUNDS):
@@ -57,7 +57,7 @@ def _periodic(loop: Loop) -> FloatArray:
     return force
 
 
-def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, float]:
+def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> tuple[FloatArray, float]:
     """Forces along a part of the fine axis, (4N', laws), from the state of their motion, and its largest size."""
     grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0[part], loop.v0[part]
     A, rows = s.state_matrix(), s.motion_rows(loop.wide)
@@ -69,7 +69,7 @@ def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, floa
         force_steps(A, s.force_columns(loop.wide), rows, step),
         expm(A * grid.step),
         [
-            Site(_preloaded(term, reach), term.parameters, element)
+            Site(_without_equivalent(term, reach), term.parameters, element)
             for term, element, reach in zip(loop.terms, loop.elements, np.transpose(loop.reach), strict=True)
         ],
         (inputs + propagate(A, rows, begin, step / 2, len(nodes)))[..., None],
@@ -81,9 +81,9 @@ def _march(loop: Loop, part: slice, begin: FloatArray) -> tuple[FloatArray, floa
     return force, float(np.max(np.abs(solution.states)))
 
 
-def _preloaded(term: Term, reach: FloatArray) -> ElementLaw:
+def _without_equivalent(term: Term, reach: FloatArray) -> ElementLaw:
     """The law less the linear part that the plant carries, flat beyond its reach (deflection, rate)."""
-    law, (stiffness, damping) = term.element_law, term.preload
+    law, (stiffness, damping) = term.element_law, term.equivalent
 
     def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
         d, v = np.clip(motion.deflection, -reach[0], reach[0]), np.clip(motion.rate, -reach[1], reach[1])

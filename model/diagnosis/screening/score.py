@@ -101,14 +101,14 @@ class Projector:
         self.factor = factor
 
     @cached_property
-    def lean(self) -> FloatArray:
+    def score_offset(self) -> FloatArray:
         """What the residual leans on J at the end of a fit whose residual's covariance depends on the parameters.
 
         Such a fit ends at J^T r = d log det R / 2, not at zero.
         """
         slope = np.concatenate([self.fit.log_det_slope, np.zeros(len(self.fit.point.state))])[-len(self.kept) :]
-        lean = np.linalg.lstsq(self.r.T, slope[self.kept] / self.scale[self.kept], rcond=1e-9)[0]
-        return np.asarray(self.q @ lean[self.strong] / 2)
+        score_offset = np.linalg.lstsq(self.r.T, slope[self.kept] / self.scale[self.kept], rcond=1e-9)[0]
+        return np.asarray(self.q @ score_offset[self.strong] / 2)
 
     def spread(self, column: FloatArray, change: ComplexArray) -> float:
         """What the residual's determinant adds to the product of a column and the residual.
@@ -116,9 +116,9 @@ class Projector:
         change (F, S, inputs): of what the sensors show of the inputs.  Forces along elements need none of it: what
         the determinant makes of them is what it makes of the spring and damper that they resemble.
         """
-        if not self.problem.follows:
+        if not self.problem.process_noise:
             return 0.0
-        return float(column @ self.lean) - self.fit.whitener.log_det_slope(change) / 2
+        return float(column @ self.score_offset) - self.fit.whitener.log_det_slope(change) / 2
 
     @cached_property
     def complex_q(self) -> ComplexArray:

@@ -67,7 +67,7 @@ def _of_sensors(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[C
         for law in laws:
             slope = law.slope()
             factor = _factor(slope, jw)
-            if problem.part.rated[i] and not np.any(factor):
+            if problem.part.differentiated[i] and not np.any(factor):
                 continue  # a position that is compared by its rate shows no bias
             signal = factor * truth[:, i] + slope.offset * constant
             column = projector.pack(projector.factor[:, :, i] * signal[:, None])

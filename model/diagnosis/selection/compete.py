@@ -68,7 +68,7 @@ class Trial:
     @property
     def explains(self) -> float:
         """How much of what was missing: evidence, or power of forces that nobody measured."""
-        return self.worth if self.fit.noise.follows else self.gain
+        return self.worth if self.fit.noise.process_noise else self.gain
 
     @property
     def named(self) -> bool:
@@ -134,7 +134,7 @@ def compete(
     best = trials[0].evidence
 
     def close(rank: int, trial: Trial) -> bool:
-        near = problem.follows or trial.evidence > best - max(_NEAR, 0.3 * abs(best))
+        near = problem.process_noise or trial.evidence > best - max(_NEAR, 0.3 * abs(best))
         return rank < _LAST or (rank < _MOST_FINISHED and near)
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
@@ -185,7 +185,7 @@ def _begun(problem: Problem, base: Fit, hit: Candidate) -> Trial | None:
 def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
     it promises is explained.  With one law alone it stays as what that one was chosen before."""
-    if problem.follows or len(named) < 2:
+    if problem.process_noise or len(named) < 2:
         return True
     best = max(named, key=lambda trial: trial.worth)
     noise = 1 + _CHANCE * np.sqrt(2 / best.fit.count)
@@ -195,7 +195,7 @@ def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
 def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
     least = min((t.fit.reduced for t in trials), default=1.0)
-    if least < _QUIET and not problem.follows:
+    if least < _QUIET and not problem.process_noise:
         again = [_judged(problem, base, t.hit, t.fit, _QUIET * least) for t in trials]
         trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
     return sorted(trials, key=lambda t: -t.evidence)
@@ -211,7 +211,7 @@ def start_of(base: Fit, hit: Candidate) -> Point:
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
     if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
         state = np.append(state, 0.0)
-    near = point.near
+    near = point.warm_start
     if is_waveform(hit.term):
         near = (*near, base.force_along(hit.term))
     return Point(point.theta, (*point.terms, hit.term), state, near)
@@ -291,10 +291,10 @@ def _try(problem: Problem, base: Fit, hit: Candidate, start: Point, iterations: 
 
 def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
-    if trial.fit.converged and not problem.follows:
+    if trial.fit.converged and not problem.process_noise:
         return trial
     finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
-    if not problem.follows or finished.fit.deviance > base.deviance:
+    if not problem.process_noise or finished.fit.deviance > base.deviance:
         return finished
     _, fit = refreshed(problem, finished.fit)
     return _judged(problem, base, trial.hit, fit)
@@ -302,7 +302,7 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
 
 def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = _QUIET) -> Trial:
     sensors = len(problem.sensors)
-    if problem.follows:  # how noisy the forces are is what candidates differ in
+    if problem.process_noise:  # how noisy the forces are is what candidates differ in
         gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
         worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
     else:

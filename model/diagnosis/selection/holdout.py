@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise, Part, Signals, drifting, rate_of, transform
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid
 from sprung.model.diagnosis.response.forward import Forward, propagate
-from sprung.model.diagnosis.response.harmonic_balance import LawForces, near_of
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_forces
 from sprung.model.diagnosis.selection.compete import profile_gain
@@ -68,7 +68,7 @@ class HeldOut:
     split: int
 
     @cached_property
-    def rated(self) -> BoolArray:
+    def differentiated(self) -> BoolArray:
         """Sensors that are compared by their rates."""
         return drifting(self.system, self.signals.sensor_index)
 
@@ -80,7 +80,9 @@ class HeldOut:
     @cached_property
     def later(self) -> Part:
         """The held-out part as it is compared: positions that drift by their rates."""
-        return transform(self.signals.part(self.split, self.signals.samples), self.noise, rated=self.rated)
+        return transform(
+            self.signals.part(self.split, self.signals.samples), self.noise, differentiated=self.differentiated
+        )
 
     @property
     def grid(self) -> Grid:
@@ -89,7 +91,7 @@ class HeldOut:
     @cached_property
     def tracked(self) -> Part:
         """The whole recording as it is followed: positions that drift by their rates."""
-        return transform(self.signals, self.noise, rated=self.rated)
+        return transform(self.signals, self.noise, differentiated=self.differentiated)
 
     @property
     def still(self) -> bool:
@@ -116,11 +118,11 @@ class HeldOut:
         state = np.zeros_like(point.state)
         trained = slice(0, self.split)
         weights = 1 / self.noise.sensors
-        near = point.near if problem.follows else ()
-        for number in range(2 if problem.follows else _ROUNDS):
-            forward = problem.forward(replace(point, state=state, near=near))
+        near = point.warm_start if problem.process_noise else ()
+        for number in range(2 if problem.process_noise else _ROUNDS):
+            forward = problem.forward(replace(point, state=state, warm_start=near))
             shown, forces = self._free_run(problem, forward, state, number > 0)
-            near = near_of(forces)
+            near = warm_start_of(forces)
             rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, part.grid.step, self.split)
             particular = part.grid.inverse(shown)
@@ -130,11 +132,11 @@ class HeldOut:
             solved = np.linalg.lstsq(normal * scale * scale[:, None], right * scale, rcond=1e-12)[0] * scale
             moved = float(np.max(np.abs(solved - state) / np.maximum(np.abs(solved), 1e-12)))
             state = solved
-            if forces is None or (moved < 1e-3 and not problem.follows):
+            if forces is None or (moved < 1e-3 and not problem.process_noise):
                 break
         A = forward.plant.structure.state_matrix()
         simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
-        return simulated[self.split :], replace(point, state=state, near=near)
+        return simulated[self.split :], replace(point, state=state, warm_start=near)
 
     def compare(self, before: Fit, after: Fit) -> Comparison:
         """Two fits on the held-out part.
@@ -142,7 +144,7 @@ class HeldOut:
         Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
         good the model.
         """
-        if not before.noise.follows:
+        if not before.noise.process_noise:
             first, second = self._residuals(*self.runs(before.point, after.point))
             gain = float(first @ first - second @ second)
         else:
@@ -154,7 +156,7 @@ class HeldOut:
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""
         problem = Problem(self.system, self.later, self.signals.sensor_index, fit.noise)
-        point, working = along_measured_motion(problem, replace(fit.point, near=()))
+        point, working = along_measured_motion(problem, replace(fit.point, warm_start=()))
         shown, forward, _ = problem.predict(point, working.inputs)
         free = self.later.grid.forward(forward.free_rows() @ point.state)
         return working.whitener(self.later.sensors - shown - free, self.later), working.whitener.log_det
@@ -162,13 +164,13 @@ class HeldOut:
     def _up_to_split(self, point: Point) -> tuple[Point, Part]:
         """The inputs as measured, but where laws follow the sensors' motion up to the split: smoothed until there.
 
-        With the point, whose `near` are then the laws' forces along that motion.
+        With the point, whose warm start are then the laws' forces along that motion.
         """
         signals = self.signals
         follower = Problem(self.system, self.tracked, signals.sensor_index, self.noise)
-        if not follower.follows:
+        if not follower.process_noise:
             return point, self.whole
-        point, working = along_measured_motion(follower, replace(point, near=()))
+        point, working = along_measured_motion(follower, replace(point, warm_start=()))
         followed = follower.forward(point, working.inputs).part
         force = followed.grid.inverse(followed.force) + followed.grid.monomials @ followed.force_polynomial
         force[self.split :] = signals.force[self.split :]
@@ -185,7 +187,7 @@ class HeldOut:
         if loop is None:
             return problem.shown(forward, None), None
         forces: LawForces | None
-        if problem.follows:
+        if problem.process_noise:
             known = np.column_stack(forward.start_force)
             forces = loop.answer(march_forces(forward, state, self.split) if started else known)
         else:
@@ -209,7 +211,7 @@ class HeldOut:
         residuals = []
         for run in runs:
             error = run.measured - run.simulated
-            compared = np.where(self.later.rated, rate_of(error, self.grid), error)
+            compared = np.where(self.later.differentiated, rate_of(error, self.grid), error)
             residuals.append(whitener(self.grid.forward(compared), self.later))
         return residuals
 
