@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import shutil
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from sqlalchemy.exc import SQLAlchemyError
@@ -16,6 +19,52 @@ from sprung.service.times import NANOSECONDS, now_ns
 log = logging.getLogger("sprung.housekeeping")
 PERIOD_SECONDS = 3600.0
 DAY = 86_400 * NANOSECONDS
+LONGEST_PAUSE = DAY  # by which a pause of the service ages what is kept
+
+
+class RetentionClock:
+    """Time by which things age: it goes with the host's clock, but takes no leap.
+
+    While the service runs it advances as the monotonic clock does, however the host's clock is set meanwhile; over a
+    pause of the service it advances by a day at the most.  A clock that is forty days ahead after a rollover, or years
+    because a battery was empty, makes nothing old; a train that stood for months loses its data some days later than
+    it could.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        before: Callable[[], int | None],
+        wall: Callable[[], int] = now_ns,
+        monotonic: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        """before: where the clock stood as far as anybody knows, when its file is not there."""
+        self._path = path
+        self._before = before
+        self._wall = wall
+        self._monotonic = monotonic
+        self._last: tuple[int, int] | None = None  # (this clock, monotonic)
+
+    def now(self) -> int:
+        """ns since epoch; written down, so that the next process goes on from there."""
+        wall, monotonic = self._wall(), self._monotonic()
+        if self._last is not None:
+            time_ns = self._last[0] + (monotonic - self._last[1])
+        else:
+            kept = self._kept() or self._before()
+            time_ns = wall if kept is None else kept + min(max(wall - kept, 0), LONGEST_PAUSE)
+        self._last = (time_ns, monotonic)
+        part = self._path.with_suffix(".part")
+        self._path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_text(json.dumps({"time_ns": time_ns}))
+        part.replace(self._path)
+        return time_ns
+
+    def _kept(self) -> int | None:
+        try:
+            return int(json.loads(self._path.read_text())["time_ns"])
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
 
 
 class Housekeeping:
@@ -24,6 +73,7 @@ class Housekeeping:
     def __init__(self, settings: Settings, store: Store) -> None:
         self._settings = settings
         self._store = store
+        self.clock = RetentionClock(settings.data_dir / "retention.json", self._newest)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-housekeeping", daemon=True)
 
@@ -52,24 +102,34 @@ class Housekeeping:
             log.warning("%d files that were left half written are deleted", len(left))
         return [path.name for path in left]
 
-    def once(self, now: int) -> retention.Forgotten:
-        """One round, as if it were `now`, ns since epoch."""
+    def once(self, now: int, keep: bool = True) -> retention.Forgotten:
+        """One round, as if it were `now`, ns since epoch; keep: False only tells what would be forgotten."""
         settings = self._settings
+        limits = retention.Limits(
+            now - round(settings.retention_windows_days * DAY),
+            now - round(settings.retention_minutes_days * DAY),
+            now - round(settings.retention_uploads_days * DAY),
+            settings.retention_store_bytes,
+            round(0.8 * settings.max_uploads_bytes),  # so that the next upload finds room
+        )
         with self._store.write() as connection:
-            forgotten = retention.forget(
-                connection,
-                now - round(settings.retention_windows_days * DAY),
-                now - round(settings.retention_minutes_days * DAY),
-                now - round(settings.retention_uploads_days * DAY),
-            )
+            forgotten = retention.forget(connection, limits)
+            if not keep:
+                connection.get_transaction().rollback()  # type: ignore[union-attr]
+                return forgotten
         for name in forgotten.upload_files:
             (settings.uploads / name).unlink(missing_ok=True)
         return forgotten
 
+    def _newest(self) -> int | None:
+        """When the last window was stored: a store that comes without its clock is not older than that."""
+        with self._store.read() as connection:
+            return retention.newest(connection)
+
     def _run(self) -> None:
         while True:
             try:
-                self.once(now_ns())
+                self.once(self.clock.now())
             except (SQLAlchemyError, OSError):
                 log.exception("housekeeping failed; it tries again in an hour")
             if self._stopping.wait(PERIOD_SECONDS):

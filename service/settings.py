@@ -89,7 +89,10 @@ class Settings(BaseSettings):
     misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 
-    retention_windows_days: float = Field(default=30.0, gt=0)  # counted from when a window was stored
+    retention_store_bytes: int | None = Field(default=None, gt=0)  # of an SQLite store; the oldest windows make room
+    retention_windows_days: float = Field(
+        default=30.0, gt=0
+    )  # by the time of the data and of storing, whichever is later
     retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
     retention_uploads_days: float = Field(default=7.0, gt=0)
 

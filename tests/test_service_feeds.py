@@ -394,8 +394,8 @@ def test_housekeeping_deletes_what_is_old(core: Core, recording: Path) -> None:
     core.settings.uploads.mkdir(parents=True)
     (core.settings.uploads / "old.csv").write_text("x")
     with core.store.write() as connection:
-        work.add_recording(connection, work.RecordingRow("r", None, "n", "upload", "old.csv", 1, None, 0, None))
-    core.housekeeping.once(time.time_ns())
+        work.add_recording(connection, work.RecordingRow("r", None, "n", "upload", "old.csv", 1, None, START, None))
+    core.housekeeping.once(START + 30 * 86_400 * 10**9)
     assert not (core.settings.uploads / "old.csv").exists()
     core.close()
 

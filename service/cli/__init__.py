@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -14,6 +15,7 @@ INTERRUPTED = 130
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; never a traceback, unless SPRUNG_DEBUG is set."""
+    _usable_streams()
     from sprung.service.cli.app import app
 
     try:
@@ -32,6 +34,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if status == INTERRUPTED:
         print("sprung: interrupted", file=sys.stderr)
     return status if isinstance(status, int) else 0
+
+
+def _usable_streams() -> None:
+    """Streams that take every character, and that are there at all: `>&-` closes them, `LC_ALL=C` makes them ASCII."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115 (for as long as the process)
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def describe(error: Exception) -> str:

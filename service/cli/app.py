@@ -266,6 +266,17 @@ def bench(
     return run(name, context.args)
 
 
+@app.command()
+def retention(
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be forgotten.")] = False,
+    store: StoreUrl = None,
+) -> int:
+    """Forget now what the settings SPRUNG_RETENTION_... do not keep; the service does so every hour."""
+    from sprung.service.cli.retention import run
+
+    return run(dry_run, store)
+
+
 token = typer.Typer(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
 app.add_typer(token, name="token")
 

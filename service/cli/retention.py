@@ -1,0 +1,27 @@
+"""`sprung retention`."""
+
+from __future__ import annotations
+
+from sprung.service.housekeeping import Housekeeping
+from sprung.service.settings import settings_with
+from sprung.service.store import open_store
+from sprung.service.times import to_iso
+
+
+def run(dry_run: bool, store: str | None) -> int:
+    """Forget, or tell what would be forgotten."""
+    settings = settings_with({"store": store})
+    opened = open_store(settings.store_url)
+    try:
+        housekeeping = Housekeeping(settings, opened)
+        now = housekeeping.clock.now()
+        found = housekeeping.once(now, keep=not dry_run)
+    finally:
+        opened.close()
+    would = "would be forgotten" if dry_run else "are forgotten"
+    room = f" ({found.windows_for_room} of them to make room)" if found.windows_for_room else ""
+    print(
+        f"as of {to_iso(now)}: {found.windows} windows{room}, {found.minutes} one-minute roll-ups and "
+        f"{len(found.upload_files)} uploaded files {would}"
+    )
+    return 0

@@ -1,0 +1,128 @@
+"""What is kept: by both clocks of a window, within bytes, and no clock that leaps forgets anything."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select
+
+from sprung.model.system import System
+from sprung.service.compute import Compute
+from sprung.service.engine import Engine
+from sprung.service.housekeeping import DAY, Housekeeping, RetentionClock
+from sprung.service.pipeline import Pipeline
+from sprung.service.settings import Settings
+from sprung.service.store import Store, retention, work
+from sprung.service.store.schema import windows
+from tests.service_fakes import START, make_window
+
+HOUR = DAY // 24
+
+
+def stored(store: Store) -> int:
+    with store.read() as connection:
+        return int(connection.execute(select(func.count()).select_from(windows)).scalar_one())
+
+
+def fill(engine: Engine, store: Store, compute: Compute, system: System, at: int, first: int = 0) -> None:
+    pipeline = Pipeline(engine, store, compute, clock=lambda: at)
+    pipeline.process("a", [make_window(system, first + i) for i in range(20)])
+
+
+class Clocks:
+    """A host's clocks."""
+
+    def __init__(self, wall: int) -> None:
+        self.wall, self.monotonic = wall, 5
+
+    def passed(self, seconds: float, leap: int = 0) -> None:
+        self.wall += round(seconds * 1e9) + leap
+        self.monotonic += round(seconds * 1e9)
+
+    def retention(self, path: Path, newest: int | None = None) -> RetentionClock:
+        return RetentionClock(path, lambda: newest, lambda: self.wall, lambda: self.monotonic)
+
+
+def test_the_clock_goes_on_with_time_but_takes_no_leap(tmp_path: Path) -> None:
+    path, clocks = tmp_path / "retention.json", Clocks(START)
+    clock = clocks.retention(path)
+    assert clock.now() == START
+    clocks.passed(3600)
+    assert clock.now() == START + HOUR
+    clocks.passed(3600, leap=40 * DAY)
+    assert clock.now() == START + 2 * HOUR
+    clocks.passed(3600, leap=-80 * DAY)
+    assert clock.now() == START + 3 * HOUR
+
+
+@pytest.mark.parametrize(("leap", "advance"), [(40 * DAY, DAY), (5500 * DAY, DAY), (-9000 * DAY, 0), (HOUR, HOUR)])
+def test_a_restart_advances_it_by_a_day_at_the_most(tmp_path: Path, leap: int, advance: int) -> None:
+    path = tmp_path / "retention.json"
+    Clocks(START).retention(path).now()
+    assert Clocks(START + leap).retention(path).now() == START + advance
+
+
+def test_without_its_file_it_begins_at_the_last_window(tmp_path: Path) -> None:
+    path = tmp_path / "retention.json"
+    assert Clocks(START + 40 * DAY).retention(path, newest=START).now() == START + DAY
+    path.write_text("rubbish")
+    assert Clocks(START + 40 * DAY).retention(path, newest=START).now() == START + DAY
+
+
+@pytest.mark.parametrize("leap", [40 * DAY, 5500 * DAY])
+def test_a_clock_that_is_ahead_at_the_start_forgets_nothing(
+    engine: Engine, store: Store, compute: Compute, system: System, tmp_path: Path, leap: int
+) -> None:
+    fill(engine, store, compute, system, START)
+    housekeeping = Housekeeping(Settings(data_dir=tmp_path), store)
+    housekeeping.clock = Clocks(START + leap).retention(tmp_path / "retention.json", newest=START)
+    assert housekeeping.once(housekeeping.clock.now()).windows == 0
+    assert stored(store) == 20
+
+
+@pytest.mark.parametrize(
+    ("stored_at", "forgotten"), [(0, 0), (START, 20), (START + 31 * DAY, 0)], ids=["1970", "long ago", "lately"]
+)
+def test_a_window_is_old_when_its_data_and_its_storing_are(
+    engine: Engine, store: Store, compute: Compute, system: System, tmp_path: Path, stored_at: int, forgotten: int
+) -> None:
+    fill(engine, store, compute, system, stored_at)
+    found = Housekeeping(Settings(data_dir=tmp_path), store).once(START + 32 * DAY)
+    assert (found.windows, stored(store)) == (forgotten, 20 - forgotten)
+
+
+def test_a_preview_tells_the_same_and_keeps_everything(
+    engine: Engine, store: Store, compute: Compute, system: System, tmp_path: Path
+) -> None:
+    fill(engine, store, compute, system, START)
+    housekeeping = Housekeeping(Settings(data_dir=tmp_path), store)
+    preview = housekeeping.once(START + 32 * DAY, keep=False)
+    assert (preview.windows, stored(store)) == (20, 20)
+    assert housekeeping.once(START + 32 * DAY) == preview
+    assert stored(store) == 0
+
+
+def test_a_store_that_is_too_large_loses_its_oldest_windows(
+    engine: Engine, store: Store, compute: Compute, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sprung.service.store.retention.AT_ONCE", 5)
+    for first in range(0, 200, 20):
+        fill(engine, store, compute, system, START, first)
+    with store.read() as connection:
+        used = retention.used_bytes(connection)
+    assert used is not None
+    with store.write() as connection:
+        found = retention.forget(connection, retention.Limits(0, 0, 0, store_bytes=used - 50_000))
+        left = connection.execute(select(func.min(windows.c.start_ns))).scalar_one()
+    assert 0 < found.windows == found.windows_for_room < 200
+    assert left == START + found.windows * 500_000_000  # the oldest went
+
+
+def test_uploads_make_room_oldest_first(store: Store) -> None:
+    with store.write() as connection:
+        for number in range(5):
+            row = work.RecordingRow(f"r{number}", None, "n", "upload", f"{number}.csv", 100, None, START + number, None)
+            work.add_recording(connection, row)
+        found = retention.forget(connection, retention.Limits(0, 0, 0, upload_bytes=250))
+    assert found.upload_files == ("0.csv", "1.csv", "2.csv")
