@@ -7,24 +7,11 @@ from datetime import UTC, datetime
 
 NANOSECONDS = 1_000_000_000
 AHEAD = 300 * NANOSECONDS  # ns that a vehicle's clock may be ahead of this host's
-FIRST_YEAR = 946_684_800 * NANOSECONDS  # 2000: no window of a running train is older
 
 
 def now_ns() -> int:
     """The wall clock, ns since epoch; the one place of the service that reads it for stored rows."""
     return time.time_ns()
-
-
-def start_problem(start_ns: int, now_ns: int) -> str | None:
-    """Why a window that is sent now cannot have begun at `start_ns`; None when it can.
-
-    Only for what comes from a clock of now: a replayed recording may be from any time.
-    """
-    if start_ns > now_ns + AHEAD:
-        return f"start {to_iso(start_ns)} is in the future: this host's clock says {to_iso(now_ns)}"
-    if start_ns < FIRST_YEAR:
-        return f"start {to_iso(start_ns)} is before the year 2000: the sender's clock is not set"
-    return None
 
 
 def to_iso(nanoseconds: int) -> str:

@@ -12,7 +12,8 @@ from cantools.database.can import Database, Message, Signal
 
 from sprung.model.signals import Channel
 from sprung.replay import UnreadableRecording
-from sprung.replay.live import LiveBus, send
+from sprung.replay.account import Account
+from sprung.replay.live import LiveBus, frame_block, send
 from sprung.replay.windowing import Windower
 
 CHANNEL = Channel("speed", "m/s", 0.1, can="Train.Speed")
@@ -195,3 +196,30 @@ def test_udp_multicast_carries_frames_between_buses(dbc):
         assert listener.wait(lambda: len(listener.values()) >= 10)
     listener.stop()
     assert Counter(listener.values()) == Counter(float(value) for value in range(10))
+
+
+def test_a_frame_from_the_future_does_not_make_the_reader_deaf(dbc, bus_name):
+    bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
+    now = time.time()
+
+    def stamped(ahead):
+        message = frame(1)
+        message.timestamp = now + ahead
+        return [message]
+
+    assert bus._current(stamped(0.0))
+    bus._current(stamped(14 * 365.25 * 86_400))
+    assert bus._current(stamped(0.1))
+    assert bus.lag < 1.0
+    assert bus.tally.dropped == 0
+    bus._current(stamped(-3600.0))
+    assert bus._current(stamped(-3599.0))
+
+
+def test_a_frame_without_a_possible_time_costs_itself():
+    good, bad, worse = frame(1), frame(2), frame(3)
+    good.timestamp, bad.timestamp, worse.timestamp = 1_790_000_000.0, float("nan"), 1e30
+    account = Account()
+    block = frame_block([good, bad, worse], account)
+    assert block.time.tolist() == [1_790_000_000_000_000_000]
+    assert account.tally.corrupt == 2

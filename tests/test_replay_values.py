@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mcap.writer import Writer
 
 from sprung.model.signals import Channel, SampleBlock
-from sprung.replay.account import KEPT_PROBLEMS, Account
+from sprung.replay.account import KEPT_PROBLEMS, Account, UnreadableRecording
 from sprung.replay.blf import frames as blf_frames
 from sprung.replay.convert import converter
 from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_RANGE, OUT_OF_TIME, Screen, nanoseconds
@@ -274,3 +274,21 @@ def test_countless_problems_are_a_hundred_lines():
         account.problem(f"chunk {number} is damaged")
     assert len(account.problems) == KEPT_PROBLEMS + 1
     assert account.problems[-1] == f"and {100_000 - KEPT_PROBLEMS} more like these"
+
+
+def test_names_in_a_file_can_do_nothing_to_a_terminal(tmp_path):
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("Body", "jsonschema", b"{}")
+        channel = writer.register_channel("/evil\n\x1b[31mred" + "x" * 100_000, "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    with pytest.raises(UnreadableRecording) as found:
+        read(path)
+    assert str(found.value).isprintable()
+    assert len(str(found.value)) < 1100
+    account = Account()
+    account.problem("topic a\r\n\tb\x07 cannot be read")
+    assert account.problems == ["topic a b cannot be read"]

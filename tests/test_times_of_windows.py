@@ -13,7 +13,6 @@ from sprung.service.compute import Compute
 from sprung.service.engine import Engine
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store
-from sprung.service.times import start_problem
 from tests.service_fakes import HOP, START, make_window
 from tests.tracker_windows import EPOCH, constant, correlated, make_tracker, step, windows
 
@@ -60,15 +59,6 @@ def test_a_new_segment_is_followed_the_same_after_a_restart(
         state = Pipeline(engine, store, compute, clock=lambda: NOW).process("a", whole[:until]).state
     at_once = Pipeline(engine, store, compute, clock=lambda: NOW).process("b", whole).state
     assert state.to_dict() == at_once.to_dict()
-
-
-def test_a_start_that_is_sent_now_lies_neither_ahead_nor_before_clocks() -> None:
-    assert start_problem(NOW, NOW) is None
-    assert start_problem(NOW + 60 * 10**9, NOW) is None
-    assert start_problem(NOW - 86_400 * 10**9, NOW) is None
-    assert "in the future" in (start_problem(NOW + 174 * YEAR, NOW) or "")
-    assert "in the future" in (start_problem(NOW + 600 * 10**9, NOW) or "")
-    assert "before the year 2000" in (start_problem(5 * 10**9, NOW) or "")
 
 
 def test_a_change_under_way_is_found_though_the_clock_steps_back() -> None:
