@@ -136,6 +136,11 @@ class System:
                 channels.append(_channel(f"{name}.pressure", "pressure", body.load.pressure))
         return tuple(channels)
 
+    @property
+    def needed_inputs(self) -> int:
+        """Leading channels without which a window is worthless; a speed that is missing is estimated."""
+        return 0 if self.on_track else len(self.inputs)
+
     @cached_property
     def on_track(self) -> bool:
         """Whether what moves it is a track that nobody measures."""

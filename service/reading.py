@@ -97,7 +97,7 @@ def windower_of(system: System, stamped: bool = False) -> Windower:
         system.sample_rate,
         system.window,
         system.hop,
-        inputs=len(system.inputs),
+        inputs=system.needed_inputs,
         stamped=stamped,
     )
 

@@ -181,7 +181,7 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
 
 def _usable(system: System, recording: Recording) -> Iterator[list[Window]]:
     """Windows that were not dropped, in batches."""
-    windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=len(system.inputs))
+    windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=system.needed_inputs)
     held: list[Window] = []
 
     def windows() -> Iterator[Window]:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.linalg
 import scipy.signal
 
+import sprung
 from sprung.benchmarks.generator.ride import Ride, draw_ride, record
 from sprung.model.ambient.forces import ForceExcitation
 from sprung.model.ambient.identify import AmbientIdentifier
@@ -204,6 +206,24 @@ def test_a_changed_structure_does_not_fit(vehicle: System) -> None:
     assert not seen.adequate
 
 
+def test_a_measured_speed_is_used_and_a_missing_one_estimated() -> None:
+    rng = np.random.default_rng(14)
+    ride = draw_ride(rng)
+    values = record(rng, ride, 30.0)
+    system = parse_system(ACCELEROMETERS.read_text() + "\nspeed: {csv: v, unit: km/h, noise: 0.2}\n")
+    assert system.channels[0].name == "speed" and system.needed_inputs == 0
+    identifier = AmbientIdentifier(system)
+    stds = []
+    for speed in (ride.speed, np.nan):
+        told = identifier.told(np.column_stack([np.full(3000, speed), values]))
+        assert told is not None
+        assert told.speed[0] == pytest.approx(ride.speed, rel=3e-3)
+        stds.append(told.speed[1])
+    assert stds[0] <= stds[1]
+    crawling = np.column_stack([np.full(3000, 3.0), values])
+    assert identifier.told(crawling) is None
+
+
 def test_windows_of_another_shape_and_values_that_are_no_numbers_are_refused(vehicle: System) -> None:
     with pytest.raises(UnusableWindow, match=r"shape \(B, T, 12\)"):
         AmbientIdentifier(vehicle).identify(np.zeros((1, 6000, 3)))
@@ -289,3 +309,23 @@ def test_identifiability_of_a_vehicle_on_a_track_is_what_a_minute_then_tells(veh
     assert told[:8].max() < 0.03 and told[12:20].max() < 0.1
     with pytest.raises(SystemFileError, match=r"window: 1 s is too short .* a minute \(6000\)"):
         parse_system(ACCELEROMETERS.read_text().replace("window: 6000", "window: 100"))
+
+
+@pytest.mark.slow
+def test_a_ride_is_tracked_from_a_table_of_accelerations(vehicle: System, tmp_path: Path) -> None:
+    rng = np.random.default_rng(15)
+    ride = draw_ride(rng)
+    values = record(rng, ride, 150.0)
+    names = list(vehicle.sensors)
+    text = ACCELEROMETERS.read_text()
+    for name in names:
+        text = text.replace(f"  {name}: {{kind: acceleration", f"  {name}: {{kind: acceleration, csv: {name}")
+    system = parse_system(text)
+    table = np.column_stack([1.7e9 + np.arange(len(values)) / 100, values])
+    path = tmp_path / "ride.csv"
+    np.savetxt(path, table, delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.6f")
+    tracked = sprung.track(system, sprung.open_recording(path, system))
+    assert tracked.windows >= 3
+    for report, truth in zip(tracked.parameters, ride.log_ratio, strict=True):
+        assert report.identifiable
+        assert abs(report.log_ratio - truth) < 4 * report.log_std

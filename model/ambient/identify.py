@@ -89,11 +89,9 @@ class AmbientIdentifier:
 
     def _checked(self, windows: FloatArray) -> FloatArray:
         windows = np.asarray(windows, dtype=np.float64)
-        channels, inputs = self.system.channels, len(self.system.inputs)
+        channels = self.system.channels
         if windows.ndim != 3 or windows.shape[2] != len(channels):
             raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
-        if not np.isfinite(windows[:, :, :inputs]).all():
-            raise UnusableWindow(f"{channels[0].name}: the speed is missing or not finite")
         for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
             raise UnusableWindow(f"{channels[column].name}: not finite")
         return windows

@@ -36,15 +36,15 @@ class Track:
     def excitation(self, inputs: FloatArray, found: Spectra, sensed: Sensing) -> TrackExcitation | None:
         """Wheels at the speed of the window; None where it is too slow.
 
-        inputs: the measured speed (T, 1), or (T, 0) where the file states it or nobody knows it.
+        inputs: the measured speed (T, 1), NaN where it is missing, or (T, 0) where the file states it or nobody does.
         """
-        stated = self.system.file.speed
-        speed = float(inputs.mean()) if inputs.size else (None if stated is None else stated.value)
+        stated, measured = self.system.file.speed, inputs[np.isfinite(inputs)]
+        speed = float(measured.mean()) if measured.size else (None if stated is None else stated.value)
         if speed is None:
             return self._under(found, Running(self._search(found, sensed, None), np.inf))
         if abs(speed) < SLOWEST:
             return None
-        scatter = float(inputs.std()) if inputs.size else 0.0
+        scatter = float(measured.std()) if measured.size else 0.0
         directed = self._search(found, sensed, speed)
         return self._under(found, Running(directed, float(np.hypot(SPEED_STD * speed, scatter))))
 
