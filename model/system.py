@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from sprung.model.address import Address
-from sprung.model.laws import CATALOGUE, Law
+from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
@@ -182,6 +182,19 @@ class System:
             for name, body in self.file.bodies.items():
                 if not body.mass.fixed:
                     found.append(Parameter(f"{name}.mass", name, "mass", "kg", body.mass.value))
+        return tuple(found)
+
+    @cached_property
+    def tracked(self) -> tuple[Parameter, ...]:
+        """What windows are asked for: the parameters, then positive values of element laws that are not fixed."""
+        found = list(self.parameters)
+        for placed in self.laws:
+            if isinstance(placed.law, ElementLaw):
+                values = zip(placed.law.parameters, placed.names, placed.values, placed.fixed, strict=True)
+                for spec, name, value, fixed in values:
+                    if value > 0 and not fixed:
+                        quantity = f"{placed.law.name}.{spec.name}"
+                        found.append(Parameter(name, placed.location, quantity, spec.unit, value))
         return tuple(found)
 
     @cached_property

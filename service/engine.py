@@ -61,7 +61,7 @@ class Engine:
     def description(self) -> dict[str, Any]:
         """What the store must know to read its arrays without this code."""
         return {
-            "parameters": [{"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in self.system.parameters],
+            "parameters": [{"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in self.system.tracked],
             "sensors": list(self.system.sensors),
             "window": self.system.window,
             "sample_rate": self.system.sample_rate,
@@ -101,7 +101,7 @@ def load_engine(settings: Settings) -> Engine:
             f"{path}: a component test has no bodies, so nothing to follow from window to window; "
             f"`sprung diagnose FILE --system {path}` identifies it from a whole recording"
         )
-    if not system.parameters:
+    if not system.tracked:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
     return Engine(
         system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc
@@ -111,4 +111,4 @@ def load_engine(settings: Settings) -> Engine:
 def make_tracker(system: System) -> Tracker:
     """The tracker of a system, told its window and hop."""
     rate = system.sample_rate
-    return Tracker(system.parameters, TrackerSettings(window=system.window / rate, hop=system.hop / rate))
+    return Tracker(system.tracked, TrackerSettings(window=system.window / rate, hop=system.hop / rate))

@@ -153,7 +153,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
             r.drift_std,
             alarmed.get(r.name),
         )
-        for r, p in zip(reports, engine.system.parameters, strict=True)
+        for r, p in zip(reports, engine.system.tracked, strict=True)
     )
     per_sensor = {} if last is None or last.solved is None else sensor_dict(engine, last.solved.per_sensor)
     return VehicleView(
@@ -218,7 +218,7 @@ def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
 
 def window_dict(engine: Engine, record: WindowRecord) -> dict[str, Any]:
     """One line of `replay --json`."""
-    names = [p.name for p in engine.system.parameters]
+    names = [p.name for p in engine.system.tracked]
     line: dict[str, Any] = {
         "window": to_iso(record.start),
         "outcome": record.outcome,

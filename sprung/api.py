@@ -168,7 +168,7 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
     """
     model = model or load_identifier(system)
     rate = system.sample_rate
-    tracker = Tracker(system.parameters, TrackerSettings(window=system.window / rate, hop=system.hop / rate))
+    tracker = Tracker(system.tracked, TrackerSettings(window=system.window / rate, hop=system.hop / rate))
     state, count = tracker.initial_state(), 0
     for windows in _usable(system, recording):
         estimates = model.identify(np.stack([w.values for w in windows]))
@@ -219,7 +219,7 @@ def _values(system: System, estimate: Estimate) -> tuple[ParameterValue, ...]:
         ParameterValue(
             p.name, p.nominal * float(np.exp(x)), p.nominal * float(np.exp(x) * s), p.unit, p.nominal, bool(i)
         )
-        for p, x, s, i in zip(system.parameters, estimate.log_ratio, std, estimate.identifiable, strict=True)
+        for p, x, s, i in zip(system.tracked, estimate.log_ratio, std, estimate.identifiable, strict=True)
     )
 
 

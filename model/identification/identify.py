@@ -14,6 +14,7 @@ from sprung.model.identification.estimator import Estimator, bundled_estimator, 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws, without_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System
@@ -104,18 +105,53 @@ class OutputOnly:
         return found
 
 
+@dataclass(slots=True)
+class Undistorted:
+    """Windows without the faults of measurements that the system file states."""
+
+    system: System
+    inner: Identifies
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate."""
+        return self.inner.digest
+
+    @property
+    def times(self) -> StageTimes:
+        """Seconds of the last batch."""
+        return self.inner.times
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window; see `model.identifier.Identifies`."""
+        return self.inner.identify(self.system.undistorted(windows), start, states=states)
+
+
 def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifies:
     """The system's identifier with trained weights from `model` (a directory), or the bundled ones if they fit.
 
     Without weights for the system the refinement starts from the nominal values.  Systems on a track, or without any
     input, are identified from the spectra of their sensors (`model.ambient`), for which there is nothing to train.
     """
+    if system.laws:
+        return _with_laws(system, workers)
     if system.on_track:
         return AmbientIdentifier(system)
     if not system.file.inputs:
         return OutputOnly(Identifier(system, None, workers), AmbientIdentifier(system))
     estimator = load_estimator(model, system) if model is not None else bundled_estimator(system)
     return Identifier(system, estimator, workers)
+
+
+def _with_laws(system: System, workers: int) -> Identifies:
+    """The identifier around the laws of a system file.  Errors: `UnusableWindow` for a law that windows cannot hold."""
+    if system.on_track or not system.file.inputs:
+        raise UnusableWindow(f"{system.name}: laws can be tracked where the inputs are measured; leave them out")
+    laws = acting_laws(system)
+    if not laws:  # faults of measurements alone
+        return Undistorted(system, Identifier(system, None, workers))
+    linear = without_laws(system, laws)
+    return Undistorted(system, IdentifierWithLaws(system, laws, Identifier(linear, None, workers), linear, workers))
 
 
 def identifiability(system: System, seed: int = 0) -> FloatArray:

@@ -84,8 +84,8 @@ async def history(
 
 def points(core: Core, name: str, found: Series) -> dict[str, Any]:
     """JSON of one parameter's points; those where nothing but the prior was known are left out."""
-    index = [p.name for p in core.engine.system.parameters].index(name)
-    parameter = core.engine.system.parameters[index]
+    index = [p.name for p in core.engine.system.tracked].index(name)
+    parameter = core.engine.system.tracked[index]
     rows = []
     if len(found.time):
         known = found.std[:, index] < known_limit(core.engine)
@@ -145,7 +145,7 @@ def _rounded(values: FloatArray, known: Any) -> list[float | None]:
 
 def _names(core: Core, asked: list[str] | None, needed: bool) -> list[str]:
     """The parameters asked for, all where none is needed; 422 for one that the system does not have."""
-    known = [p.name for p in core.engine.system.parameters]
+    known = [p.name for p in core.engine.system.tracked]
     if not asked:
         if needed:
             raise wrong_query("parameter", "is needed; name one or more, as in parameter=ELEMENT.stiffness")

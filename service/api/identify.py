@@ -97,7 +97,7 @@ def _parameters(
             "ratio": ratio,
         }
         | ({} if identifiable is None else {"identifiable": ok})
-        for p, (value, spread), ratio, ok in zip(engine.system.parameters, pairs, ratios, told, strict=True)
+        for p, (value, spread), ratio, ok in zip(engine.system.tracked, pairs, ratios, told, strict=True)
     ]
 
 

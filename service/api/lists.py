@@ -110,7 +110,7 @@ async def deliveries(
 @router.get("/system", summary="What is monitored", tags=["vehicles"], response_model=models.SystemAnswer)
 async def system(core: CoreOf) -> Response:
     """Parameters, elements and channels of the system file that the service runs with."""
-    found, names = core.engine.system, {p.name for p in core.engine.system.parameters}
+    found, names = core.engine.system, {p.name for p in core.engine.system.tracked}
     elements = [
         {
             "name": name,

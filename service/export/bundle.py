@@ -41,7 +41,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
             _signals(file, engine, excerpt)
         for window in windows:
             _compared(file, engine, window)
-        for parameter in engine.system.parameters:
+        for parameter in engine.system.tracked:
             value, std = values_of(engine, parameter.name, found.series)
             topic = f"/estimate/{parameter.element}/{parameter.quantity}"
             for i in np.flatnonzero(np.isfinite(value)).tolist():

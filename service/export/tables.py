@@ -38,11 +38,11 @@ def history_file(engine: Engine, vehicle: str, names: Sequence[str], found: Seri
 
 def values_of(engine: Engine, name: str, found: Series) -> tuple[FloatArray, FloatArray]:
     """Value and standard deviation in the parameter's unit, shapes (n,); NaN where it was not identifiable."""
-    index = [p.name for p in engine.system.parameters].index(name)
+    index = [p.name for p in engine.system.tracked].index(name)
     if not len(found.time):
         return np.zeros(0), np.zeros(0)
     known = found.std[:, index] < known_limit(engine)
-    value = np.where(known, engine.system.parameters[index].nominal * np.exp(found.mean[:, index]), np.nan)
+    value = np.where(known, engine.system.tracked[index].nominal * np.exp(found.mean[:, index]), np.nan)
     return value, value * found.std[:, index]
 
 
@@ -51,7 +51,7 @@ def _csv(engine: Engine, names: Sequence[str], found: Series) -> bytes:
     columns = [values_of(engine, name, found) for name in names]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    units = {p.name: p.unit for p in engine.system.parameters}
+    units = {p.name: p.unit for p in engine.system.tracked}
     heads = [head for name in names for head in (f"{name} [{units[name]}]", f"{name}.std [{units[name]}]")]
     writer.writerow(["time", "seconds", "windows", *heads])
     for i, time in enumerate(found.time.tolist()):
@@ -67,7 +67,7 @@ def _parquet(engine: Engine, vehicle: str, names: Sequence[str], found: Series) 
         import pyarrow.parquet as pq
     except ImportError:
         raise UserError("Parquet needs pyarrow: pip install 'sprung[parquet]', or ask for csv") from None
-    units = {p.name: p.unit for p in engine.system.parameters}
+    units = {p.name: p.unit for p in engine.system.tracked}
     fields = [pa.field("time", pa.timestamp("ns", tz="UTC")), pa.field("windows", pa.int64())]
     arrays = [pa.array(found.time, pa.timestamp("ns", tz="UTC")), pa.array(found.windows)]
     for name in names:
@@ -87,7 +87,7 @@ def _mcap(engine: Engine, vehicle: str, names: Sequence[str], found: Series) -> 
     with McapFile(sink, {"vehicle": vehicle, "model": engine.digest, "system": engine.system.name}) as file:
         for name in names:
             element, _, quantity = name.rpartition(".")
-            parameter = next(p for p in engine.system.parameters if p.name == name)
+            parameter = next(p for p in engine.system.tracked if p.name == name)
             topic = f"/estimate/{element}/{quantity}"
             value, std = values_of(engine, name, found)
             for i in np.flatnonzero(np.isfinite(value)).tolist():
