@@ -9,6 +9,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from prometheus_client import Histogram
+
 from sprung import __version__
 from sprung.model.signals import Tally
 from sprung.service.batching import Batcher
@@ -33,7 +35,7 @@ from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.windows import latest_window
 from sprung.service.tokens import Tokens
 from sprung.service.views import VehicleView, vehicle_view
-from sprung.service.vitals import Vitals
+from sprung.service.vitals import Vitals, request_histogram
 
 log = logging.getLogger("sprung")
 
@@ -61,6 +63,7 @@ class Core:
     tokens: Tokens
     stopping: threading.Event
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
+    requests: Histogram | None = None  # durations of requests
 
     def tally_counter(self, source: str) -> OnTally:
         """A callback that adds to `sprung_frames_total` what a source has read since the last call."""
@@ -139,6 +142,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}
     vitals = Vitals(__version__, engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
     metrics.registry.register(vitals)
+    core.requests = request_histogram(metrics.registry)
     return core
 
 

@@ -9,7 +9,7 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
@@ -48,6 +48,8 @@ class Settings(BaseSettings):
     allowed_hosts: tuple[
         str, ...
     ] = ()  # host names that are served, as a JSON list; none: any, where tokens are needed
+    log_format: Literal["text", "json"] = "text"
+    log_level: Literal["debug", "info", "warning", "error"] = "warning"
     connections: int = Field(default=1000, gt=0)  # in all; fewer where the system allows fewer open files
     client_connections: int = Field(default=256, gt=0)  # of one address
     header_seconds: float = Field(default=10.0, gt=0)  # in which a request's header must come

@@ -6,12 +6,24 @@ import platform
 from collections.abc import Callable, Iterator, Mapping
 
 import torch
+from prometheus_client import CollectorRegistry, Histogram
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from sprung.service.live import FeedStatus
 
 STATES = ("receiving", "silent", "behind", "down", "failing", "hung", "ended")
+
+
+def request_histogram(registry: CollectorRegistry) -> Histogram:
+    """Durations of requests, from the first byte of the answered request to its whole answer."""
+    return Histogram(
+        "sprung_http_request_duration_seconds",
+        "Time to answer a request",
+        ["method", "path", "status"],
+        registry=registry,
+        buckets=(0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0),
+    )
 
 
 class Vitals(Collector):

@@ -81,5 +81,5 @@ def create_app(
         paths={"/recordings": uploads, "/diagnose": uploads},
     )
     app.add_middleware(HeadAsGet)
-    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens)
+    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests)
     return app

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import ipaddress
+import logging
 import math
+import re
+import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
 
+from prometheus_client import Histogram
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sprung.service.api.problems import Problem, problem_response
-from sprung.service.api.scopes import VEHICLE_PATH, Need, need_of
+from sprung.service.api.scopes import VEHICLE_PATH, Need, need_of, place_of
+from sprung.service.logs import request_id
 from sprung.service.settings import Settings
 from sprung.service.tokens import Actor, Refused, Tokens
 
+log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
@@ -46,8 +53,10 @@ HEADERS = {
 class Guard:
     """ASGI middleware, the outermost."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens) -> None:
+    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens, requests: Histogram | None = None) -> None:
+        """requests: takes the durations of requests."""
         self.app = app
+        self._requests = requests
         self._settings = settings
         self._tokens = tokens
         self._limiter = Limiter(settings.client_requests_per_second)
@@ -57,13 +66,38 @@ class Guard:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        path, headers = scope["path"], Headers(scope=scope)
+        headers, started, status = Headers(scope=scope), time.perf_counter(), 0
+        identity = request_id_of(headers)
+        request_id.set(identity)
 
         async def with_headers(message: Message) -> None:
+            nonlocal status
             if message["type"] == "http.response.start":
-                self._complete(path, scope, MutableHeaders(scope=message))
+                status = message["status"]
+                complete = MutableHeaders(scope=message)
+                self._complete(scope["path"], scope, complete)
+                complete["X-Request-ID"] = identity
             await send(message)
 
+        try:
+            await self._answer(scope, headers, receive, with_headers)
+        finally:
+            seconds = time.perf_counter() - started
+            place = place_of(scope["method"], scope["path"])
+            if self._requests is not None and place != "/events":
+                self._requests.labels(scope["method"][:7], place, str(status)).observe(seconds)
+            log.info(
+                "request",
+                extra={
+                    "method": scope["method"],
+                    "path": scope["path"],
+                    "status": status,
+                    "seconds": round(seconds, 4),
+                },
+            )
+
+    async def _answer(self, scope: Scope, headers: Headers, receive: Receive, with_headers: Send) -> None:
+        path = scope["path"]
         try:
             need = need_of(scope["method"], path)
             self._check_host(headers)
@@ -175,6 +209,12 @@ class Limiter:
         if refused:
             wait = str(math.ceil((1.0 - left) / self._rate))
             raise Problem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})
+
+
+def request_id_of(headers: Mapping[str, str]) -> str:
+    """The client's name for its request where it is a decent one, else a new one."""
+    given = headers.get("x-request-id", "")
+    return given if REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
 
 
 def session_of(headers: Mapping[str, str]) -> str | None:

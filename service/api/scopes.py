@@ -48,6 +48,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("DELETE", "/tokens/{id}"): Need("admin"),
     ("GET", "/debug/profile"): Need("admin"),
 }
+OTHER = "other"
 READ, ADMIN = Need("read"), Need("admin")
 VEHICLE_PATH = re.compile(r"^/(?:pages/)?vehicles/([^/]+)")
 
@@ -57,13 +58,19 @@ def _pattern(template: str) -> re.Pattern[str]:
     return re.compile("^" + re.sub(r"\\\{\w+\\\}", "[^/]+", inner) + "/?$")
 
 
-_PATTERNS = [(method, _pattern(template), need) for (method, template), need in NEEDS.items()]
+_PATTERNS = [(method, _pattern(template), need, template) for (method, template), need in NEEDS.items()]
 
 
 def need_of(method: str, path: str) -> Need:
     """What a request needs; reading needs `read`, and anything else that is not listed `admin`."""
     method = "GET" if method in ("HEAD", "OPTIONS") else method
-    for listed, pattern, need in _PATTERNS:
+    for listed, pattern, need, _ in _PATTERNS:
         if listed == method and pattern.match(path):
             return need
     return READ if method == "GET" else ADMIN
+
+
+def place_of(method: str, path: str) -> str:
+    """The template of a path, for metrics: what clients make up is all one."""
+    method = "GET" if method in ("HEAD", "OPTIONS") else method
+    return next((text for listed, pattern, _, text in _PATTERNS if listed == method and pattern.match(path)), OTHER)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -13,6 +12,7 @@ from sprung.service.cli.console import parameter_table, plain_progress, print_ta
 from sprung.service.cli.replay import closing_line, incomplete_line, readable
 from sprung.service.core import Core
 from sprung.service.feed import Fed, OnBatch
+from sprung.service.logs import set_up
 from sprung.service.main import Feeds, serve
 from sprung.service.settings import settings_with
 from sprung.service.views import vehicle_view
@@ -20,10 +20,10 @@ from sprung.service.views import vehicle_view
 
 def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:
     """Serve until told to stop."""
-    logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="sprung: %(levelname)s: %(message)s")
     for path in files:
         readable(path)
     settings = settings_with(options)
+    set_up(settings.log_format, settings.log_level)
 
     def announce(address: str) -> None:
         print(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +20,7 @@ from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
+from sprung.service.logs import JsonLines, request_id
 from sprung.service.main import access_notice
 from sprung.service.settings import Settings
 from sprung.service.store import Store, audit, tokens
@@ -295,3 +298,26 @@ def test_deeds_are_written_down(client: TestClient, core: Core) -> None:
 def test_a_profile_names_the_threads(client: TestClient) -> None:
     text = client.get("/debug/profile?seconds=0.1").text
     assert "sprung-compute;" in text
+
+
+def test_requests_have_a_name_and_their_durations_are_counted(client: TestClient) -> None:
+    assert client.get("/vehicles", headers={"x-request-id": "ride-7"}).headers["x-request-id"] == "ride-7"
+    assert len(client.get("/vehicles", headers={"x-request-id": "a b\tc"}).headers["x-request-id"]) == 16
+    client.get("/vehicles/north-1/alarms")
+    client.get("/made/up/by/a/client")
+    text = client.get("/metrics").text
+    assert 'sprung_http_request_duration_seconds_count{method="GET",path="/vehicles",status="200"} 2.0' in text
+    assert 'path="/vehicles/{id}/{part}"' in text and 'path="other",status="404"' in text
+    assert "made" not in text and "north-1/alarms" not in text
+    assert "sprung_build_info{" in text
+
+
+def test_logs_are_one_json_object_a_line_with_the_request() -> None:
+    record = logging.makeLogRecord({"name": "sprung.x", "levelno": 20, "levelname": "INFO", "msg": "job ended"})
+    record.job = "j1"
+    token = request_id.set("ride-7")
+    try:
+        line = json.loads(JsonLines().format(record))
+    finally:
+        request_id.reset(token)
+    assert (line["event"], line["level"], line["job"], line["request"]) == ("job ended", "info", "j1", "ride-7")
