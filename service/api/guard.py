@@ -26,6 +26,7 @@ from sprung.service.tokens import Actor, Refused, Tokens
 log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
@@ -85,7 +86,7 @@ class Guard:
             seconds = time.perf_counter() - started
             place = place_of(scope["method"], scope["path"])
             if self._requests is not None and place != "/events":
-                self._requests.labels(scope["method"][:7], place, str(status)).observe(seconds)
+                self._requests.labels(_known(scope["method"]), place, str(status)).observe(seconds)
             log.info(
                 "request",
                 extra={
@@ -246,6 +247,10 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _known(method: str) -> str:
+    return method if method in METHODS else "other"
 
 
 def _address(scope: Scope) -> str:
