@@ -11,7 +11,7 @@ DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 PYTEST ?=
 
-.PHONY: help install install-dev demo test test-slow matrix ci lint format bench clean
+.PHONY: help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
@@ -63,6 +63,19 @@ lint: install-dev
 format: install-dev
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
+
+# what is in the lock, with licences; what is known against it; what bandit finds in the source
+sbom: install-dev
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
+	$(BIN)/cyclonedx-py requirements requirements.lock --of JSON -o sbom.json
+
+audit: install-dev
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet "pip-audit>=2.7,<3"
+	$(BIN)/pip-audit --requirement requirements.lock --no-deps
+
+bandit: install-dev
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"
+	$(BIN)/bandit --quiet --recursive model replay service --severity-level medium --skip B104,B608
 
 bench: install
 	$(BIN)/sprung bench $(NAME)

@@ -126,6 +126,8 @@ class Guard:
         given = headers.get("authorization", "")
         kind, _, text = given.partition(" ")
         try:
+            if not need.scope and not given:  # before the store is asked: it may be what is wrong
+                return Actor("nobody", frozenset()), True
             if given and kind.lower() == "bearer":
                 return self._tokens.actor(text.strip()), False
             if not self.required:
@@ -147,9 +149,9 @@ class Guard:
         allowed = self._settings.allowed_hosts
         if allowed and host not in allowed:
             raise Problem(421, "this host name is not served here; allow it with SPRUNG_ALLOWED_HOSTS")
-        if allowed or self.required or "." not in host.rstrip(".") or host.endswith(".localhost") or _is_address(host):
+        if allowed or "." not in host.rstrip(".") or host.endswith(".localhost") or _is_address(host):
             return
-        if host != self._settings.host:
+        if host != self._settings.host and not self.required:
             raise Problem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
 
     def _check_browser(self, scope: Scope, headers: Headers, need: Need, by_cookie: bool) -> None:
