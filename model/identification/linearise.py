@@ -251,7 +251,7 @@ class WindowModel:
     def _transfer(self, values: ElementValues, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
         """Compliance (B, F, n, n); compressed signals per element force (B, F, R, E) and per unit drive noise."""
         s, f = self.simulator, self.frequency
-        compliance = torch.linalg.inv(f.stiffness(values))
+        compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
         Q = self._signal_rows(data, kind)
         sensing = Q @ (f.sensing(values) if f.element_sensors else f.motion_sensing)
@@ -332,6 +332,17 @@ class WindowModel:
 def _usual_noise(system: System) -> FloatArray:
     """Noise of usual instruments for the values of the drives, shape (W/2,)."""
     return np.array([USUAL_NOISE[system.inputs[value].unit] for value in knot_columns(system)[0]])
+
+
+def _inverse(stiffness: Tensor) -> Tensor:
+    """Inverse of dynamic stiffnesses (..., n, n); the pseudo-inverse at frequency zero of a body that nothing holds.
+
+    Where a free body would go under a steady force is told by its free response, not by its compliance.
+    """
+    found, failed = torch.linalg.inv_ex(stiffness)
+    if bool(failed.any()):
+        found = torch.where((failed != 0)[..., None, None], torch.linalg.pinv(stiffness), found)
+    return found
 
 
 def _rows(spectra: Tensor) -> Tensor:

@@ -22,8 +22,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         status = app(arguments, prog_name="sprung", standalone_mode=False)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        return _closed_pipe()
+    except SystemExit as ended:  # the library of the command line makes 1 of it, which would say "alarms"
+        if isinstance(ended.__context__, BrokenPipeError):
+            return _closed_pipe()
+        raise
     except (KeyboardInterrupt, typer.Abort):
         status = INTERRUPTED  # older versions of typer raise, newer ones return it
     except Exception as error:
@@ -46,11 +49,18 @@ def _usable_streams() -> None:
             stream.reconfigure(errors="backslashreplace")
 
 
+def _closed_pipe() -> int:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
 def describe(error: Exception) -> str:
     """One line: what, where, what to do."""
     usage = getattr(error, "format_message", None)  # typer's and click's errors of usage have it
     if callable(usage):
-        return f"{_one_line(usage())}; see sprung --help"
+        context = getattr(error, "ctx", None)
+        command = getattr(context, "command_path", None) or "sprung"
+        return f"{_one_line(usage()).rstrip('.')}; see {command} --help"
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
     if isinstance(error, ValueError):  # what every folder raises for input that cannot be used

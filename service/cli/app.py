@@ -15,29 +15,41 @@ app = typer.Typer(
     help="Springs and dampers of rail vehicles, identified from running recordings.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its boxes call a flag <bool>, and break names on narrow terminals
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 Files = Annotated[
-    list[Path], typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables.", metavar="FILE...")
+    list[Path],
+    typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables; - is stdin.", metavar="FILE..."),
 ]
-File = Annotated[Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables.", metavar="FILE")]
-System = Annotated[Path | None, typer.Option("--system", help="System file; default: the Manchester vehicle.")]
-Dbc = Annotated[Path | None, typer.Option("--dbc", help="CAN database; default: the bundled system's.")]
+File = Annotated[
+    Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables; - is stdin.", metavar="FILE")
+]
+System = Annotated[
+    Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
+]
+Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE", help="CAN database; default: the bundled system's.")]
 Weights = Annotated[
-    Path | None, typer.Option("--weights", help="Trained estimator (a folder); default: the bundled one.")
+    Path | None,
+    typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),
 ]
 StoreUrl = Annotated[
     str | None,
-    typer.Option("--store", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
+    typer.Option("--store", metavar="URL", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
 Start = Annotated[
     str | None,
-    typer.Option("--start", help="When the recording began, if its times count from 0; default: the file's own time."),
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        help="When the recording began, if its times count from 0; default: the file's own time.",
+    ),
 ]
 Vehicle = Annotated[
-    str | None, typer.Option("--vehicle", help="Whose it is; default: as recorded, else the file's name.")
+    str | None,
+    typer.Option("--vehicle", metavar="NAME", help="Whose it is; default: as recorded, else the file's name."),
 ]
 
 
@@ -64,7 +76,9 @@ def replay(
     store: StoreUrl = None,
     weights: Weights = None,
     vehicle: Vehicle = None,
-    speed: Annotated[float, typer.Option("--speed", min=0, help="Times real time; 0: as fast as possible.")] = 0.0,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="FACTOR", min=0, help="Times real time; 0: as fast as possible.")
+    ] = 0.0,
     start: Start = None,
     json_lines: Json = False,
 ) -> int:
@@ -95,19 +109,27 @@ def serve(
     store: StoreUrl = None,
     weights: Weights = None,
     data_dir: Annotated[
-        Path | None, typer.Option("--data-dir", help="Uploads, reports and the embedded store.")
+        Path | None, typer.Option("--data-dir", metavar="FOLDER", help="Uploads, reports and the embedded store.")
     ] = None,
-    host: Annotated[str | None, typer.Option("--host", help="Address to listen on; default 127.0.0.1.")] = None,
-    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="Default 8000; 0: any free one.")] = None,
+    host: Annotated[
+        str | None, typer.Option("--host", metavar="ADDRESS", help="Address to listen on; default 127.0.0.1.")
+    ] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", metavar="NUMBER", min=0, max=65535, help="Default 8000; 0: any free one.")
+    ] = None,
     replay_files: Annotated[
-        list[Path] | None, typer.Option("--replay", help="Recording to replay into the service; repeatable.")
+        list[Path] | None,
+        typer.Option("--replay", metavar="FILE", help="Recording to replay into the service; repeatable."),
     ] = None,
     speed: Annotated[
-        float, typer.Option("--speed", min=0, help="Of --replay: times real time; 0: as fast as possible.")
+        float,
+        typer.Option("--speed", metavar="FACTOR", min=0, help="Of --replay: times real time; 0: as fast as possible."),
     ] = 0.0,
     can: Annotated[
         list[str] | None,
-        typer.Option("--can", help="Live bus, as socketcan:can0 or pcan:PCAN_USBBUS1,bitrate=500000; repeatable."),
+        typer.Option(
+            "--can", metavar="BUS", help="Live bus, as socketcan:can0 or pcan:PCAN_USBBUS1,bitrate=500000; repeatable."
+        ),
     ] = None,
     vehicle: Vehicle = None,
 ) -> int:
@@ -137,10 +159,12 @@ def train(
         list[Path] | None, typer.Option("--recordings", metavar="FILE...", help="Train on from these, without labels.")
     ] = None,
     dbc: Dbc = None,
-    out: Annotated[Path, typer.Option("--out", help="Folder for the weights.")] = Path("weights"),
-    seed: Annotated[int | None, typer.Option("--seed", help="Same seed, same weights.")] = None,
-    records: Annotated[int | None, typer.Option("--records", min=1, help="Simulated records.")] = None,
-    steps: Annotated[int | None, typer.Option("--steps", min=1, help="Optimiser steps.")] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="Folder for the weights.")] = Path("weights"),
+    seed: Annotated[int | None, typer.Option("--seed", metavar="NUMBER", help="Same seed, same weights.")] = None,
+    records: Annotated[
+        int | None, typer.Option("--records", metavar="NUMBER", min=1, help="Simulated records.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option("--steps", metavar="NUMBER", min=1, help="Optimiser steps.")] = None,
 ) -> int:
     """Train the estimator for a system; goes on after an interrupt when called again."""
     from sprung.service.cli.train import run
@@ -155,14 +179,17 @@ def diagnose(
     file: File,
     system: System = None,
     dbc: Dbc = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for the page and the pictures.")] = None,
-    name: Annotated[str | None, typer.Option("--name", help="Of the recording, in the report.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="PATH", help="Folder for the page and the pictures.")
+    ] = None,
+    name: Annotated[str | None, typer.Option("--name", metavar="TEXT", help="Of the recording, in the report.")] = None,
     start: Start = None,
     write_system: Annotated[
-        Path | None, typer.Option("--write-system", help="Write the system file with what was found.")
+        Path | None, typer.Option("--write-system", metavar="FILE", help="Write the system file with what was found.")
     ] = None,
     laws: Annotated[
-        Path | None, typer.Option("--laws", help="Python file with laws of your own; it is run: trust it.")
+        Path | None,
+        typer.Option("--laws", metavar="FILE", help="Python file with laws of your own; it is run: trust it."),
     ] = None,
     json_lines: Json = False,
 ) -> int:
@@ -178,13 +205,15 @@ def diagnose(
 def simulate(
     system_file: Annotated[Path, typer.Argument(help="System file, with laws where it has them.", metavar="SYSTEM")],
     inputs: Annotated[Path, typer.Option("--inputs", help="Recording whose measured inputs drive the simulation.")],
-    out: Annotated[Path, typer.Option("--out", help="Recording to write: .mcap .csv .blf .asc .log.")],
+    out: Annotated[Path, typer.Option("--out", metavar="PATH", help="Recording to write: .mcap .csv .blf .asc .log.")],
     dbc: Dbc = None,
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME=NUMBER", help="Another value, as car.mass=34000.")
     ] = None,
-    noise: Annotated[bool, typer.Option("--noise", help="With the sensors' noise of the system file.")] = False,
-    seed: Annotated[int, typer.Option("--seed", help="Of the noise.")] = 0,
+    noise: Annotated[
+        bool, typer.Option("--noise", metavar="NUMBER", help="With the sensors' noise of the system file.")
+    ] = False,
+    seed: Annotated[int, typer.Option("--seed", metavar="NUMBER", help="Of the noise.")] = 0,
 ) -> int:
     """Write what the sensors of a vehicle with the laws of its system file would measure."""
     from sprung.service.cli.simulate import simulate as run
@@ -200,7 +229,9 @@ def compare(
     ],
     system: System = None,
     dbc: Dbc = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder for pictures of signals and force loops.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="PATH", help="Folder for pictures of signals and force loops.")
+    ] = None,
     json_lines: Json = False,
 ) -> int:
     """How far a simulation is from a recording: errors of every sensor, residual spectra, force loops."""
@@ -246,13 +277,70 @@ def system(
     ] = False,
     export: Annotated[
         Path | None,
-        typer.Option("--export", help="Write the model: .fmu .mo .mat .npz, or a folder for force tables."),
+        typer.Option(
+            "--export", metavar="FILE", help="Write the model: .fmu .mo .mat .npz, or a folder for force tables."
+        ),
     ] = None,
 ) -> int:
     """Check a system file; print bodies, elements, modes, and what the sensors can identify; or export the model."""
     from sprung.service.cli.system import run
 
     return run(file, json_lines, schema, export)
+
+
+@app.command()
+def export(
+    vehicle: Annotated[str, typer.Argument(help="As recordings call it.", metavar="VEHICLE")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default: standard output, as CSV.")] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option("--format", metavar="KIND", help="csv, parquet or mcap; default: the suffix of --out."),
+    ] = None,
+    parameter: Annotated[
+        list[str] | None, typer.Option("--parameter", metavar="NAME", help="Repeatable; default: all.")
+    ] = None,
+    since: Annotated[str | None, typer.Option("--since", metavar="TIME", help="RFC 3339, inclusive.")] = None,
+    until: Annotated[str | None, typer.Option("--until", metavar="TIME", help="RFC 3339, exclusive.")] = None,
+    resolution: Annotated[
+        str, typer.Option("--resolution", metavar="SECONDS", help="Per point (60, 1m, 6h); raw: single windows.")
+    ] = "raw",
+    system: System = None,
+    store: StoreUrl = None,
+    weights: Weights = None,
+) -> int:
+    """The history of a vehicle's parameters as a file, out of a store."""
+    one_thread_each()
+    from sprung.service.cli.history import run
+
+    return run(
+        vehicle,
+        system=system,
+        weights=weights,
+        store=store,
+        out=out,
+        kind=kind,
+        parameters=parameter or [],
+        since=since,
+        until=until,
+        resolution=resolution,
+    )
+
+
+@app.command()
+def doctor(
+    system: System = None,
+    store: StoreUrl = None,
+    weights: Weights = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As of sprung serve.")] = None,
+    can: Annotated[
+        list[str] | None, typer.Option("--can", metavar="INTERFACE:CHANNEL", help="Listen to this bus; repeatable.")
+    ] = None,
+) -> int:
+    """Check installation, model, store, disk, clock and buses; a line each, and what to do."""
+    one_thread_each()
+    from sprung.service.cli.doctor import run
+
+    return run(system, weights, store, data_dir, can or [])
 
 
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,15 @@ from sprung.service.pipeline import Batch
 from sprung.service.views import VehicleView
 
 PLAIN_SECONDS = 2.0  # between lines where there is no terminal
+COLUMNS = {  # of the table of parameters, and the width from which they are shown
+    "parameter": 0,
+    "value": 64,
+    "± std": 96,
+    "nominal": 84,
+    "ratio": 74,
+    "drift": 0,
+    "state": 0,
+}
 HEALTH_STYLE = {"ok": "green", "maintenance_required": "yellow"}
 
 
@@ -75,31 +85,39 @@ def _silent(_batch: Batch) -> None:
     """Shows nothing."""
 
 
-def parameter_table(view: VehicleView) -> Table:
-    """Every tracked parameter, the ones with alarms marked."""
+def width_of_output() -> int:
+    """Columns of the terminal; of a pipe those that COLUMNS says, else enough for everything."""
+    console = Console()
+    if console.is_terminal:
+        return console.width
+    told = os.environ.get("COLUMNS", "")
+    return int(told) if told.isdigit() and int(told) > 0 else 120
+
+
+def parameter_table(view: VehicleView, width: int = 120) -> Table:
+    """Every tracked parameter, the ones with alarms marked; on narrow terminals fewer columns, whole names."""
     style = HEALTH_STYLE.get(view.health, "red")
     table = Table(
         title=f"{view.vehicle}: [{style}]{view.health.replace('_', ' ')}[/{style}]",
         title_justify="left",
         title_style="bold",
     )
-    table.add_column("element")
-    table.add_column("quantity")
-    for column in ("value", "± std", "nominal", "ratio", "drift"):
-        table.add_column(column, justify="right")
-    table.add_column("state")
+    shown = [name for name, least in COLUMNS.items() if width >= least]
+    for name in shown:
+        table.add_column(name, justify="left" if name in ("parameter", "state") else "right", no_wrap=True)
     for p in view.parameters:
-        table.add_row(
-            p.element,
-            p.quantity,
-            quantity(p.value, p.unit),
-            quantity(p.std, p.unit),
-            quantity(p.nominal, p.unit),
-            f"{p.value / p.nominal:.3f}",
-            percent(p.drift),
-            _state(p.alarm, p.identifiable, p.drift),
-            style={"alarm": "red", "warning": "yellow"}.get(p.alarm or ""),
-        )
+        told = p.identifiable
+        cells = {
+            "parameter": p.name,
+            "value": quantity(p.value, p.unit) if told else "–",
+            "± std": quantity(p.std, p.unit) if told else "–",
+            "nominal": quantity(p.nominal, p.unit),
+            "ratio": f"{p.value / p.nominal:.3f}" if told else "–",
+            "drift": percent(p.drift),
+            "state": _state(p.alarm, told, p.drift),
+        }
+        style = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
+        table.add_row(*(cells[name] for name in shown), style=style)
     return table
 
 
@@ -107,7 +125,7 @@ def print_table(table: Table) -> None:
     """On stdout; in a pipe as wide as it needs to be, without colours."""
     console = Console(highlight=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=120, no_color=True)
+        console = Console(highlight=False, width=width_of_output(), no_color=True)
     console.print(table)
 
 

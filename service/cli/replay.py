@@ -5,12 +5,15 @@ from __future__ import annotations
 import json
 import sys
 import tempfile
-from contextlib import ExitStack
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
-from sprung.service.cli.console import parameter_table, print_table, progress
+from sprung.service.cli.console import parameter_table, print_table, progress, width_of_output
 from sprung.service.cli.starts import start_time
+from sprung.service.cli.stdin import spooled
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.feed import Fed, comfort_dict, feed_file
@@ -37,7 +40,8 @@ def run(
     """Replay each file; 1 when a vehicle has alarms or a recording was incomplete."""
     settings = settings_with({"system": system, "dbc": dbc, "store": store, "weights": weights})
     for path in files:
-        readable(path)
+        if str(path) != "-":
+            readable(path)
     began = start_time(start, files)
     status = 0
     with ExitStack() as stack:
@@ -51,7 +55,8 @@ def run(
         compute = Compute(settings.compute_queue)
         stack.callback(compute.close)
         pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
-        for path in files:
+        for named in files:
+            path = spooled(named, stack)
             fed = _replay(pipeline, opened, path, vehicle, speed, settings.batch_windows, began, json_lines)
             status = max(status, _report(pipeline, path, fed, json_lines))
     return status
@@ -77,9 +82,14 @@ def _replay(
     row = file_row(path)
     with store.write() as connection:
         work.add_recording(connection, row)
-    with progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show:
+    kept = Counter[str]()
+    with (
+        told_when_interrupted(kept, store),
+        progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show,
+    ):
 
         def on_batch(batch: Batch) -> None:
+            kept["windows"] += len(batch.records)
             if json_lines:
                 lines = (json.dumps(window_dict(pipeline.engine, record)) for record in batch.records)
                 sys.stdout.write("\n".join(lines) + "\n")
@@ -99,6 +109,20 @@ def _replay(
     return fed
 
 
+@contextmanager
+def told_when_interrupted(kept: Counter[str], store: Store) -> Iterator[None]:
+    """After Ctrl-C: what is stored, and how to go on."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if "/sprung-" in str(store.engine.url):  # the folder that goes with this run
+            line = f"{kept['windows']} windows were followed and nothing is kept; with --store they would be"
+        else:
+            line = f"{kept['windows']} windows are kept in {store.engine.url}; call it again to go on"
+        print(f"sprung: {line}", file=sys.stderr)
+        raise
+
+
 def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
     """Print the outcome; the exit status of this file."""
     assert fed.state is not None
@@ -106,7 +130,7 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
     if json_lines:
         print(json.dumps({"summary": summary(pipeline, view, fed)}), flush=True)
     else:
-        print_table(parameter_table(view))
+        print_table(parameter_table(view, width_of_output()))
         print(closing_line(pipeline, view, fed))
     complaint = incomplete_line(path, fed)
     for line in fed.problems:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sprung.service.cli.console import parameter_table, plain_progress, print_table
+from sprung.service.cli.console import parameter_table, plain_progress, print_table, width_of_output
 from sprung.service.cli.replay import closing_line, incomplete_line, readable
 from sprung.service.core import Core
 from sprung.service.feed import Fed, OnBatch
@@ -44,7 +44,7 @@ def watch(path: Path, core: Core) -> tuple[OnBatch, Callable[[Fed], None]]:
     def on_end(fed: Fed) -> None:
         assert fed.state is not None
         view = vehicle_view(core.engine, fed.vehicle, fed.state, None)
-        print_table(parameter_table(view))
+        print_table(parameter_table(view, width_of_output()))
         print(closing_line(core.pipeline, view, fed), flush=True)
         complaint = incomplete_line(path, fed)
         if complaint:

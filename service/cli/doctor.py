@@ -1,0 +1,155 @@
+"""`sprung doctor`: what of an installation works, and what to do about the rest."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Literal
+
+import can
+from packaging.requirements import Requirement
+
+from sprung import __version__
+from sprung.model.identification.identify import load_identifier
+from sprung.model.system import load_system
+from sprung.service.settings import Settings, settings_with
+from sprung.service.store import open_store
+from sprung.service.store.status import Wanted, health_counts
+
+BUS_SECONDS = 3.0
+LOW_BYTES = 1_000_000_000
+OLDEST = 1_767_225_600  # 2026-01-01: a clock before it has not been set
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The outcome of one check."""
+
+    state: Literal["ok", "warning", "failed"]
+    what: str
+    text: str
+
+
+def run(system: Path | None, weights: Path | None, store: str | None, data_dir: Path | None, buses: list[str]) -> int:
+    """Print a line for every check; 1 when one of them failed."""
+    settings = settings_with({"system": system, "weights": weights, "store": store, "data_dir": data_dir})
+    failed = False
+    for check in (_installation, _model, _store, _disk, _clock):
+        for finding in _guarded(check, settings):
+            failed |= finding.state == "failed"
+            print(f"{finding.state:8s} {finding.what}: {finding.text}", flush=True)
+    for name in buses:
+        finding = _bus(name)
+        failed |= finding.state == "failed"
+        print(f"{finding.state:8s} {finding.what}: {finding.text}", flush=True)
+    return int(failed)
+
+
+def _guarded(check: Callable[[Settings], Iterator[Finding]], settings: Settings) -> Iterator[Finding]:
+    try:
+        yield from check(settings)
+    except (ValueError, OSError) as error:
+        yield Finding("failed", check.__name__.strip("_"), " ".join(str(error).split()))
+
+
+def _installation(_settings: Settings) -> Iterator[Finding]:
+    yield Finding("ok", "installation", f"sprung {__version__}, Python {sys.version.split()[0]}")
+    try:
+        needed = [Requirement(line) for line in requires("sprung") or []]
+    except PackageNotFoundError:
+        yield Finding("warning", "packages", "sprung runs from a source tree; its packages are not checked")
+        return
+    wrong = []
+    for need in needed:
+        if need.marker is not None and not need.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            found = version(need.name)
+        except PackageNotFoundError:
+            wrong.append(f"{need.name} is missing")
+            continue
+        if not need.specifier.contains(found, prereleases=True):
+            wrong.append(f"{need.name} {found} is not {need.specifier}")
+    if wrong:
+        yield Finding("failed", "packages", "; ".join(wrong) + "; install sprung anew")
+    else:
+        yield Finding("ok", "packages", "as required")
+
+
+def _model(settings: Settings) -> Iterator[Finding]:
+    system = load_system(settings.system) if settings.system is not None else load_system()
+    identifier = load_identifier(system, settings.weights)
+    parameters = f"{len(system.parameters)} parameters"
+    if identifier.estimator is None:
+        text = f"{system.name}, {parameters}; no trained estimator: identified from the nominal values, which is slower"
+        yield Finding("warning", "model", text)
+    else:
+        yield Finding("ok", "model", f"{system.name}, {parameters}, with a trained estimator")
+
+
+def _store(settings: Settings) -> Iterator[Finding]:
+    store = open_store(settings.store_url)
+    try:
+        with store.read() as connection:
+            vehicles = sum(health_counts(connection, Wanted()).values())
+            if connection.dialect.name == "sqlite":
+                said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
+                if said != "ok":
+                    yield Finding("failed", "store", f"{settings.store_url} is damaged: {said}; restore a back-up")
+                    return
+        with store.write():
+            pass
+    finally:
+        store.close()
+    yield Finding("ok", "store", f"{settings.store_url}, {vehicles} vehicles, can be written")
+
+
+def _disk(settings: Settings) -> Iterator[Finding]:
+    folder = settings.data_dir
+    while not folder.exists():
+        folder = folder.parent
+    free = shutil.disk_usage(folder).free
+    state: Literal["ok", "warning"] = "ok" if free > LOW_BYTES else "warning"
+    yield Finding(state, "disk", f"{free / 1e9:.1f} GB free at {folder}")
+
+
+def _clock(_settings: Settings) -> Iterator[Finding]:
+    now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+    if time.time() < OLDEST:
+        yield Finding("failed", "clock", f"it is {now} by this machine: set its clock")
+        return
+    tool = shutil.which("timedatectl")
+    said = ""
+    if tool is not None:
+        command = [tool, "show", "--property=NTPSynchronized", "--value"]
+        said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
+    if said == "yes":
+        yield Finding("ok", "clock", f"{now}, synchronised")
+    elif said == "no":
+        yield Finding("warning", "clock", f"{now}, not synchronised: windows of live buses carry this machine's time")
+    else:
+        yield Finding("ok", "clock", f"{now}; whether it is synchronised cannot be told here")
+
+
+def _bus(name: str) -> Finding:
+    """Open a bus as the service would, and listen for a moment."""
+    interface, separator, channel = name.split(",", maxsplit=1)[0].partition(":")
+    if not separator:
+        return Finding("failed", f"bus {name}", "give INTERFACE:CHANNEL, as in socketcan:can0")
+    try:
+        with can.Bus(channel, interface) as bus:
+            end = time.monotonic() + BUS_SECONDS
+            count = 0
+            while time.monotonic() < end:
+                count += bus.recv(0.1) is not None
+    except Exception as error:  # every driver raises its own
+        return Finding("failed", f"bus {name}", " ".join(str(error).split()) or type(error).__name__)
+    if not count:
+        return Finding("warning", f"bus {name}", f"open, but silent for {BUS_SECONDS:g} s; check cable and bit rate")
+    return Finding("ok", f"bus {name}", f"{count / BUS_SECONDS:.0f} frames a second")

@@ -1,0 +1,81 @@
+"""`sprung export`: histories out of a store, as CSV, Parquet or MCAP."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import ExitStack
+from pathlib import Path
+
+from sqlalchemy import select
+
+from sprung.service.engine import load_engine
+from sprung.service.errors import UserError
+from sprung.service.export.tables import MEDIA_TYPES, history_file
+from sprung.service.settings import settings_with
+from sprung.service.store import fleet, history, open_store
+from sprung.service.store.schema import models
+from sprung.service.times import from_iso
+
+UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+FOREVER = 2**63 - 1
+
+
+def run(
+    vehicle: str,
+    *,
+    system: Path | None,
+    weights: Path | None,
+    store: str | None,
+    out: Path | None,
+    kind: str | None,
+    parameters: list[str],
+    since: str | None,
+    until: str | None,
+    resolution: str,
+) -> int:
+    """Write the history of a vehicle's parameters to a file, or to standard output."""
+    kind = kind or ("csv" if out is None else out.suffix.removeprefix("."))
+    if kind not in MEDIA_TYPES:
+        raise UserError(f"--format {kind}: known are {', '.join(MEDIA_TYPES)}")
+    settings = settings_with({"system": system, "store": store, "weights": weights})
+    engine = load_engine(settings)
+    known = [p.name for p in engine.system.parameters]
+    for name in parameters:
+        if name not in known:
+            raise UserError(f"--parameter {name}: {engine.system.name} has {', '.join(known[:3])}, ...")
+    begin, end = _time("--since", since, 0), _time("--until", until, FOREVER)
+    with ExitStack() as stack:
+        opened = open_store(settings.store_url)
+        stack.callback(opened.close)
+        with opened.read() as connection:
+            if not fleet.vehicle_exists(connection, vehicle):
+                raise UserError(f"{settings.store_url}: nothing is known of vehicle {vehicle!r}")
+            model = connection.execute(select(models.c.id).where(models.c.digest == engine.digest)).scalar()
+            if model is None:
+                raise UserError(f"{settings.store_url}: nothing was stored with this system and these weights")
+            found = history.series(connection, vehicle, model, begin, end, _seconds(resolution), FOREVER)
+    body = history_file(engine, vehicle, parameters or known, found, kind)
+    if out is None:
+        sys.stdout.buffer.write(body)
+        sys.stdout.buffer.flush()
+    else:
+        out.write_bytes(body)
+        print(f"{out}: {len(found.time)} points of {len(parameters or known)} parameters", file=sys.stderr)
+    return 0
+
+
+def _time(option: str, text: str | None, default: int) -> int:
+    try:
+        return default if text is None else from_iso(text)
+    except (ValueError, OverflowError):
+        raise UserError(f"{option} {text}: give an RFC 3339 time, as in 2026-09-21T14:13:20Z") from None
+
+
+def _seconds(text: str) -> float:
+    if text == "raw":
+        return 0.0
+    unit = UNITS.get(text[-1:])
+    try:
+        return float(text if unit is None else text[:-1]) * (unit or 1.0)
+    except ValueError:
+        raise UserError(f"--resolution {text}: give seconds, as in 60, 1m, 6h, or raw") from None

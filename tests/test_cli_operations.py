@@ -1,0 +1,115 @@
+"""The command line beside replays: help, pipes, interrupts, narrow terminals, export, doctor."""
+
+from __future__ import annotations
+
+import csv
+import io
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from sprung.service.cli import describe, main
+from sprung.service.cli.console import parameter_table
+from sprung.service.engine import Engine
+from sprung.service.views import vehicle_view
+
+ROOT = Path(__file__).parent.parent
+RIDE = ROOT / "tests" / "data" / "drift-600s.blf"
+HEAD_ONLY = "set -o pipefail; {python} -m sprung replay {ride} --json | head -n 1"
+
+
+def run(*arguments: str, stdin: bytes | None = None, columns: str = "120") -> subprocess.CompletedProcess[bytes]:
+    environment = os.environ | {"COLUMNS": columns, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, "-m", "sprung", *arguments]
+    return subprocess.run(command, cwd=ROOT, env=environment, input=stdin, capture_output=True, check=False)
+
+
+@pytest.mark.parametrize("command", ["replay", "serve", "export", "doctor", "diagnose", "train", "system"])
+def test_help_is_in_full_words(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    options = text[text.index("Options:") :]
+    for machine in ("<bool>", "<path>", "<str>", "list[", "range>"):
+        assert machine not in options
+
+
+def test_wrong_usage_points_to_the_help_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay"]) == 2
+    line = capsys.readouterr().err.strip()
+    assert line.endswith("see sprung replay --help") and ".;" not in line
+
+
+def test_what_is_no_usage_error_is_one_line() -> None:
+    assert describe(ValueError("two\nlines")) == "two lines"
+
+
+def test_narrow_tables_keep_whole_names(engine: Engine) -> None:
+    view = vehicle_view(engine, "a", engine.tracker.initial_state(), None)
+    for width in (50, 64, 80, 120):
+        table = parameter_table(view, width)
+        heads = [str(column.header) for column in table.columns]
+        assert heads[0] == "parameter" and {"drift", "state"} <= set(heads)
+        assert ("nominal" in heads) == (width >= 84)
+
+
+def test_doctor_tells_what_works_and_what_does_not(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--store", str(tmp_path / "s.db"), "--data-dir", str(tmp_path)]
+    assert main(["doctor", *options]) == 0
+    text = capsys.readouterr().out
+    for what in ("installation", "model", "store", "disk", "clock"):
+        assert f" {what}: " in text
+    assert main(["doctor", *options, "--can", "socketcan:can9"]) == 1
+    assert "failed   bus socketcan:can9" in capsys.readouterr().out
+    (tmp_path / "broken.db").write_bytes(b"this is no database" * 100)
+    assert main(["doctor", "--store", str(tmp_path / "broken.db"), "--data-dir", str(tmp_path)]) == 1
+
+
+def test_export_of_an_unknown_vehicle_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["export", "nobody", "--store", str(tmp_path / "s.db")]) == 2
+    assert "nothing is known of vehicle 'nobody'" in capsys.readouterr().err
+    assert main(["export", "a", "--format", "xls"]) == 2
+    assert main(["export", "a", "--since", "noon", "--store", str(tmp_path / "s.db")]) == 2
+
+
+@pytest.mark.slow
+def test_a_ride_from_stdin_and_out_again(tmp_path: Path) -> None:
+    store = str(tmp_path / "s.db")
+    done = run("replay", "-", "--store", store, "--vehicle", "car-17", stdin=RIDE.read_bytes(), columns="60")
+    assert done.returncode == 1, done.stderr  # it has alarms
+    assert b"secondary_2l.damping" in done.stdout and b"\xe2\x80\xa6" not in done.stdout
+    out = run("export", "car-17", "--store", store)
+    rows = list(csv.reader(io.StringIO(out.stdout.decode())))
+    assert len(rows) == 1 + 1199 and len(rows[0]) == 3 + 48
+    mcap = tmp_path / "h.mcap"
+    run("export", "car-17", "--store", store, "--out", str(mcap), "--parameter", "secondary_2l.damping")
+    with mcap.open("rb") as file:
+        assert {c.topic for _, c, _ in make_reader(file).iter_messages()} == {"/estimate/secondary_2l/damping"}
+
+
+@pytest.mark.slow
+def test_a_closed_pipe_is_no_alarm() -> None:
+    line = HEAD_ONLY.format(python=sys.executable, ride=RIDE)
+    done = subprocess.run(["bash", "-c", line], cwd=ROOT, capture_output=True, check=False)
+    assert done.returncode == 0 and done.stdout.startswith(b'{"window"'), done.stderr
+
+
+@pytest.mark.slow
+def test_an_interrupt_tells_what_is_kept(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "sprung", "replay", str(RIDE), "--store", str(tmp_path / "s.db"), "--speed", "2"]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL) as process:
+        time.sleep(25)
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert b"windows are kept in" in errors and b"call it again" in errors
+
+
+def test_a_free_body_is_a_legal_system(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["system", str(ROOT / "benchmarks" / "systems" / "emps.yaml")]) == 0
+    assert "slide.mass" in capsys.readouterr().out
