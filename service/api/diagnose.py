@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import FileResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
@@ -20,6 +20,8 @@ from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import discard, receive
 from sprung.service.core import Core
 from sprung.service.errors import NotFound
+from sprung.service.links import with_links
+from sprung.service.notify.events import vehicle_page
 from sprung.service.store import fleet, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 from sprung.service.tokens import Actor
@@ -71,14 +73,17 @@ async def report(request: Request, core: CoreOf, actor: ActorOf, id: str) -> Res
     return json_response(row.report | {"id": row.id})
 
 
-@router.get("/reports/{id}/page", summary="A mismatch report as a page", response_class=FileResponse)
+@router.get("/reports/{id}/page", summary="A mismatch report as a page", response_class=HTMLResponse)
 async def report_page(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """A self-contained page with the pictures."""
     row = await _report(core, actor, id)
     path = core.settings.reports / row.id / PAGE  # the id is the store's, not the client's
     if not path.is_file():
         raise NotFound(f"the page of report {row.id} is no longer kept")
-    return FileResponse(path, media_type="text/html")
+    page = await run_in_threadpool(path.read_text, "utf-8")
+    links = {"/": "Fleet"} | ({vehicle_page("", row.vehicle_id): row.vehicle_id} if row.vehicle_id else {})
+    links |= {"/pages/work": "Reports", f"/reports/{row.id}": "JSON"}
+    return HTMLResponse(with_links(page, links))
 
 
 async def _of_upload(request: Request, core: Core, actor: Actor) -> JobRow:

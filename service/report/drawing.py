@@ -81,6 +81,12 @@ def _support(axes: Axes, layout: Layout, name: str, colour: str) -> Point:
     )
     centre = layout.at(x, y, -0.42)
     order = -2 if y > 0 else 9
+    if not layout.railway:  # the moved table of a test rig
+        table = [(centre[0] - 0.6, 0.0), (centre[0] + 0.6, 0.0), (centre[0] + 0.6, -0.22), (centre[0] - 0.6, -0.22)]
+        axes.add_patch(Polygon(table, closed=True, facecolor="#f4f6f8", edgecolor=colour, lw=1.5, zorder=order))
+        arrow = {"arrowstyle": "<|-|>", "color": colour, "lw": 1.3}
+        axes.annotate("", xy=(centre[0], -0.24), xytext=(centre[0], -0.84), arrowprops=arrow)
+        return centre
     axes.add_patch(Circle(centre, 0.42, facecolor="#f4f6f8", edgecolor=colour, lw=1.5, zorder=order))
     axes.add_patch(Circle(centre, 0.08, facecolor=colour, edgecolor="none", zorder=order))
     return centre
