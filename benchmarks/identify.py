@@ -18,6 +18,7 @@ import torch
 from sprung.benchmarks.bounds import time_domain_bound
 from sprung.benchmarks.peers import ScipyPeer, ukf_peer
 from sprung.benchmarks.sensing import full_state_system
+from sprung.model.identification.estimator import bundled_estimator
 from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
 from sprung.model.identification.features import magnitudes
 from sprung.model.identification.identify import Identifier, load_identifier
@@ -59,7 +60,8 @@ def _accuracy(system: System, windows: int, bounds: int) -> Iterator[dict[str, A
     at_truth = Refiner(system).refine(runs.clean, runs.log_ratio, iterations=1)
     bound = np.sqrt(np.diagonal(at_truth.covariance, axis1=1, axis2=2))
     ratio = np.sqrt((error**2).mean(axis=0)) / np.sqrt((bound**2).mean(axis=0))
-    alone = identifier.estimator.estimate(runs.values).log_ratio if identifier.estimator else np.zeros_like(error)
+    estimator = bundled_estimator(system)
+    alone = estimator.estimate(runs.values).log_ratio if estimator else np.zeros_like(error)
     alone_ratio = np.sqrt(((alone - runs.log_ratio) ** 2).mean(axis=0)) / np.sqrt((bound**2).mean(axis=0))
     inside = np.abs(error) < 1.96 * _std(estimates)
     for i, parameter in enumerate(system.parameters):
@@ -156,7 +158,7 @@ def _paper_sensing(windows: int) -> Iterator[dict[str, Any]]:
 
 
 def _speed(system: System, scipy_windows: int) -> Iterator[dict[str, Any]]:
-    identifier = load_identifier(system, workers=os.cpu_count() or 1)
+    identifier = Identifier(system, bundled_estimator(system), workers=os.cpu_count() or 1)
     runs = _draw(system, 1024, 106)
     identifier.identify(runs.values)
     rates = []

@@ -18,7 +18,7 @@ from sprung.model.alps import train_fit
 from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
 from sprung.model.alps.train_system import STEPS, TrainData, full_state_system, generate, to_points
-from sprung.model.identification.estimator import Estimator, new_estimator, noise_power
+from sprung.model.identification.estimator import Estimator, bundled_estimator, new_estimator, noise_power
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.system import System, load_system
@@ -191,8 +191,9 @@ def _sensor_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]
             continue
         identifier = load_identifier(system)
         first = None
-        if identifier.estimator is not None and method == "sensors_refined":
-            first = identifier.estimator.estimate(measured).log_ratio
+        estimator = bundled_estimator(system)
+        if estimator is not None and method == "sensors_refined":
+            first = estimator.estimate(measured).log_ratio
         elif method == "sensors_refined":
             continue  # no trained weights for this system here
         found = Refiner(system).refine(measured, first)

@@ -110,7 +110,7 @@ class System:
         Wheels on a track have none; the measured speed, where there is one, tells how late each of them is.
         """
         channels = []
-        if self.on_track and self._speed_measured:
+        if self.on_track and self._speed_measured and self.file.speed is not None:
             channels.append(_channel("speed", "speed", self.file.speed))
         for name, source in self.file.inputs.items():
             if isinstance(source, ForceInput):
@@ -129,7 +129,7 @@ class System:
     def auxiliary(self) -> tuple[Channel, ...]:
         """Measured signals that say how the vehicle runs: `speed`, and `BODY.pressure` of loads."""
         channels = []
-        if self._speed_measured and not self.on_track:
+        if self._speed_measured and not self.on_track and self.file.speed is not None:
             channels.append(_channel("speed", "speed", self.file.speed))
         for name, body in self.file.bodies.items():
             if body.load is not None and body.load.pressure is not None:

@@ -294,7 +294,8 @@ class IdentifierWithLaws:
         covariance = 2 * np.linalg.inv(curved + 2 / PRIOR_STD**2 * np.eye(L))
         step = np.clip(-0.5 * (covariance @ slope[:, :, None])[:, :, 0], -_MOST, _MOST)
         std = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        return Profile(changed(step), covariance, moves, bool(np.mean(np.abs(step) < np.maximum(_CLOSE * std, 1e-3)) > _MOSTLY))
+        small = np.abs(step) < np.maximum(_CLOSE * std, 1e-3)
+        return Profile(changed(step), covariance, moves, bool(np.mean(small) > _MOSTLY))
 
     def _cost(self, solved: Refined) -> FloatArray:
         cost: FloatArray = solved.chi_square * solved.freedom

@@ -31,7 +31,11 @@ async def events(
 ) -> Response:
     """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle."""
     loop, ready = asyncio.get_running_loop(), asyncio.Event()
-    listener = core.hub.listen(vehicle, lambda: loop.call_soon_threadsafe(ready.set))
+
+    def wake() -> None:
+        loop.call_soon_threadsafe(ready.set)
+
+    listener = core.hub.listen(vehicle, wake)
     stream = _stream(request, core, listener, ready)
     return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 

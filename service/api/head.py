@@ -20,7 +20,7 @@ class HeadAsGet:
 
         async def without_body(message: Message) -> None:
             if message["type"] == "http.response.body":
-                message = message | {"body": b""}
+                message = {**message, "body": b""}
             await send(message)
 
         await self.app(dict(scope) | {"method": "GET"}, receive, without_body)

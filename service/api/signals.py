@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -64,7 +65,11 @@ async def vehicle_bundle(core: CoreOf, id_: Id) -> Response:
     found = await read(core, query)
     excerpt = core.diagnoses.excerpt(id_)
     windows = list(whole_windows(core.engine, excerpt))
-    work = core.compute.submit(lambda: [compare(core.engine, *held) for held in windows], Priority.BATCH)
+
+    def compared() -> Sequence[Compared]:
+        return [compare(core.engine, *held) for held in windows]
+
+    work = core.compute.submit(compared, Priority.BATCH)
     body = await run_in_threadpool(bundle, core.engine, found, excerpt, await asyncio.wrap_future(work))
     headers = {"Content-Disposition": f'attachment; filename="{id_.replace(":", "_")}.mcap"'}
     return Response(body, media_type=BUNDLE_MEDIA, headers=headers)

@@ -111,7 +111,8 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
     for name, sensor in file.sensors.items():
         body = getattr(sensor, "body", None)
         if body in tops:
-            x, y = sensor.position if sensor.position is not None else file.bodies[body].position
+            at = getattr(sensor, "position", None)
+            x, y = at if at is not None else file.bodies[body].position
             parts.append(_sensor(name, names[name], found.across(float(x), float(y)), tops[body], sensors))
         else:
             element = getattr(sensor, "element", None)

@@ -56,8 +56,8 @@ def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
     insert_or_ignore(connection, vehicles, [{"id": vehicle, "created_ns": now}])
     model = connection.execute(select(func.max(models.c.id))).scalar()
     if model is not None:
-        numbers = ("revision", "urgency", "alarms", "warnings", "unacknowledged", "earlier", "learned")
-        numbers += ("used", "repaired", "dropped", "uninformative", "unfitting")
+        counted = ("used", "repaired", "dropped", "uninformative", "unfitting")
+        numbers = ("revision", "urgency", "alarms", "warnings", "unacknowledged", "earlier", "learned", *counted)
         blank = {"vehicle_id": vehicle, "model_id": model, "health": "ok", "elements": "", "received_ns": now}
         insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
 

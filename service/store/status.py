@@ -99,7 +99,7 @@ def save_status(
     earlier = _open_of_other_models(connection, vehicle, model_id)
     numbers = {name: (getattr(old, name) if same else 0) + counts[name] for name in COUNTED}
     values = asdict(status)
-    if status.nrmse is None and same:
+    if status.nrmse is None and same and old is not None:
         values["nrmse"] = old.nrmse
     values |= numbers | {
         "vehicle_id": vehicle,
