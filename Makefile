@@ -11,7 +11,7 @@ DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 PYTEST ?=
 
-.PHONY: help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
+.PHONY: docs help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
@@ -20,6 +20,7 @@ help:
 	@echo "make matrix     the fast tests on Python 3.11, 3.12 and 3.13, those that are installed"
 	@echo "make lint       ruff and mypy"
 	@echo "make ci         lint, then the tests with coverage, as CI does"
+	@echo "make docs       the documents as a site in site/"
 	@echo "make bench      list the benchmarks; make bench NAME=replay runs one"
 
 install: $(VENV)/.installed
@@ -76,6 +77,10 @@ audit: install-dev
 bandit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"
 	$(BIN)/bandit --quiet --recursive model replay service --severity-level medium --skip B104,B608
+
+docs: install
+	$(PIP) "mkdocs==1.6.1"
+	$(BIN)/mkdocs build --quiet --site-dir site
 
 bench: install
 	$(BIN)/sprung bench $(NAME)

@@ -174,3 +174,18 @@ def test_every_query_of_panels_variables_and_rules_is_answered(prometheus: str) 
         for metric in re.findall(r"sprung_\w+", rule["expr"]):
             assert ask(prometheus, metric), (rule["alert"], metric)
     assert {alert["metric"]["alertname"] for alert in ask(prometheus, "ALERTS")} >= {"SprungSuspensionChanged"}
+
+
+@pytest.mark.skipif(shutil.which("mkdocs") is None, reason="needs mkdocs, as `make docs` installs it")
+def test_the_site_of_the_documents_asks_no_other_host(tmp_path: Path) -> None:
+    root = DEPLOY.parent
+    command = ["mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    pages = list((tmp_path / "site").rglob("*.html"))
+    assert {page.stem for page in pages} >= {path.stem for path in (root / "docs").glob("*.md")}
+    for page in pages:
+        loaded = re.findall(r"<(?:script|img|iframe)[^>]* src=\"([^\"]+)\"", page.read_text())
+        loaded += re.findall(r"<link[^>]* rel=\"stylesheet\"[^>]* href=\"([^\"]+)\"", page.read_text())
+        loaded += re.findall(r"<link[^>]* href=\"([^\"]+)\"[^>]* rel=\"stylesheet\"", page.read_text())
+        assert not [link for link in loaded if link.startswith(("http", "//"))], page
