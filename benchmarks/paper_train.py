@@ -19,7 +19,6 @@ from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
 from sprung.model.alps.train_system import STEPS, TrainData, full_state_system, generate, to_points
 from sprung.model.identification.estimator import Estimator, bundled_estimator, new_estimator, noise_power
-from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.system import System, load_system
 
@@ -189,7 +188,6 @@ def _sensor_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]
     for method in ("sensors_refined", "sensors_output_error"):
         if not settings.wants(method):
             continue
-        identifier = load_identifier(system)
         first = None
         estimator = bundled_estimator(system)
         if estimator is not None and method == "sensors_refined":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
 import numpy as np
@@ -130,11 +132,21 @@ class Recording:
         return self.account.incomplete
 
 
+@cache
+def added_readers() -> dict[str, EntryPoint]:
+    """Readers of other packages by extension: entry points of the group `sprung.readers`, as `xyz = package:blocks`.
+
+    Each is a function (path, channels, account, time) -> Iterator[SampleBlock], like `csvtable.blocks`.
+    """
+    return {f".{point.name.lower()}": point for point in entry_points(group="sprung.readers")}
+
+
 def kind_of(path: Path) -> str:
     """The extension of a file that can be read; raises UnreadableRecording when there is no such file or reader."""
     extension = path.suffix.lower()
-    if extension not in EXTENSIONS:
-        raise UnreadableRecording(f"{path}: cannot read files of this kind; known are {' '.join(EXTENSIONS)}")
+    if extension not in EXTENSIONS and extension not in added_readers():
+        known = " ".join([*EXTENSIONS, *added_readers()])
+        raise UnreadableRecording(f"{path}: cannot read files of this kind; known are {known}")
     if not path.is_file():
         raise UnreadableRecording(f"{path}: no such file")
     return extension
@@ -167,6 +179,8 @@ def open_recording(
         source = _whatever(path, parquet.blocks(path, channels, account, time), account)
     elif extension in series.KINDS:
         source = _whatever(path, _series(path, channels, account, time), account)
+    elif extension in added_readers():
+        source = _whatever(path, added_readers()[extension].load()(path, channels, account, time), account)
     else:
         if dbc is None:
             raise UnreadableRecording(f"{path}: a CAN recording needs a CAN database; name it with --dbc")

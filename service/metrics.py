@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import entry_points
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
@@ -28,6 +29,8 @@ class Metrics:
         """fleet: counts of all vehicles in service by health, from the store."""
         self.registry = CollectorRegistry()
         self.registry.register(FleetCollector(board, parameter_vehicles, fleet))
+        for added in entry_points(group="sprung.metrics"):  # of other packages: a function (board) -> Collector
+            self.registry.register(added.load()(board))
         self.frames = Counter(
             "sprung_frames_total",
             "Messages read, by what became of them",

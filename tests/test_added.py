@@ -1,0 +1,137 @@
+"""A law, a reader and a metric added by a package of somebody else's; no file of ours is touched."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from sprung.model.simulate.ride import simulate_ride
+from sprung.model.system import parse_system
+
+ROOT = Path(__file__).parents[1]
+READER = '''
+import numpy as np
+from sprung.model.signals import SampleBlock
+
+def blocks(path, channels, account, time):
+    """Rows of float64: time in s, then every channel in the system's order."""
+    rows = np.fromfile(path).reshape(-1, 1 + len(channels))
+    stamps = np.repeat(np.round(rows[:, 0] * 1e9).astype(np.int64), len(channels))
+    which = np.tile(np.arange(len(channels), dtype=np.int32), len(rows))
+    account.tally.used += len(rows)
+    yield SampleBlock(stamps, which, rows[:, 1:].ravel())
+'''
+METRIC = """
+from prometheus_client.core import GaugeMetricFamily
+
+class Cars:
+    def __init__(self, board):
+        self.board = board
+
+    def collect(self):
+        yield GaugeMetricFamily("other_answer", "Of somebody else", value=42)
+
+    def describe(self):
+        return []
+"""
+LAW = """
+import numpy as np
+from sprung.model.laws import ElementLaw, ParameterSpec, grid
+
+SQUEAK = ElementLaw(
+    name="squeak",
+    title="squeak",
+    parameters=(ParameterSpec("size", "N", 0.0, 1e6, "amplitude", lambda seen: 20.0),),
+    force=lambda motion, p, element: p[0] * np.sin(motion.deflection / 1e-3),
+    shapes=lambda seen: grid([20.0]),
+    absent=(0.0,),
+    looks_like="waves over the deflection",
+    confused_with=(),
+    sentence="a squeak of {size}",
+)
+"""
+SYSTEM = """
+name: one
+sample_rate: 100
+window: 100
+bodies: {car: {mass: 400}}
+inputs: {road: {kind: displacement, displacement: {csv: z, noise: 1.0e-5}, velocity: {csv: v, noise: 1.0e-4}}}
+elements: {strut: {upper: car, lower: road, stiffness: 20000, damping: 1500}}
+sensors: {a: {kind: acceleration, body: car, csv: a, noise: 0.01}}
+"""
+
+
+def package(folder: Path) -> Path:
+    """An installed package, as `pip install --target` leaves it."""
+    site = folder / "site"
+    (site / "other").mkdir(parents=True)
+    (site / "other" / "__init__.py").write_text("")
+    (site / "other" / "reading.py").write_text(READER)
+    (site / "other" / "counting.py").write_text(METRIC)
+    info = site / "other-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
+    points = "[sprung.readers]\nraw8 = other.reading:blocks\n\n[sprung.metrics]\ncars = other.counting:Cars\n"
+    (info / "entry_points.txt").write_text(points)
+    return site
+
+
+def run(arguments: list[str], site: Path) -> subprocess.CompletedProcess[str]:
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
+    return subprocess.run(
+        [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False, cwd=ROOT
+    )
+
+
+def test_a_reader_of_another_package_is_replayed(tmp_path: Path) -> None:
+    system = parse_system(SYSTEM)
+    t = np.arange(3000) / 100
+    rng = np.random.default_rng(1)
+    f, phase = rng.uniform(0.5, 10, 40), rng.uniform(0, 6.3, 40)
+    z = (3e-3 / f * np.sin(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
+    v = (6e-3 * np.pi * np.cos(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
+    inputs = np.stack([z, v], axis=1)
+    shown = simulate_ride(system, inputs, {"strut.stiffness": 23000.0}, noise=rng).sensors
+    noisy = inputs + rng.normal(0, [1e-5, 1e-4], inputs.shape)
+    np.column_stack([1.79e9 + t, noisy, shown]).tofile(tmp_path / "ride.raw8")
+    (tmp_path / "one.yaml").write_text(SYSTEM)
+    done = run(
+        ["-m", "sprung", "replay", str(tmp_path / "ride.raw8"), "--system", str(tmp_path / "one.yaml"), "--json"],
+        package(tmp_path),
+    )
+    summary = json.loads(done.stdout.splitlines()[-1])["summary"]
+    stiffness = next(p for p in summary["parameters"] if p["name"] == "strut.stiffness")
+    assert abs(stiffness["value"] - 23000) < 5 * stiffness["std"], done.stderr
+
+
+def test_a_metric_of_another_package_is_shown(tmp_path: Path) -> None:
+    code = (
+        "from sprung.service.metrics import Metrics\n"
+        "class Board:\n"
+        "    def __getattr__(self, name): return lambda *a, **k: []\n"
+        "from prometheus_client import generate_latest\n"
+        "import sprung.service.metrics as m\n"
+        "m.FleetCollector = type('None_', (), {'__init__': lambda s, *a: None, 'collect': lambda s: [],"
+        " 'describe': lambda s: []})\n"
+        "print(generate_latest(Metrics(Board(), 1).registry).decode())\n"
+    )
+    done = run(["-c", code], package(tmp_path))
+    assert "other_answer 42.0" in done.stdout, done.stderr
+
+
+def test_a_law_from_a_file_is_known_to_the_diagnosis(tmp_path: Path) -> None:
+    (tmp_path / "laws.py").write_text(LAW)
+    (tmp_path / "one.yaml").write_text(SYSTEM.replace("1500}", "1500, laws: [{squeak: {size: 10}}]}"))
+    code = (
+        "from sprung.model.laws import CATALOGUE; from sprung.model.laws.own import load_laws\n"
+        "from sprung.model.system import load_system\n"
+        f"laws = CATALOGUE + load_laws({str(tmp_path / 'laws.py')!r}, ())\n"
+        f"print(load_system({str(tmp_path / 'one.yaml')!r}, laws).laws[0].names)\n"
+    )
+    done = run(["-c", code], tmp_path)
+    assert "strut.squeak.size" in done.stdout, done.stderr
