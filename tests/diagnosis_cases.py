@@ -6,6 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.signals import declared_noise, transform
 from sprung.model.system import System, parse_system
 
 SYSTEM = """
@@ -99,3 +102,17 @@ def _decimated(channels: np.ndarray) -> np.ndarray:
     filtered = oaconvolve(channels, taps[:, None], axes=0)[half:-half]
     margin = 30 * FINE  # the filter's ends
     return filtered[margin:-margin:FINE]
+
+
+def problem_of(record: Recorded, system: System | None = None) -> Problem:
+    """A recording of the quarter car as a problem with declared noise."""
+    system = system or quarter_car()
+    signals = prepare(system, record.values, record.sample_rate).signals
+    noise = declared_noise(system, signals)
+    return Problem(system, transform(signals, noise), signals.sensor_index, noise)
+
+
+def true_log_ratios(system: System) -> np.ndarray:
+    """The simulated elements' values over nominal, logarithms, (P,)."""
+    values = [(STIFFNESS if p.quantity == "stiffness" else DAMPING)[p.element] for p in system.parameters]
+    return np.log(np.array(values) / system.nominal)

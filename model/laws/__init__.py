@@ -66,19 +66,6 @@ CATALOGUE: tuple[Law, ...] = (
 )
 
 
-def element_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[ElementLaw, ...]:
-    """The laws that add a force to an element or a pair."""
-    return tuple(law for law in catalogue if isinstance(law, ElementLaw))
-
-
-def body_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[BodyLaw, ...]:
-    return tuple(law for law in catalogue if isinstance(law, BodyLaw))
-
-
-def sensor_laws(catalogue: tuple[Law, ...] = CATALOGUE) -> tuple[SensorLaw, ...]:
-    return tuple(law for law in catalogue if isinstance(law, SensorLaw))
-
-
 def find_law(name: str, catalogue: tuple[Law, ...] = CATALOGUE) -> Law:
     """The law of that name; a ValueError that lists the names otherwise."""
     for law in catalogue:
@@ -102,11 +89,8 @@ __all__ = [
     "SensorResponse",
     "SpringDamper",
     "SupportLaw",
-    "body_laws",
-    "element_laws",
     "find_law",
     "grid",
     "load_laws",
     "observe",
-    "sensor_laws",
 ]

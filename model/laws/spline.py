@@ -119,7 +119,6 @@ class ForceMap:
     rate: FloatArray  # m/s, (b,)
     force: FloatArray  # N, (b, a)
     std: FloatArray  # N, (b, a)
-    visited: FloatArray  # share of the recording spent in the cell, (b, a)
 
 
 @dataclass(frozen=True)
@@ -169,18 +168,12 @@ class LatentForce:
         """The surface on a grid over the range of the motion."""
         x, y = self._grid(points)
         d, v = np.meshgrid(x, y)
-        return ForceMap(x, y, self.force(d, v), self.std(d, v), self._visited(x, y))
+        return ForceMap(x, y, self.force(d, v), self.std(d, v))
 
     def _grid(self, points: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         reach = (self.surface.deflection.reach, self.surface.rate.reach)
         x, y = (np.linspace(-r, r, count) / _MARGIN for r, count in zip(reach, points, strict=True))
         return x, y
-
-    def _visited(self, x: FloatArray, y: FloatArray) -> FloatArray:
-        d, v = self.surface.motion
-        edges = [np.concatenate([[-np.inf], 0.5 * (a[1:] + a[:-1]), [np.inf]]) for a in (y, x)]
-        counts, *_ = np.histogram2d(v, d, bins=edges)
-        return counts / len(d)
 
 
 @dataclass(frozen=True)

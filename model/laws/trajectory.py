@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -107,8 +106,3 @@ def _column(value: Any) -> Any:
     """A parameter that broadcasts with (..., T), without the axis of samples."""
     array = np.asarray(value, dtype=float)
     return array[..., 0] if array.ndim else array
-
-
-def parameter_columns(trials: FloatArray) -> Sequence[FloatArray]:
-    """Trials (S, P) as P columns (S, 1), ready for `along`."""
-    return [trials[:, i, None] for i in range(trials.shape[1])]

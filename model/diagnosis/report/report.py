@@ -235,8 +235,6 @@ class Report:
             "advice": list(self.advice),
         }
 
-    as_dict = to_dict
-
 
 def _number(value: float | None) -> float | None:
     """A float that JSON can hold: None stands for what is not finite."""

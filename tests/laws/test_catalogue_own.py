@@ -10,11 +10,11 @@ import pytest
 
 from sprung.model.laws import CATALOGUE, SpringDamper, load_laws, observe
 from sprung.model.laws.own import LawFileError
-from sprung.model.laws.trajectory import along, parameter_columns
+from sprung.model.laws.trajectory import along
 from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement
 from sprung.model.system import load_system
 
-DOCUMENT = Path(__file__).parent.parent / "docs" / "catalogue.md"
+DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "catalogue.md"
 
 
 def example() -> str:
@@ -36,7 +36,7 @@ def test_the_documented_law_screens_like_any_other(law):
     trials = law.shapes(seen)
     assert all(law.admits(p) for p in trials)
     element = SpringDamper(4e5, 2e4)
-    forces = along(law, parameter_columns(trials), d, v, sample_rate=100.0, element=element)
+    forces = along(law, trials.T[:, :, None], d, v, sample_rate=100.0, element=element)
     assert forces.shape == (len(trials), 500)
     assert (forces * v >= 0).all()
 

@@ -176,8 +176,7 @@ def test_the_surface_leaves_spring_and_damper_alone():
 def test_a_map_for_drawing():
     _, latent, _ = found("quadratic stiffness", rounds=1)
     drawn = latent.map((21, 15))
-    assert drawn.force.shape == drawn.std.shape == drawn.visited.shape == (15, 21)
-    assert drawn.visited.sum() == pytest.approx(1.0)
+    assert drawn.force.shape == drawn.std.shape == (15, 21)
     assert (drawn.std > 0).all()
 
 

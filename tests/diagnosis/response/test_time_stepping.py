@@ -1,0 +1,30 @@
+"""Forces marched in time against those of the whole trajectory."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from diagnosis_cases import problem_of, quarter_car, simulate, true_log_ratios
+
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.laws import find_law
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "settles"), [("coulomb_friction", (300.0, 0.01), True), ("bump_stop", (4e-3, 1e6), False)]
+)
+def test_forces_marched_in_time_are_those_of_the_whole_trajectory(law, values, settles):
+    """Steps in time lead to the forces of the iteration, also where that does not settle from its own start."""
+    problem = problem_of(simulate(seed=6))
+    point = Point(true_log_ratios(quarter_car()), (Term(find_law(law), "secondary", values),), np.zeros(4))
+    forward = problem.forward(point)
+    alone = forward.law_forces(point.state)
+    assert alone is not None and alone.converged is settles
+    marched = march_forces(forward, point.state)
+    led = replace(forward, start_force=tuple(marched.T)).law_forces(point.state)
+    assert led is not None and led.converged
+    inside = slice(400, -100)  # the marched one is not periodic at the ends
+    difference = marched[inside, 0] - led.force[inside, 0]
+    assert np.std(difference) < 0.02 * np.std(led.force[inside, 0])
