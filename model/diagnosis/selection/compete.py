@@ -1,14 +1,6 @@
 """Which candidate, if any: full fits of the best screened ones, compared by evidence, one finding after the other.
 
-Gain of a candidate:   sum over blocks (sensor, band) of  n log(chi^2 before / chi^2 after),
-
-twice the log-likelihood ratio with the noise level of every block profiled out, so that coloured noise of unknown
-level does not count as evidence; where the noise is white and known it equals the fall of chi^2.
-
-Evidence of a model, up to constants:   gain - sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
-
-(Laplace's approximation with a flat prior of `width`, MacKay 2003, chapter 28): a parameter costs what the recording
-tells about it, so a shape that does not matter costs nothing, where BIC would charge log n for it.
+What a fit is worth and what its parameters cost: `evidence`.
 """
 
 from __future__ import annotations
@@ -17,7 +9,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.fit.baseline import refreshed
@@ -28,24 +19,27 @@ from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.point import Point, advance
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.score import Candidate, Screening
+from sprung.model.diagnosis.selection.evidence import (
+    RULES,
+    bic,
+    chance,
+    monotone_gains,
+    occam_cost,
+    profile_gain,
+    unusual_cost,
+)
 from sprung.model.laws import BodyLaw, ElementLaw
 from sprung.model.laws.base import Reading, Restart
-from sprung.model.signals import FloatArray
 
-_LOG_WIDTH = 4.6  # prior width of a parameter of unknown order: a factor of 100
-_WIDTHS = 4.0  # prior width of other parameters, in sizes at which they matter
 _UNNAMED_RATIO = 1.3  # and explain this many times as much
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
 _NEAR = 45.0  # or this close to it
 _MOST = 9  # candidates that are fitted
-_UNUSUAL = 4.0  # evidence that a factor e outside the usual range of a parameter costs
 _STRONGER = 1.1
 _HINT = 0.02  # share of a law's strength at which its first step is taken
-_BLOCKS, _FIRST_BLOCK = 14, 24  # frequency blocks per sensor, bins of the first
 _SETTLING = 3  # rounds in which fits that still fall and could lead are fitted on
 _LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
 _FURTHER = 3  # candidates that are tried for a runner-up where none was close
-_QUIET = 0.5  # least noise power of a block over the estimated one
 _CHANCE = 4.0  # standard deviations by which what is noise exceeds it
 
 
@@ -76,12 +70,11 @@ class Trial:
 
     def p_value(self, tests: int) -> float:
         """Chance of such a gain among so many candidates, noise levels unknown."""
-        count = max(1, self.freedom)
-        return float(min(1.0, tests * stats.chi2.sf(max(self.gain, 0.0), count)))
+        return chance(self.gain, self.freedom, tests)
 
     def delta_bic(self) -> float:
         """BIC with the candidate less BIC without."""
-        return -self.gain + len(self.term.parameters) * float(np.log(self.fit.count))
+        return bic(self.gain, len(self.term.parameters), self.fit.count)
 
 
 def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Candidate]:
@@ -189,15 +182,20 @@ def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
         return True
     best = max(named, key=lambda trial: trial.worth)
     noise = 1 + _CHANCE * np.sqrt(2 / best.fit.count)
-    return unnamed.score > best.worth or not _QUIET <= best.fit.reduced <= noise
+    return unnamed.score > best.worth or not RULES.quiet <= best.fit.reduced <= noise
 
 
 def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
     least = min((t.fit.reduced for t in trials), default=1.0)
-    if least < _QUIET and not problem.process_noise:
-        again = [_judged(problem, base, t.hit, t.fit, _QUIET * least) for t in trials]
+    if least < RULES.quiet and not problem.process_noise:
+        again = [_judged(problem, base, t.hit, t.fit, RULES.quiet * least) for t in trials]
         trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
+    if not problem.process_noise:
+        gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials])
+        trials = [
+            replace(t, gain=gain, evidence=t.evidence - (t.gain - gain)) for t, gain in zip(trials, gains, strict=True)
+        ]
     return sorted(trials, key=lambda t: -t.evidence)
 
 
@@ -300,7 +298,7 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     return _judged(problem, base, trial.hit, fit)
 
 
-def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = _QUIET) -> Trial:
+def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = RULES.quiet) -> Trial:
     sensors = len(problem.sensors)
     if problem.process_noise:  # how noisy the forces are is what candidates differ in
         gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
@@ -308,7 +306,7 @@ def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float 
     else:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet))
-    dear = cost(fit, len(hit.term.parameters)) + hit.term.law.prior_cost + _unusual(fit.point.terms[-1])
+    dear = cost(fit, len(hit.term.parameters)) + hit.term.law.prior_cost
     freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(hit, fit, gain, worth, gain - dear, freedom)
 
@@ -323,37 +321,11 @@ def preferred(trials: list[Trial]) -> list[Trial]:
     return trials
 
 
-def profile_gain(before: FloatArray, after: FloatArray, sensors: int, quiet: float) -> float:
-    """Twice the log-likelihood ratio of two whitened residuals (2 F S,), block levels profiled out.
-
-    A block quieter than `quiet` times the estimated noise, which is white, owes that to its colour: no evidence.
-    """
-    power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
-    bins = len(power[0])
-    edges = np.unique(np.round(np.geomspace(min(_FIRST_BLOCK, bins), bins, _BLOCKS)).astype(int))
-    edges = np.concatenate([[0], edges[edges > 0]])
-    counts = 2.0 * np.diff(edges)[:, None]
-    levels = [np.maximum(np.add.reduceat(p, edges[:-1], axis=0) / counts, quiet) for p in power]
-    return float(np.sum(counts * np.log(levels[0] / levels[1])))
-
-
 def cost(fit: Fit, count: int) -> float:
     """What the last `count` law parameters cost in evidence."""
     term = fit.point.terms[-1]
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[-count:], 0)) / np.abs(term.slopes) if count else np.zeros(0)
-    total = 0.0
-    for spec, scale, s in zip(term.law.parameters, term.scales, sigma, strict=True):
-        width = _LOG_WIDTH if spec.log else _WIDTHS * scale
-        if s > 0:
-            total += max(0.0, 2 * float(np.log(width / (s * np.sqrt(2 * np.pi)))))
-    return total
-
-
-def _unusual(term: Term) -> float:
-    """What values outside a law's usual range cost in evidence: look-alikes pass into each other there."""
-    total = 0.0
+    total = occam_cost([spec.log for spec in term.law.parameters], term.scales, sigma)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
-        low, high = spec.usual
-        relative = max(abs(value) / scale, 1e-12)
-        total += _UNUSUAL * float(np.log(max(1.0, low / relative, relative / high)))
+        total += unusual_cost(value / scale, spec.usual)
     return total

@@ -34,6 +34,7 @@ class EvidenceRules:
     blocks: int = 14  # frequency blocks per sensor; chosen on simulated vehicles, insensitive from 8 to 24
     first_block: int = 24  # bins of the first: the level of a block is then known to 20 %
     quiet: float = 0.5  # least noise power of a block over the estimated one: white noise is no quieter by chance
+    plainly: float = 1.2  # ratio of what two fits leave from which one is plainly better: white noise gives 1.02
     log_width: float = 4.6  # prior width of a parameter of unknown order: a factor of 100
     widths: float = 4.0  # prior width of other parameters, in sizes at which they matter
     unusual: float = 4.0  # evidence that a factor e outside the usual range of a parameter costs
@@ -79,6 +80,18 @@ def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:
     elif rise > 0:
         up = min(up, down * fall / rise)
     return up - down
+
+
+def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: EvidenceRules = RULES) -> list[float]:
+    """Gains of rival fits, none more than that of one that leaves clearly less chi-square.
+
+    Sums of logarithms weigh quiet blocks like loud ones; that may tell fits apart which leave about the same, but no
+    fit wins by them against one that is plainly better.
+    """
+    return [
+        min([gain, *(other for other, chi in zip(gains, left, strict=True) if rules.plainly * chi < own)])
+        for gain, own in zip(gains, left, strict=True)
+    ]
 
 
 def occam_cost(

@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_forces
-from sprung.model.diagnosis.selection.compete import profile_gain
+from sprung.model.diagnosis.selection.evidence import profile_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
