@@ -22,6 +22,11 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
     "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
+    "real": ("sprung.benchmarks.real", "measured dampers, an axis and a beam, beside references (--data DIR)"),
+    "setups": (
+        "sprung.benchmarks.setups",
+        "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions",
+    ),
     "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
     "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
     "physics-overhead": ("sprung.benchmarks.physics_overhead", "what physics in the loop costs a training update"),

@@ -100,15 +100,15 @@ def element_motion(
     if velocity is not None:
         level = white_noise(velocity)
         seen, _, _ = _continued(velocity, sample_rate, odd=False)
-        seen[0] -= 3 * count * line
+        seen[0] -= (3 * count - 2) * line
         variance_d = (omega * noise) ** 2  # of the differentiated displacement
         share = variance_d / np.maximum(variance_d + max(level, 1e-300) ** 2, 1e-300)  # of the measured velocity
         rate_spectrum = share * seen + (1 - share) * 1j * omega * spectrum
         rate_spectrum = _wiener(rate_spectrum, level) * rate_spectrum
         rate_power = share * level**2
-    here = slice(count, 2 * count)
-    rate = np.asarray(np.fft.irfft(rate_spectrum, 3 * count)[here] + line, dtype=np.float64)
-    periodic = np.asarray(np.fft.irfft(passed * spectrum, 3 * count)[here], dtype=np.float64)
+    here = slice(count - 1, 2 * count - 1)
+    rate = np.asarray(np.fft.irfft(rate_spectrum, 3 * count - 2)[here] + line, dtype=np.float64)
+    periodic = np.asarray(np.fft.irfft(passed * spectrum, 3 * count - 2)[here], dtype=np.float64)
     smooth = np.add(periodic, _line(displacement, sample_rate, count, line), dtype=np.float64)
     left = float(np.sqrt(np.mean(passed**2)) * noise)
     return ElementMotion(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
@@ -128,8 +128,8 @@ def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tupl
     rest = series - _line(series, sample_rate, count, slope) if odd else series
     sign = -1.0 if odd else 1.0
     # the line joins the two ends, so that both are zero and the odd continuation passes through them
-    whole = np.concatenate([sign * rest[::-1], rest, sign * rest[::-1]])
-    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(3 * count, 1 / sample_rate), dtype=np.float64)
+    whole = np.concatenate([sign * rest[:0:-1], rest, sign * rest[-2::-1]])
+    omega = np.asarray(2 * np.pi * np.fft.rfftfreq(len(whole), 1 / sample_rate), dtype=np.float64)
     return np.fft.rfft(whole), omega, slope
 
 

@@ -157,6 +157,6 @@ def leftover_words(element: str, fit: ComponentFit, size: float) -> str:
     among = frequency[order[:count]]
     rms = float(np.sqrt(np.mean(held**2)))
     return (
-        f"{rms:.3g} N at {element}, {100 * rms / size:.1f} % of the force, "
+        f"{rms:.3g} N rms at {element}, {100 * rms / size:.1f} % of the force, "
         f"most of it at {among.min():.2g} to {among.max():.2g} Hz"
     )

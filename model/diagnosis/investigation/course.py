@@ -8,6 +8,7 @@ from typing import Protocol
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.verdict import Errors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals
@@ -112,6 +113,7 @@ class Investigation:
     last: Screening
     found: tuple[Found, ...] = ()
     input_faults: tuple[InputFault, ...] = ()
+    setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()
 
     @property

@@ -22,6 +22,7 @@ from sprung.model.diagnosis.investigation.course import (
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import judged
+from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
@@ -48,7 +49,9 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     state = _begun(system, record, options, tell)
-    for number in range(options.most_findings):
+    # what a delay, scale or position leaves, estimated as it is, is no physics
+    uncertain = any(fault.value is not None for fault in state.setup_faults)
+    for number in range(0 if uncertain else options.most_findings):
         following = _next_finding(state, number, tell)
         if following is None:
             break
@@ -68,8 +71,15 @@ def _begun(system: System, record: Recorded, options: Options, tell: Progress) -
     declared = declared_noise(system, signals)
     tell(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options.catalogue, options.project)
+    tell(0.15, "set-up: signs, channels, nodes, scales, positions")
+    system, mended, setup = without_setup_faults(system, signals, declared, split, start.problem, start.fit)
+    if setup:
+        split, signals = fitted_samples(signals, mended, split), mended
+        start = nominal(system, signals, declared, split, options.catalogue, options.project)
     tell(0.2, "input channels")
-    start, faults = _without_input_faults(system, options, declared, start, tell)
+    faults: tuple[InputFault, ...] = ()
+    if not any(fault.value is not None for fault in setup):
+        start, faults = _without_input_faults(system, options, declared, start, tell)
     held = HeldOut(system, start.signals, start.problem.noise, split)
     still = ("the last part of the recording hardly moves: findings could not be checked on it",) if held.still else ()
     return Investigation(
@@ -85,6 +95,7 @@ def _begun(system: System, record: Recorded, options: Options, tell: Progress) -
         first=start.screening,
         last=start.screening,
         input_faults=faults,
+        setup_faults=setup,
         notes=still,
     )
 

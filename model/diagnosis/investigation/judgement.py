@@ -35,7 +35,11 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     if lost:
         shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]
         deciding = Errors(*(np.array([share]) for share in shares))
-    effects = [fault.term.law.name for fault in state.input_faults]
+    if state.setup_faults and not lost:  # they were undone before anything was fitted
+        worst = np.sqrt(state.setup_faults[0].before / len(size))
+        deciding = replace(errors, before=np.maximum(errors.before, worst))
+    effects = [fault.effect for fault in state.setup_faults]
+    effects += [fault.term.law.name for fault in state.input_faults]
     effects += ["sensor_stuck"] * len(state.prepared.stuck) + ["sensor_noise"] * len(noisy)
     effects += [found.trial.term.law.name for found in state.found]
     verdict = verdict_of(effects, deciding)

@@ -15,6 +15,7 @@ from sprung.model.diagnosis.investigation.course import (
     Outcome,
     Recorded,
 )
+from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
@@ -121,6 +122,7 @@ def _findings(outcome: Outcome) -> list[Finding]:
     if said.strange is not None:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
+    ranked += [(np.inf, _setup_finding(f)) for f in course.setup_faults]
     ranked += [(f.score, _input_finding(f)) for f in course.input_faults]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if said.carried:
@@ -128,7 +130,7 @@ def _findings(outcome: Outcome) -> list[Finding]:
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
     if said.verdict == "unknown_physics" and not any(f.effect == UNKNOWN for f in findings):
-        findings.insert(0, _unknown_finding(outcome))
+        findings.insert(len(course.setup_faults), _unknown_finding(outcome))
     return findings
 
 
@@ -362,6 +364,35 @@ def _input_finding(fault: InputFault) -> Finding:
         delta_bic=None,
         runner_up=fault.runner_up,
         sentence=f"{fault.term.location}: {words}",
+    )
+
+
+_SETUP_WORDS = {
+    "sign_reversed": "{place}: the sign is reversed",
+    "channels_swapped": "{place}: the two channels are exchanged",
+    "node_delay": "{place}: all of them are late by {value}, as a whole node is",
+    "wrong_scale": "{place}: {value} times what it should show, a wrong scale or unit",
+    "wrong_position": "{place}: sits {value} from where the system file says",
+}
+_SETUP_VALUES = {"node_delay": ("time", "s"), "wrong_scale": ("ratio", "1"), "wrong_position": ("offset", "m")}
+
+
+def _setup_finding(fault: SetupFault) -> Finding:
+    parameters: tuple[LawParameter, ...] = ()
+    words = ""
+    if fault.value is not None:
+        name, unit = _SETUP_VALUES[fault.effect]
+        parameters = (LawParameter(name, fault.value, fault.std, unit),)
+        words = _value(parameters[0])
+    sentence = _SETUP_WORDS[fault.effect].format(place=fault.location.replace("|", " and "), value=words)
+    share = 100 * (1 - fault.after / fault.before)
+    return Finding(
+        location=fault.location,
+        effect=fault.effect,
+        parameters=parameters,
+        p_value=None,
+        delta_bic=None,
+        sentence=f"{sentence}; put right, {share:.0f} % of the misfit goes",
     )
 
 

@@ -1,0 +1,52 @@
+"""Wrong set-ups of a simulated vehicle are found and undone; a right one is left alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
+from sprung.benchmarks.setups import falsified, in_order
+from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.investigation.setup import SetupFault, without_setup_faults
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.record.split import cut
+from sprung.model.system import MANCHESTER, System, load_system
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> tuple[System, np.ndarray]:
+    system, drawn = load_system(), read_vehicle(MANCHESTER)
+    (made,) = make_recordings(drawn, draw_cases(drawn, 1, 77, ["clean"]), 10.0)
+    return system, in_order(system, made.values)
+
+
+def found(system: System, values: np.ndarray) -> tuple[SetupFault, ...]:
+    signals, split = cut(prepare(system, values, 100.0).signals, 0.7)
+    declared = declared_noise(system, signals)
+    problem, fit = baseline(system, signals, declared, split)
+    return without_setup_faults(system, signals, declared, split, problem, fit)[2]
+
+
+def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> None:
+    assert found(*vehicle) == ()
+
+
+@pytest.mark.parametrize("kind", ["sign_reversed", "channels_swapped", "node_delay", "wrong_scale"])
+def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[System, np.ndarray]) -> None:
+    system, values = vehicle
+    wrong = falsified(system, values, kind, np.random.default_rng(8))
+    fault = found(system, wrong.values)[0]
+    assert fault.effect == kind
+    assert frozenset(fault.location.split("|")) == wrong.channels
+
+
+def test_a_delay_is_estimated_with_its_deviation(vehicle: tuple[System, np.ndarray]) -> None:
+    system, values = vehicle
+    names = [channel.name for channel in system.channels]
+    at = [names.index(name) for name in system.sensors if name.startswith("bogie2")]
+    late = values[7:].copy()
+    late[:, at] = values[:-7, at]
+    (fault,) = found(system, late)
+    assert fault.value == pytest.approx(0.07, abs=3e-4)
