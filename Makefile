@@ -6,12 +6,12 @@ TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
-SOURCES := sprung noxfile.py model replay service benchmarks tests
+SOURCES := sprung noxfile.py docs/imports.py model replay service benchmarks tests
 DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 PYTEST ?=
 
-.PHONY: docs help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
+.PHONY: docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
@@ -87,3 +87,7 @@ bench: install
 
 clean:
 	rm -rf $(VENV) .demo build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+
+# the picture of docs/architecture.md; fails where folders import each other in a circle
+drawing:
+	$(PYTHON) docs/imports.py
