@@ -77,7 +77,7 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
     import resource
     import time
 
-    from sprung.service import feed
+    from sprung.service import feed, reading
     from sprung.service.compute import Compute
     from sprung.service.engine import load_engine
     from sprung.service.pipeline import Batch, Pipeline
@@ -92,7 +92,7 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
             stages[stage] = stages.get(stage, 0.0) + seconds
 
     if times > 1:
-        feed.open_recording = _longer(feed.open_recording, times)  # type: ignore[attr-defined]
+        reading.open_recording = _longer(reading.open_recording, times)  # type: ignore[attr-defined]
     started = time.perf_counter()
     store, compute = open_store(store_file), Compute(8)
     fed = feed.feed_file(Pipeline(engine, store, compute), recording, on_batch=add)
