@@ -17,6 +17,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "decode": ("sprung.benchmarks.decode", "frames and messages per second, against cantools and mcap"),
     "replay": ("sprung.benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
     "serve": ("sprung.benchmarks.serve", "latency of POST /identify, against a bare echo"),
+    "trust": ("sprung.benchmarks.trust", "windows acknowledged, lost and doubled while the service is killed"),
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
