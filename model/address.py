@@ -65,6 +65,13 @@ class Address(Strict):
         default=None, description="[lowest, highest] possible value, SI; others are taken as missing"
     )
 
+    gain_std: float | None = Field(
+        default=None, ge=0, description="what the data sheet leaves to the gain, relative; default 0.015"
+    )
+    delay_std: float | None = Field(
+        default=None, ge=0, description="what it leaves to the delay against the other signals, s; default 0.002"
+    )
+
     @field_validator("range")
     @classmethod
     def _ordered(cls, limits: tuple[float, float] | None) -> tuple[float, float] | None:

@@ -77,6 +77,34 @@ class Window:
     new_segment: bool = False  # the first after the clock jumped: its time says nothing about what came before
 
 
+FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped"]
+
+
+@dataclass(frozen=True, slots=True)
+class MeasurementFault:
+    """What is wrong with a measurement."""
+
+    channel: str  # several that share it are joined by |
+    kind: FaultKind
+    value: float  # gain: reading over truth; delay: s by which it reads late; frozen, saturated: the reading
+    std: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Deviating:
+    """What a window says about H deviations from the system file (gains, delays, loads) beside the P parameters.
+
+    For deviations h the parameters are most likely N(x^ + cross (h - point), given), and the log-likelihood of h
+    itself is score' (h - point) - (h - point)' information (h - point) / 2.
+    """
+
+    point: FloatArray  # deviations that the window was refined at, shape (H,)
+    given: FloatArray  # covariance of the log-ratios were the deviations known, shape (P, P)
+    cross: FloatArray  # shape (P, H)
+    information: FloatArray  # shape (H, H)
+    score: FloatArray  # shape (H,)
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """What one window told about the P parameters: log-ratios to nominal, with their covariance."""
@@ -91,6 +119,8 @@ class Estimate:
     converged: bool
     iterations: int
     states: FloatArray | None = None  # simulated states, shape (T, N), only when asked for
+    deviating: Deviating | None = None  # where it was asked for, or refined elsewhere than at the system file
+    faults: tuple[MeasurementFault, ...] = ()  # that had to be taken back before the window fitted
     informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not
 
 

@@ -25,7 +25,14 @@ MANCHESTER = BUNDLED / "manchester.yaml"
 MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
 USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
-_WHERE = ("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range")  # an address without its noise
+GAIN_STD = 0.015  # of a channel whose data sheet is not quoted: 1 to 2 % for accelerometers with their electronics
+DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
+LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
+# An address without its noise, which the mechanics does not see.
+_WHERE = (
+    *("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range"),
+    *("gain_std", "delay_std"),
+)
 
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
 
@@ -44,6 +51,25 @@ class Parameter:
     quantity: str  # stiffness | damping | mass
     unit: str
     nominal: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoadState:
+    """A body whose mass varies; its inertias vary with it."""
+
+    name: str  # "car.load"
+    body: str
+    empty: float  # kg, the mass of the system file
+    declared: bool  # the system file says so
+    std: float  # of the logarithm of mass over `empty`, before any window
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """Standard deviations that a data sheet leaves to one channel."""
+
+    gain: float  # relative
+    delay: float  # s
 
 
 @dataclass(frozen=True)
@@ -196,6 +222,48 @@ class System:
                         quantity = f"{placed.law.name}.{spec.name}"
                         found.append(Parameter(name, placed.location, quantity, spec.unit, value))
         return tuple(found)
+
+    @cached_property
+    def loads(self) -> tuple[LoadState, ...]:
+        """Bodies that carry passengers or goods: those that say `load`; else those on which nothing stands.
+
+        A mass that is estimated, or fixed, is no load.
+        """
+        declared = [name for name, body in self.file.bodies.items() if body.load is not None]
+        carrying = {element.lower for element in self.file.elements.values()}
+        estimated = {p.element for p in self.parameters if p.quantity == "mass"}
+        free = [name for name in self.bodies if name not in carrying and not self.file.bodies[name].mass.fixed]
+        return tuple(self._load(name, name in declared) for name in declared or free if name not in estimated)
+
+    def _load(self, name: str, declared: bool) -> LoadState:
+        body = self.file.bodies[name]
+        mass, most = body.mass.value, None if body.load is None else body.load.max
+        std = LOAD_STD if most is None else max(0.5 * np.log1p(most / mass), 0.05)
+        return LoadState(f"{name}.load", name, mass, declared, float(std))
+
+    @cached_property
+    def load_of_dof(self) -> FloatArray:
+        """1 where a load moves with a degree of freedom, shape (loads, n): mass and inertias grow together."""
+        return np.array(
+            [self.mechanics.body_of_dof == self.bodies.index(load.body) for load in self.loads], dtype=float
+        ).reshape(len(self.loads), self.mechanics.n)
+
+    @cached_property
+    def tolerances(self) -> tuple[Tolerance, ...]:
+        """What the data sheet of every channel leaves open."""
+        addresses: list[Address] = []
+        for source in self.file.inputs.values():
+            if isinstance(source, ForceInput):
+                addresses.append(source)
+            elif isinstance(source, SupportInput):
+                addresses += source.measured.values()
+        addresses += self.file.sensors.values()
+        return tuple(
+            Tolerance(
+                GAIN_STD if at.gain_std is None else at.gain_std, DELAY_STD if at.delay_std is None else at.delay_std
+            )
+            for at in addresses
+        )
 
     @cached_property
     def nominal(self) -> FloatArray:

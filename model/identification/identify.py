@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,14 +12,14 @@ from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.faults import Explainer, fit_limit
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws, without_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.system import System
 
-_FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
 EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
 
 
@@ -35,17 +35,28 @@ class Identifier:
     workers: int = 1
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refiner] = field(default_factory=dict)
+    _explainers: dict[int, Explainer] = field(default_factory=dict)
 
     @property
     def digest(self) -> str:
         """Names the model that made an estimate: system, and weights where an estimator is used."""
         return self.system.digest + (f"-{self.estimator.digest}" if self.estimator is not None else "")
 
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+    def identify(
+        self,
+        windows: FloatArray,
+        start: FloatArray | None = None,
+        *,
+        states: bool = False,
+        weigh: BoolArray | None = None,
+        explain: bool = False,
+    ) -> list[Estimate]:
         """One `Estimate` per window.
 
         windows: (B, T, C) in the order of `system.channels`, NaN columns for absent sensors.
         start: log-ratios (B, P) to refine from, such as the tracker's; the estimator's where left out.
+        weigh: windows (B,) whose evidence on gains, delays and loads is wanted, see `Estimate.deviating`.
+        explain: look for a wrong measurement or a load in windows that do not fit, see `model.identification.faults`.
         Errors: `UnusableWindow` for a wrong shape or an input that is not finite.
         """
         windows = self._checked(windows)
@@ -55,9 +66,30 @@ class Identifier:
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
             start = self.estimator.estimate(windows, self.workers).log_ratio
         between = time.perf_counter()
-        refined = self._refiner(windows.shape[1]).refine(windows, start, states=states)
+        loads = any(load.declared for load in self.system.loads)
+        refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
+        estimates = self._estimates(refined, states)
+        bad = np.array([b for b, e in enumerate(estimates) if e.informative and not e.adequate], dtype=np.int64)
+        if explain and len(bad):
+            for b, found in self._explainer(windows.shape[1]).explain(windows, bad).items():
+                (mended,) = self._estimates(found.refined, False, found.point)
+                estimates[b] = replace(mended, faults=found.faults)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
-        return _estimates(refined, states)
+        return estimates
+
+    def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
+        """point: deviations (H,) that were taken back from the samples before."""
+        P = len(self.system.parameters)
+        deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
+        return _estimates(refined, P, states, deviating)
+
+    def _explainer(self, samples: int) -> Explainer:
+        if samples not in self._explainers:
+            estimator = self.estimator
+            fitting = estimator is not None and estimator.samples == samples
+            start = (lambda w: estimator.estimate(w).log_ratio) if estimator is not None and fitting else None
+            self._explainers[samples] = Explainer(self.system, samples, start, self.workers)
+        return self._explainers[samples]
 
     def _refiner(self, samples: int) -> Refiner:
         if samples not in self._refiners:
@@ -171,19 +203,48 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     return np.minimum(np.median(std, axis=0), PRIOR_STD)
 
 
-def _estimates(refined: Refined, states: bool) -> list[Estimate]:
+def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArray | None) -> Deviating | None:
+    """What window `b` says about deviations; loads that were refined with the parameters are profiled apart."""
+    if not refined.weighed[b]:
+        return None
+    C, H = len(system.channels), refined.score.shape[1]
+    at = np.zeros(H) if point is None else point.copy()
+    covariance, cross = refined.covariance[b], refined.cross[b]
+    information, score = refined.information[b].copy(), refined.score[b].copy()
+    given = covariance[:P, :P]
+    if refined.log_ratio.shape[1] > P:
+        loads = slice(2 * C, H)
+        at[loads] = refined.log_ratio[b, P:]
+        inverse = np.linalg.inv(covariance[P:, P:])
+        per_load = covariance[:P, P:] @ inverse  # (P, loads)
+        moved = cross[P:, : 2 * C]  # of the loads per gain or delay
+        information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
+        information[: 2 * C, loads] = -moved.T @ inverse
+        information[loads, : 2 * C] = information[: 2 * C, loads].T
+        information[loads, loads] = inverse
+        given = given - per_load @ covariance[P:, :P]
+        cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
+        cross[:, loads] = per_load
+    if point is not None:  # samples were divided by the gain: a relative deviation of what is left counts that much less
+        scale = np.ones(H)
+        scale[:C] = 1 / (1 + at[:C])
+        cross, score = cross * scale, score * scale
+        information = information * np.outer(scale, scale)
+    return Deviating(at, given, cross[:P], information, score)
+
+
+def _estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating | None]) -> list[Estimate]:
     with np.errstate(divide="ignore", invalid="ignore"):
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
-    limit = 1 + _FIT_SIGMAS * np.sqrt(2 / np.maximum(refined.freedom, 1))
-    fits = refined.chi_square < limit
+    fits = refined.chi_square < fit_limit(refined.freedom)
     # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
     told = np.where(fits, refined.identifiable.any(axis=1) & refined.converged, True)
     informative = (refined.excitation > EXCITED) & told
     return [
         Estimate(
-            log_ratio=refined.log_ratio[b],
-            covariance=refined.covariance[b],
-            identifiable=refined.identifiable[b],
+            log_ratio=refined.log_ratio[b, :P],
+            covariance=refined.covariance[b, :P, :P],
+            identifiable=refined.identifiable[b, :P],
             nrmse=pooled_nrmse(per_sensor[b]),
             per_sensor=per_sensor[b],
             chi_square=float(refined.chi_square[b]),
@@ -192,6 +253,7 @@ def _estimates(refined: Refined, states: bool) -> list[Estimate]:
             iterations=int(refined.iterations[b]),
             states=refined.states[b] if states else None,
             informative=bool(informative[b]),
+            deviating=deviating[b],
         )
         for b in range(len(refined.log_ratio))
     ]

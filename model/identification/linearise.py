@@ -6,14 +6,15 @@ lost carries no information on the parameters), which also takes absent sensors 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
-from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, FORCE, VELOCITY
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator, knot_columns
 from sprung.model.system import USUAL_NOISE, System
@@ -36,10 +37,20 @@ class WindowBatch:
 
 
 @dataclass(frozen=True, slots=True)
+class Transfer:
+    """Compressed signals (R of them) over frequency, before whitening."""
+
+    compliance: Tensor  # displacement per generalised force, shape (B, F, n, n)
+    per_load: Tensor  # per generalised force, shape (B, F, R, n)
+    per_force: Tensor  # per element force, shape (B, F, R, E)
+    drive: Tensor  # per unit of every drive that follows its own slope, shape (B, F, R, W/2)
+
+@dataclass(frozen=True, slots=True)
 class Linearisation:
     """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
 
     whiten: Tensor  # shape (B, F, R, R), weights of the bins included
+    transfer: Transfer
     free: Tensor  # whitened free responses, normalised, shape (B, N, K)
     free_scale: Tensor  # what they were divided by, shape (B, N)
     sensitivities: Tensor  # whitened, shape (B, P, K)
@@ -51,6 +62,10 @@ class Linearisation:
     cost: Tensor  # weighted squares with that state, shape (B,)
     gradient: Tensor  # minus half the gradient of the cost, shape (B, P)
     step: Tensor  # to the minimum of the linearised cost, shape (B, P)
+
+    def take(self, at: Tensor) -> Linearisation:
+        """The windows `at` of the batch."""
+        return self if len(at) == len(self.x) else _taken(self, at)
 
     def state_after(self, step: Tensor) -> Tensor:
         """Best initial state when the log-ratios move by `step`."""
@@ -65,6 +80,13 @@ class Chord:
     step: Tensor  # shape (B, P)
     x0: Tensor  # best initial state after it, shape (B, N)
     error: Tensor  # rms of measured minus simulated before it, shape (B, S')
+    residual: Tensor  # whitened, before it, shape (B, K, 1)
+    outputs: Tensor  # simulated, before it, shape (B, T, S')
+    states: Tensor  # shape (B, T, N)
+
+    def take(self, at: Tensor) -> Chord:
+        """The windows `at` of the batch."""
+        return self if len(at) == len(self.cost) else _taken(self, at)
 
 
 class WindowModel:
@@ -74,11 +96,10 @@ class WindowModel:
         self.system, self.samples = system, samples
         self.simulator = LinearSimulator(system)
         omega = bin_frequencies(samples, system.sample_rate)
-        self.bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right"))
-        self.frequency = FrequencyModel(self.simulator, omega[: self.bins])
-        weight = np.full(self.bins, np.sqrt(2 / samples))
-        weight[0] = np.sqrt(1 / samples)
-        self.weight = torch.as_tensor(weight)
+        # The mean is left out: every signal may have an offset (gravity, curves, drifting electronics).
+        self.bins = int(np.searchsorted(omega, 2 * np.pi * BAND * system.sample_rate, side="right")) - 1
+        self.frequency = FrequencyModel(self.simulator, omega[1 : self.bins + 1])
+        self.weight = torch.full((self.bins,), np.sqrt(2 / samples), dtype=torch.float64)
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
         self.usual_noise = torch.where(self.drive_noise > 0, self.drive_noise, torch.as_tensor(_usual_noise(system)))
         self.sensor_noise = system.sensor_noise
@@ -123,16 +144,17 @@ class WindowModel:
         """Everything at log-ratios x (B, P)."""
         s = self.simulator
         values = s.element_values(x)
-        discrete = self._compressed(s.discretise(values), data)
+        discrete = self.compressed(s.discretise(values), data)
         forced = s.states(discrete, data.w, x.new_zeros(len(x), discrete.Ad.shape[1]))
         residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
         free = s.free_response(discrete, self.samples)
 
-        compliance, per_force, carried = self._transfer(values, data)
+        transfer = self._transfer(values, data)
+        carried = transfer.drive * self.drive_noise[:, None]
         whiten = self._whitening(carried)
-        white_residual = whiten @ self._spectra(residual).unsqueeze(3)  # (B, F, R, 1)
-        white_free = whiten @ self._spectra(free)  # (B, F, R, N)
-        r, basis = _rows(white_residual), _rows(white_free)  # (B, 1, K), (B, N, K)
+        white_residual = whiten @ self.spectra(residual).unsqueeze(3)  # (B, F, R, 1)
+        white_free = whiten @ self.spectra(free)  # (B, F, R, N)
+        r, basis = as_rows(white_residual), as_rows(white_free)  # (B, 1, K), (B, N, K)
         free_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
         basis = basis / free_scale.unsqueeze(2)
         products = basis @ basis.mT
@@ -145,10 +167,13 @@ class WindowModel:
         left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
         states = forced + s.free_states(discrete, x0, self.samples)
-        J = self._sensitivities(values, compliance, whiten @ per_force, states, data, noise)
-        if s.estimates_mass:
-            J = torch.cat([J, self._mass_columns(values, compliance, whiten, states, data)], dim=3)
-        J = _rows(J)
+        J = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
+        masses = s.m_of[s.m_of.any(dim=1)]
+        if x.shape[1] > len(s.m_of):
+            masses = torch.cat([masses, s.load_of])
+        if len(masses):
+            J = torch.cat([J, self.by_mass(values, transfer, whiten, states, data, masses)], dim=3)
+        J = as_rows(J)
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
         information = J @ J.mT - across_products.mT @ across
@@ -156,23 +181,24 @@ class WindowModel:
         prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
         covariance = torch.linalg.inv(information + prior)
         step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
-        return Linearisation(whiten, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step)
+        return Linearisation(whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step)
 
     def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
         """One more step from (x, x0) with the products of `at`."""
         s = self.simulator
         discrete = self._present(s.discretise(s.element_values(x)), data)
         states = s.states(discrete, data.w, x0)
-        error = data.measured - states @ discrete.C.mT - data.w @ discrete.D.mT
-        spectra = self._spectra(error @ self.compression(data.present).mT)
-        r = _rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
+        outputs = states @ discrete.C.mT + data.w @ discrete.D.mT
+        error = data.measured - outputs
+        spectra = self.spectra(error @ self.compression(data.present).mT)
+        r = as_rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
         along = at.free @ r
         free_part = torch.cholesky_solve(along, at.factor)
         gradient = at.sensitivities @ r - at.across.mT @ along
         step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
         cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
         x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.free_scale
-        return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt())
+        return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt(), r, outputs, states)
 
     def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
         """Simulated states, (B, T, N)."""
@@ -182,12 +208,33 @@ class WindowModel:
     def excitation(self, data: WindowBatch) -> Tensor:
         """Mean power over bins of the strongest drive, over that of its noise, (B,); about 1 at standstill.
 
-        The mean is left out: an offset moves nothing.  Drives without a stated noise have that of a usual instrument.
+        Drives without a stated noise have that of a usual instrument.
         """
         if not self.simulator.W:
             return torch.full((len(data.w),), torch.inf, dtype=data.w.dtype)
-        power = self._spectra(data.w[:, :, 0::2])[:, 1:].abs().square() / self.samples
-        return (power / self.usual_noise[1:] ** 2).mean(dim=1).amax(dim=1)
+        power = self.spectra(data.w[:, :, 0::2]).abs().square() / self.samples
+        return (power / self.usual_noise**2).mean(dim=1).amax(dim=1)
+
+    def by_drive(self, at: Linearisation, value: Tensor, rate: Tensor, data: WindowBatch) -> Tensor:
+        """What each drive alone makes the compressed signals show, free responses apart, (B, F, R, W/2).
+
+        value, rate: (B, T, W/2).  Over a finite window the spectrum of the rate is not j w times that of the value.
+        """
+        s, kind = self.simulator, at.transfer.compliance.dtype
+        values = s.element_values(at.x)
+        U, V = (self.spectra(part).unsqueeze(2) for part in (value, rate))  # (B, F, 1, W/2)
+        shown = at.transfer.per_load.new_zeros(*at.transfer.per_load.shape[:3], s.W // 2)
+        if len(s.supports):
+            k, c = (v[:, None, :, None] * s.G for v in (values.stiffness, values.damping))  # (B, 1, E, supports)
+            columns = s.supports // 2
+            shown[..., columns] = at.transfer.per_force @ (k * U[..., columns] + c * V[..., columns])
+            if self.frequency.element_sensors:
+                direct = torch.where((s.kind == DEFLECTION)[:, None], s.L, torch.zeros_like(s.L)) @ s.G
+                shown[..., columns] += self._signal_rows(data, kind) @ direct.to(kind) * U[..., columns]
+        if len(s.forces):
+            columns = s.forces // 2
+            shown[..., columns] = at.transfer.per_load @ s.F.to(kind) * U[..., columns]
+        return shown
 
     def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
         """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
@@ -196,7 +243,8 @@ class WindowModel:
         """
         s, f = self.simulator, self.frequency
         values = s.element_values(at.x)
-        compliance, per_force, carried = self._transfer(values, data)
+        transfer = self._transfer(values, data)
+        compliance, per_force, carried = transfer.compliance, transfer.per_force, transfer.drive * self.drive_noise[:, None]
         kind = compliance.dtype
         dynamic = f.dynamic(values)
         load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)
@@ -231,9 +279,9 @@ class WindowModel:
         select = torch.eye(len(data.present), dtype=kind)[data.present]
         return self.compression(data.present).to(kind) @ select
 
-    def _spectra(self, signals: Tensor) -> Tensor:
+    def spectra(self, signals: Tensor) -> Tensor:
         """Bins within the band of signals (B, T, ...), (B, F, ...)."""
-        return torch.fft.rfft(signals, dim=1)[:, : self.bins]
+        return torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
 
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression(data.present).mT
@@ -244,12 +292,11 @@ class WindowModel:
         at = torch.as_tensor(data.present)
         return replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
 
-    def _compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
+    def compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
         Q, discrete = self.compression(data.present), self._present(discrete, data)
         return replace(discrete, C=Q @ discrete.C, D=Q @ discrete.D)
 
-    def _transfer(self, values: ElementValues, data: WindowBatch) -> tuple[Tensor, Tensor, Tensor]:
-        """Compliance (B, F, n, n); compressed signals per element force (B, F, R, E) and per unit drive noise."""
+    def _transfer(self, values: ElementValues, data: WindowBatch) -> Transfer:
         s, f = self.simulator, self.frequency
         compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
@@ -267,7 +314,7 @@ class WindowModel:
             drive[..., s.supports // 2] += Q @ f.element_response(values, s.G)
             forces = torch.where((s.kind == FORCE)[:, None], s.L, torch.zeros_like(s.L))
             per_force = per_force + Q @ forces.to(kind)
-        return compliance, per_force, drive * self.drive_noise[:, None]
+        return Transfer(compliance, per_load, per_force, drive)
 
     def _whitening(self, carried: Tensor) -> Tensor:
         R = carried.shape[2]
@@ -290,7 +337,7 @@ class WindowModel:
         n = s.H.shape[1]
         d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
         v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
-        spectra = torch.fft.rfft(torch.cat([d, v], dim=2), dim=1)[:, : self.bins]
+        spectra = self.spectra(torch.cat([d, v], dim=2))
         E = s.H.shape[0]
         # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
         kind = compliance.dtype
@@ -307,26 +354,30 @@ class WindowModel:
             [per_force[..., k_at] * deflection[:, :, None, k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3
         )
 
-    def _mass_columns(
+    def by_mass(
         self,
         values: ElementValues,
-        compliance: Tensor,
+        transfer: Transfer,
         whiten: Tensor,
         states: Tensor,
         data: WindowBatch,
+        masses: Tensor,
     ) -> Tensor:
-        """Whitened sensitivities to the masses: inertia forces m q'' along the motion, (B, F, R, masses)."""
+        """Whitened sensitivities to the logarithms of groups of masses, `masses` (X, n), (B, F, R, X)."""
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]
         acceleration = (
             states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
         )
-        spectra = torch.fft.rfft(acceleration, dim=1)[:, : self.bins] * values.mass[:, None]
-        kind = compliance.dtype
-        per_load = -(whiten @ (self._sensing(values, data) @ compliance))
-        masses = s.m_of[-s.estimated_masses :].T.to(kind)  # (n, masses)
-        return (per_load * spectra[:, :, None]) @ masses
+        spectra = self.spectra(acceleration) * values.mass[:, None]
+        return (-(whiten @ transfer.per_load) * spectra[:, :, None]) @ masses.T.to(transfer.per_load.dtype)
+
+
+def _taken(batch: Any, at: Tensor) -> Any:
+    """A dataclass of tensors (B, ...), nested ones included, with only the windows `at`."""
+    parts = {f.name: getattr(batch, f.name) for f in fields(batch)}
+    return replace(batch, **{n: p[at] if isinstance(p, Tensor) else _taken(p, at) for n, p in parts.items()})
 
 
 def _usual_noise(system: System) -> FloatArray:
@@ -345,7 +396,7 @@ def _inverse(stiffness: Tensor) -> Tensor:
     return found
 
 
-def _rows(spectra: Tensor) -> Tensor:
+def as_rows(spectra: Tensor) -> Tensor:
     """(B, F, R, X) complex to (B, X, 2 F R) real."""
     B, F, R, X = spectra.shape
     return torch.view_as_real(spectra).permute(0, 3, 1, 2, 4).reshape(B, X, F * R * 2)

@@ -26,7 +26,8 @@ import torch
 from torch import Tensor
 
 from sprung.model.chunks import alike, chunks, share
-from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel
+from sprung.model.identification.calibration import Calibration
+from sprung.model.identification.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
@@ -52,6 +53,14 @@ class Refined:
     rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
     states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
     excitation: FloatArray  # power of the strongest input over that of its noise, shape (B,)
+    weighed: BoolArray  # whether the next three were computed, shape (B,)
+    cross: FloatArray  # change of the log-ratios per deviation, shape (B, P, H); H = 0 unless asked for
+    information: FloatArray  # on the deviations, shape (B, H, H)
+    score: FloatArray  # slope of the log-likelihood along them, shape (B, H)
+
+    def take(self, at: IntArray) -> Refined:
+        """The windows `at` of the batch."""
+        return Refined(**{name: getattr(self, name)[at] for name in Refined.__slots__})
 
 
 class Refiner:
@@ -63,32 +72,47 @@ class Refiner:
     def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
         self.system, self.workers = system, workers
         self.model = WindowModel(system, samples or system.window)
+        self.calibration = Calibration(self.model)
 
     @property
     def observations(self) -> int:
         """Real numbers that a window with every sensor is compared in."""
         everything = np.ones(len(self.system.sensors), dtype=bool)
-        return (2 * self.model.bins - 1) * len(self.model.compression(everything))
+        return 2 * self.model.bins * len(self.model.compression(everything))
 
     def refine(
-        self, windows: FloatArray, start: FloatArray | None = None, *, iterations: int = 12, states: bool = False
+        self,
+        windows: FloatArray,
+        start: FloatArray | None = None,
+        *,
+        iterations: int = 12,
+        states: bool = False,
+        loads: bool = False,
+        weigh: BoolArray | None = None,
     ) -> Refined:
-        """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors."""
+        """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors.
+
+        loads: the system's loads are refined, too, and follow the P parameters in what is returned.
+        weigh: windows (B,) whose evidence on gains, delays and loads is computed as well.
+        """
+        wanted = torch.as_tensor(np.zeros(len(windows), dtype=bool) if weigh is None else weigh)
         present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         everything = np.arange(len(windows))
         knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
-        progress = _Progress.begin(start, present.shape, len(self.system.parameters), self.model.states_count)
+        size = len(self.system.parameters) + (len(self.system.loads) if loads else 0)
+        deviations = len(self.calibration.deviations) if weigh is not None else 0
+        progress = _Progress.begin(start, present.shape, size, self.model.states_count, deviations)
 
         def batch(at: IntArray) -> WindowBatch:
             return self.model.batch(knots[at], windows[at], present[at[0]])
 
         def iterate(at: IntArray) -> None:
             with torch.no_grad():
-                self._iterate(batch(at), progress, torch.as_tensor(at))
+                self._iterate(batch(at), progress, torch.as_tensor(at), wanted)
 
         def conclude(at: IntArray) -> Refined:
             with torch.no_grad():
-                return self._result(batch(at), progress, torch.as_tensor(at), states)
+                return self._result(batch(at), progress, torch.as_tensor(at), states, wanted)
 
         active = everything
         for _ in range(iterations):
@@ -113,7 +137,7 @@ class Refiner:
             at = self.model.linearise(torch.as_tensor(log_ratio), data)
         return at.cost.numpy(), -2 * at.gradient.numpy()
 
-    def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor) -> None:
+    def _iterate(self, data: WindowBatch, progress: _Progress, rows: Tensor, wanted: Tensor) -> None:
         """A full linearisation and a chord step for the windows `rows`, whose data are given."""
         x, cost, best = progress.x[rows], progress.cost[rows], progress.best[rows]
         at = self.model.linearise(x, data)
@@ -133,8 +157,27 @@ class Refiner:
         progress.iterations[rows] += 1
         progress.x0[rows], progress.covariance[rows] = second.x0, at.covariance
         progress.error[rows[:, None], torch.as_tensor(np.flatnonzero(data.present))] = second.error
+        self._weigh((done & wanted[rows]).nonzero().squeeze(1), at, second, data, progress, rows)
 
-    def _result(self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool) -> Refined:
+    def _weigh(
+        self, which: Tensor, at: Linearisation, second: Chord, data: WindowBatch, progress: _Progress, rows: Tensor
+    ) -> None:
+        """Evidence on deviations of the windows `which` of a chunk."""
+        if len(which):
+            found = self.calibration.evidence(at.take(which), second.take(which), data.take(which))
+            at_rows = rows[which]
+            progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
+            progress.score[at_rows], progress.weighed[at_rows] = found.score, True
+
+    def _result(
+        self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool, wanted: Tensor
+    ) -> Refined:
+        left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
+        if len(left):  # did not converge: where it stands is as good a point as any to ask what is wrong
+            chosen, x = data.take(left), progress.x[rows[left]]
+            at = self.model.linearise(x, chosen)
+            everything = torch.arange(len(left))
+            self._weigh(everything, at, self.model.chord(at, x, at.x0, chosen), chosen, progress, rows[left])
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
@@ -144,7 +187,7 @@ class Refiner:
             share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
             identifiable[weak] &= share < _NOISE_SHARE
         signals = len(self.model.compression(data.present))
-        freedom = (2 * self.model.bins - 1) * signals - x0.shape[1] - identifiable.sum(dim=1)
+        freedom = 2 * self.model.bins * signals - x0.shape[1] - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise, so that intervals stay honest.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
@@ -165,6 +208,10 @@ class Refiner:
             rms=rms,
             states=path.numpy(),
             excitation=self.model.excitation(data).numpy(),
+            weighed=progress.weighed[rows].numpy(),
+            cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),
+            information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),
+            score=(progress.score[rows] / chi_square.clamp_min(1)[:, None]).numpy(),
         )
 
 
@@ -180,13 +227,17 @@ class _Progress:
     error: Tensor  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
     converged: Tensor  # shape (B,)
     iterations: Tensor  # shape (B,)
+    weighed: Tensor  # shape (B,)
+    cross: Tensor  # shape (B, P, H)
+    information: Tensor  # shape (B, H, H)
+    score: Tensor  # shape (B, H)
 
     @classmethod
-    def begin(cls, start: FloatArray | None, shape: tuple[int, ...], P: int, N: int) -> _Progress:
+    def begin(cls, start: FloatArray | None, shape: tuple[int, ...], P: int, N: int, H: int) -> _Progress:
         B, sensors = shape
         x = torch.zeros(B, P, dtype=torch.float64)
         if start is not None:
-            x += torch.as_tensor(start)
+            x[:, : start.shape[1]] += torch.as_tensor(start)
         return cls(
             x=x,
             best=x.clone(),
@@ -196,6 +247,10 @@ class _Progress:
             error=torch.full((B, sensors), torch.nan, dtype=torch.float64),
             converged=torch.zeros(B, dtype=torch.bool),
             iterations=torch.zeros(B, dtype=torch.long),
+            weighed=torch.zeros(B, dtype=torch.bool),
+            cross=torch.zeros(B, P, H, dtype=torch.float64),
+            information=torch.zeros(B, H, H, dtype=torch.float64),
+            score=torch.zeros(B, H, dtype=torch.float64),
         )
 
 

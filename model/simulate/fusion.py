@@ -42,9 +42,19 @@ def fuse(
 
 def fused_noise(omega: FloatArray, dt: float, noise: tuple[float, float]) -> FloatArray:
     """Standard deviation per sample of the fused displacement at angular frequencies omega."""
-    one, two = omega * dt, 2 * omega * dt
-    derivative = (20 * np.sin(one) + 2 * np.sin(two)) / 24 / ((66 + 52 * np.cos(one) + 2 * np.cos(two)) / 120) / dt
+    derivative = _derivative(omega, dt)
     return np.asarray(1 / np.sqrt(1 / noise[0] ** 2 + derivative**2 / noise[1] ** 2), dtype=np.float64)
+
+
+def fused_shares(omega: FloatArray, dt: float, noise: tuple[float, float]) -> FloatArray:
+    """Share of the measured displacement in the fused one at angular frequencies omega; the rest is the velocity's."""
+    return np.asarray(1 / (1 + (_derivative(omega, dt) * noise[0] / noise[1]) ** 2), dtype=np.float64)
+
+
+def _derivative(omega: FloatArray, dt: float) -> FloatArray:
+    """What the spline makes of j omega, over j."""
+    one, two = omega * dt, 2 * omega * dt
+    return np.asarray((20 * np.sin(one) + 2 * np.sin(two)) / 24 / ((66 + 52 * np.cos(one) + 2 * np.cos(two)) / 120) / dt)
 
 
 @lru_cache(maxsize=32)

@@ -89,6 +89,7 @@ class LinearSimulator:
         bodies = {name: i for i, name in enumerate(system.bodies)}
         per_body = _scatter(system, "mass", bodies, len(bodies), constant)
         self.m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
+        self.load_of = constant(system.load_of_dof)
         self.estimates_mass = "mass" in quantity
         self.estimated_masses = quantity.count("mass")
         self.estimated_elements = tuple(  # indices of elements, in the order of the parameters
@@ -131,12 +132,16 @@ class LinearSimulator:
         return (self.H * self.nominal_k[:, None]).T @ self.H * root[:, None] * root[None, :]
 
     def element_values(self, log_ratio: Tensor) -> ElementValues:
-        """theta = nominal exp(log_ratio) put in place; log_ratio (B, P)."""
+        """theta = nominal exp(log_ratio) put in place; log_ratio (B, P), or (B, P + loads) with logarithms of the
+        loaded masses over the empty ones."""
+        log_ratio, load = log_ratio[:, : len(self.k_of)], log_ratio[:, len(self.k_of) :]
         k = self.nominal_k * torch.exp(log_ratio @ self.k_of)
         c = self.nominal_c * torch.exp(log_ratio @ self.c_of)
         m = self.nominal_m.expand(len(log_ratio), -1)
         if self.estimates_mass:
             m = m * torch.exp(log_ratio @ self.m_of)
+        if load.shape[1]:
+            m = m * torch.exp(load @ self.load_of)
         return ElementValues(k, c, m)
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:

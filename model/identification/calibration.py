@@ -1,0 +1,184 @@
+"""What a window says about the measurements themselves: gain and delay of every channel, load of the bodies.
+
+A channel reads `(1 + g) y(t - tau)` of the true signal y.  At the refined parameters the simulated outputs are known,
+so every sensitivity is nearly free: to a sensor's gain it is the sensor's own output, to its delay minus the derivative
+of it; to an input's gain and delay the same of what that input makes the sensors show (with the opposite sign: a reading
+too large is a motion too small); to the load of a body the response to its inertia forces.
+
+    r = J_x dx + J_h dh + noise,    free responses eliminated as in the refinement
+
+The likelihood of a window, with the parameters x profiled out, is then quadratic in the deviations h:
+
+    x^(h) = x^ + D h,   D = -C Jx' Jh,        log L(h) = b' h - h' M h / 2,   M = Jh' Jh - Jh' Jx C Jx' Jh
+
+Redundant sensors enter here with the part that the refinement drops, because it depends on no parameter: it depends on
+the gains and delays, and tells them apart from springs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from scipy.interpolate import CubicSpline
+from torch import Tensor
+
+from sprung.model.identification.linearise import Chord, Linearisation, WindowBatch, WindowModel, as_rows
+from sprung.model.signals import FloatArray, IntArray
+from sprung.model.simulate.fusion import fused_shares
+from sprung.model.simulate.linear import knot_columns
+from sprung.model.system import System
+
+Kind = Literal["gain", "delay", "load"]
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """One thing that the system file states and that may be otherwise."""
+
+    name: str  # of the channel, or of the body
+    kind: Kind
+    std: float  # what the data sheet leaves open: relative, or s; of the logarithm of the mass for a load
+    group: int  # channels that share a clock have the same number; -1 for a load
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Quadratic log-likelihood of deviations (H of them) with the parameters profiled out; B windows."""
+
+    cross: Tensor  # D, change of the estimate per deviation, shape (B, P, H)
+    information: Tensor  # M, shape (B, H, H)
+    score: Tensor  # b, shape (B, H)
+
+    def numpy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self.cross.numpy(), self.information.numpy(), self.score.numpy()
+
+
+def deviations(system: System) -> tuple[Deviation, ...]:
+    """Gains of all channels, delays of all channels, loads of the bodies that carry passengers or goods."""
+    channels = system.channels
+    groups = clock_groups(system)
+    stated = system.tolerances
+    return (
+        *(Deviation(c.name, "gain", t.gain, g) for c, t, g in zip(channels, stated, groups, strict=True)),
+        *(Deviation(c.name, "delay", t.delay, g) for c, t, g in zip(channels, stated, groups, strict=True)),
+        *(Deviation(load.body, "load", load.std, -1) for load in system.loads),
+    )
+
+
+def clock_groups(system: System) -> IntArray:
+    """Channels of one message share its clock: the address up to its last part; shape (C,)."""
+    found: dict[str, int] = {}
+    groups = []
+    for channel in system.channels:
+        address = channel.mcap or channel.can
+        message = address.rpartition(".")[0] if address else f"\0{channel.unit}"
+        groups.append(found.setdefault(message, len(found)))
+    return np.array(groups, dtype=np.int64)
+
+
+class Calibration:
+    """Sensitivities of a window model to the deviations of its system."""
+
+    def __init__(self, model: WindowModel) -> None:
+        system = model.system
+        self.model, self.deviations = model, deviations(system)
+        self.inputs = len(system.inputs)
+        self.loads = model.simulator.load_of
+        time = np.arange(model.samples) / system.sample_rate
+        self.slope = torch.as_tensor(CubicSpline(time, np.eye(model.samples))(time, 1))
+        drive, share = [], []
+        omega = model.frequency.omega.numpy()
+        for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
+            noise = system.inputs[value].noise, 0.0 if slope is None else system.inputs[slope].noise
+            of_value = fused_shares(omega, 1 / system.sample_rate, noise) if min(noise) > 0 else np.ones(len(omega))
+            drive.append(i)
+            share.append(of_value)
+            if slope is not None:
+                drive.append(i)
+                share.append(1 - of_value)
+        self.drive = torch.as_tensor(drive)  # of every input channel
+        self.share = torch.as_tensor(np.array(share).reshape(-1, len(omega)).T.copy())  # of its drive, (F, inputs)
+        self._dropped: dict[bytes, Tensor] = {}
+
+    def evidence(self, at: Linearisation, after: Chord, data: WindowBatch) -> Evidence:
+        """At the log-ratios that the chord step `after` of `at` leads to."""
+        # Known directions as orthonormal rows, so that single precision is enough for what follows.
+        free = torch.linalg.solve_triangular(at.factor, at.free, upper=False)  # (B, N, K)
+        J = at.sensitivities - at.across.mT @ at.free
+        root = torch.linalg.cholesky(at.covariance)  # C = root root'
+        known = torch.cat([free, root.mT @ J], dim=1).to(torch.float32)  # (B, N + P, K)
+        r = after.residual.to(torch.float32)
+        columns, redundant = self._columns(at, after, data)
+        rows = as_rows(columns)  # (B, H, K)
+        with_known = known @ rows.mT  # (B, N + P, H)
+        information = rows @ rows.mT - with_known.mT @ with_known
+        left = r - free.to(torch.float32).mT @ (free.to(torch.float32) @ r)
+        N = free.shape[1]
+        with_x = root.to(torch.float32) @ with_known[:, N:]  # C Jx' Jh
+        score = (rows @ left)[..., 0].double()
+        # The residual is that before the chord's step, which belongs to x^.
+        moved = torch.cholesky_solve(after.step.unsqueeze(2), root)
+        score = score - (with_x.double().mT @ moved)[..., 0]
+        if redundant is not None:
+            over = as_rows(redundant)
+            dropped = self.dropped(data.present)
+            spectra = (self.model.weight[:, None] * self.model.spectra(data.measured @ dropped.mT)).to(torch.complex64)
+            information = information + over @ over.mT
+            score = score + (over @ as_rows(spectra.unsqueeze(3)).mT)[..., 0].double()
+        return Evidence(-with_x.double(), *self._relative(information.double(), score))
+
+    def _relative(self, information: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
+        """Without what no record can tell: one gain, or one delay, that all channels share changes nothing."""
+        C = len(self.model.system.channels)
+        for part in (slice(0, C), slice(C, 2 * C)):
+            common = torch.zeros(len(self.deviations), 1, dtype=information.dtype)
+            common[part] = 1.0
+            along = information @ common  # (B, H, 1)
+            size = (common.mT @ along).clamp_min(1e-300)
+            score = score - (along * (score.unsqueeze(1) @ common) / size).squeeze(2)
+            information = information - along @ along.mT / size
+        return information, score
+
+    def _columns(self, at: Linearisation, after: Chord, data: WindowBatch) -> tuple[Tensor, Tensor | None]:
+        """Whitened sensitivities of the compressed signals (B, F, R, H), and of the dropped ones (B, F, X, H)."""
+        model = self.model
+        kind = torch.complex64
+        B, F, R = at.whiten.shape[:3]
+        C = self.inputs + len(data.present)
+        out = torch.zeros(B, F, R, len(self.deviations), dtype=kind)
+        # A reading is (1 + g) y(t - tau): the true motion below is that much smaller and earlier.
+        share = self.share[:, None].to(kind)
+        value, slope = data.w[:, :, 0::2], data.w[:, :, 1::2]
+        for first, sign, motion in ((0, -1, (value, slope)), (C, 1, (slope, self.slope @ slope))):
+            shown = (at.whiten @ model.by_drive(at, *motion, data)).to(kind)  # (B, F, R, W/2)
+            out[..., first : first + self.inputs] = sign * shown[..., self.drive] * share
+        columns = self.inputs + torch.as_tensor(np.flatnonzero(data.present))
+        shown = model.spectra(after.outputs).to(kind)  # (B, F, S')
+        late = -model.spectra(self.slope @ after.outputs).to(kind)
+        by_sensor = (at.whiten @ model.compression(data.present).to(at.whiten.dtype)).to(kind)
+        out[..., columns] = by_sensor * shown[:, :, None]
+        out[..., C + columns] = by_sensor * late[:, :, None]
+        if len(self.loads) and at.x.shape[1] == len(model.simulator.k_of):  # else they are refined themselves
+            values = model.simulator.element_values(at.x)
+            out[..., 2 * C :] = model.by_mass(values, at.transfer, at.whiten, after.states, data, self.loads).to(kind)
+        dropped = self.dropped(data.present).to(kind)
+        if not len(dropped):
+            return out, None
+        dropped = dropped * model.weight[:, None, None].to(kind)
+        over = torch.zeros(B, F, dropped.shape[1], len(self.deviations), dtype=kind)
+        over[..., columns] = dropped * shown[:, :, None]
+        over[..., C + columns] = dropped * late[:, :, None]
+        return out, over
+
+    def dropped(self, present: np.ndarray) -> Tensor:
+        """Rows (X, S') of unit noise, orthogonal to the compression: what redundant sensors say of each other."""
+        key = present.tobytes()
+        if key not in self._dropped:
+            noise = torch.as_tensor(self.model.sensor_noise[present])
+            kept = self.model.compression(present) * noise  # orthonormal rows
+            u, _, _ = torch.linalg.svd(torch.eye(kept.shape[1], dtype=kept.dtype) - kept.mT @ kept)
+            self._dropped[key] = u[:, : kept.shape[1] - kept.shape[0]].mT / noise
+        return self._dropped[key]

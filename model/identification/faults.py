@@ -1,0 +1,297 @@
+"""Windows that do not fit: is it a measurement?
+
+A gain, a delay or a load leaves a trace of its own in the residual (`calibration`): the one with the most evidence is
+taken back from the samples, and the window is refined again, until it fits or nothing helps.  What is too large for a
+linear step, a reversed sign or two exchanged channels, is tried at the nominal values, where what the sensors should
+show depends on the inputs alone; a frozen or saturated sensor shows itself in its samples, and the window is refined
+without it.  A window explained this way tells as much about the springs as any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import torch
+from scipy.interpolate import make_interp_spline
+
+from sprung.model.identification.calibration import clock_groups
+from sprung.model.identification.linearise import WindowBatch, as_rows
+from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
+from sprung.model.system import System
+
+FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
+ROUNDS = 5  # corrections of one window at most
+TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
+_BETTER = 0.8  # a correction that leaves more of chi-square than this is none
+_REVERSED = 0.3  # share of the squares at nominal values that a reversed or exchanged channel leaves, at most
+_MARGIN = 2  # samples that a delay costs at either end beyond itself
+_FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
+_CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
+
+
+@dataclass(slots=True)
+class Explained:
+    """What was found for the windows that did not fit, one entry per window."""
+
+    refined: Refined  # of the corrected window
+    point: FloatArray  # deviations that were taken back, shape (H,)
+    faults: tuple[MeasurementFault, ...]
+
+
+def fit_limit(freedom: FloatArray) -> FloatArray:
+    """Chi-square per degree of freedom beyond which a window does not fit."""
+    return np.asarray(1 + FIT_SIGMAS * np.sqrt(2 / np.maximum(freedom, 1)), dtype=np.float64)
+
+
+def fits(refined: Refined) -> BoolArray:
+    """Which windows the model explains, (B,)."""
+    return np.asarray((refined.chi_square < fit_limit(refined.freedom)) & refined.converged)
+
+
+class Explainer:
+    """Searches for what is wrong with the measurements of windows of one system."""
+
+    def __init__(self, system: System, samples: int, start, workers: int = 1) -> None:  # type: ignore[no-untyped-def]
+        """`start`: function from windows (B, T, C) to log-ratios to refine from, or None for the nominal ones."""
+        self.system, self.samples, self.start, self.workers = system, samples, start, workers
+        self._refiners: dict[int, Refiner] = {}
+        deviations = self.refiner(samples).calibration.deviations
+        self.deviations = deviations
+        self.channels = len(system.channels)
+        self.groups = clock_groups(system)
+        self.directions = self._directions()
+
+    def refiner(self, samples: int) -> Refiner:
+        if samples not in self._refiners:
+            self._refiners[samples] = Refiner(self.system, samples, self.workers)
+        return self._refiners[samples]
+
+    def _directions(self) -> FloatArray:
+        """Simple explanations as rows over the deviations: each alone, and one delay for all that share a clock."""
+        H, C = len(self.deviations), self.channels
+        rows = list(np.eye(H))
+        for group in np.unique(self.groups):
+            together = np.zeros(H)
+            together[C : 2 * C] = self.groups == group
+            if together.sum() > 1:
+                rows.append(together)
+        return np.array(rows)
+
+    def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+        """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
+        found: dict[int, Explained] = {}
+        first, rest = bad[:TRIED], bad[TRIED:]
+        for part in (first, rest):
+            if len(part) and (part is first or found):
+                found |= self._explain(windows[part], part)
+        return found
+
+    def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, Explained]:
+        stuck = [self._stuck(window) for window in windows]
+        plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
+        found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
+        for i, window in enumerate(windows):
+            if i not in found:
+                strong = self._without(window, stuck[i]) if stuck[i] else self._turned(window)
+                if strong is not None:
+                    found[i] = strong
+        return {int(names[i]): explained for i, explained in found.items()}
+
+    def _by_steps(
+        self, windows: FloatArray, known: list[tuple[MeasurementFault, ...]]
+    ) -> dict[int, Explained]:
+        """One deviation at a time, the one with the most evidence; `known`: faults that were mended before."""
+        found: dict[int, Explained] = {}
+        active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
+        before = np.full(len(windows), np.inf)
+        loads = np.zeros(len(windows), dtype=bool)
+        for _ in range(ROUNDS + 1):
+            parts = self._refined(windows[active], point[active], loads[active])
+            going = []
+            for i, one in zip(active, parts, strict=True):
+                chi_square = float(one.chi_square[0])
+                if fits(one)[0]:
+                    found[int(i)] = Explained(one, self._with_load(point[i], one), (*known[i], *self._named(point[i])))
+                elif chi_square < _BETTER * before[i]:
+                    before[i] = chi_square
+                    step = self._step(one)
+                    if np.any(step[2 * self.channels :]):
+                        loads[i] = True
+                    else:
+                        point[i] = self._moved(point[i], step)
+                    if self._credible(point[i]):
+                        going.append(i)
+            active = np.array(going, dtype=np.int64)
+            if len(active) == 0:
+                break
+        return found
+
+    def _refined(self, windows: FloatArray, point: FloatArray, loads: BoolArray) -> list[Refined]:
+        """Corrected windows refined, with their evidence; one `Refined` of one window each."""
+        C = self.channels
+        late = np.abs(point[:, C : 2 * C]).max(axis=1, initial=0.0) * self.system.sample_rate
+        margin = np.where(late > 0, np.ceil(late).astype(int) + _MARGIN, 0)
+        out: list[Refined | None] = [None] * len(windows)
+        for edge in np.unique(margin):
+            for with_loads in (False, True):
+                rows = np.flatnonzero((margin == edge) & (loads == with_loads))
+                if len(rows) == 0:
+                    continue
+                mended = self.corrected(windows[rows], point[rows])
+                start = None if self.start is None else self.start(mended)
+                inner = mended[:, edge : self.samples - edge]
+                refined = self.refiner(inner.shape[1]).refine(
+                    inner, start, loads=with_loads, weigh=np.ones(len(rows), dtype=bool), iterations=6
+                )
+                for k, row in enumerate(rows):
+                    out[row] = refined.take(np.array([k]))
+        return [one for one in out if one is not None]
+
+    def corrected(self, windows: FloatArray, point: FloatArray) -> FloatArray:
+        """Windows (B, T, C) with gains divided out and delays taken back; at the ends a delay leaves nothing right."""
+        C = self.channels
+        out = windows / (1 + point[:, None, :C])
+        time = np.arange(windows.shape[1]) / self.system.sample_rate
+        for b, c in zip(*np.nonzero(point[:, C : 2 * C]), strict=True):
+            if np.isfinite(out[b, :, c]).all():
+                at = np.clip(time + point[b, C + c], 0, time[-1])
+                out[b, :, c] = make_interp_spline(time, out[b, :, c], k=7)(at)
+        return np.asarray(out)
+
+    def _step(self, refined: Refined) -> FloatArray:
+        """The simple deviation with the most evidence, at its most likely size, shape (H,)."""
+        V = self.directions
+        slope = V @ refined.score[0]
+        curvature = np.einsum("vh,hj,vj->v", V, refined.information[0], V).clip(1e-12)
+        best = int(np.argmax(slope**2 / curvature))
+        return np.asarray(V[best] * slope[best] / curvature[best])
+
+    def _moved(self, point: FloatArray, step: FloatArray) -> FloatArray:
+        C = self.channels
+        out = point + step
+        out[:C] = (1 + point[:C]) * (1 + step[:C]) - 1
+        return out
+
+    def _credible(self, point: FloatArray) -> bool:
+        C = self.channels
+        return bool(np.abs(point[:C]).max() < 0.9 and np.abs(point[C : 2 * C]).max() < 0.2 * self.samples / 100)
+
+    def _with_load(self, point: FloatArray, one: Refined) -> FloatArray:
+        """The loads that were refined along are part of where the window was linearised."""
+        P = len(self.system.parameters)
+        out = point.copy()
+        out[2 * self.channels :] = one.log_ratio[0, P:] if one.log_ratio.shape[1] > P else 0.0
+        return out
+
+    def _named(self, point: FloatArray) -> tuple[MeasurementFault, ...]:
+        return name_deviations(self.system, self.deviations, point, np.abs(point) > 0)
+
+    def _without(self, window: FloatArray, stuck: tuple[MeasurementFault, ...]) -> Explained:
+        """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not mended."""
+        names = [channel.name for channel in self.system.channels]
+        columns = np.array([names.index(fault.channel) for fault in stuck])
+        sensors = columns[columns >= len(self.system.inputs)]
+        if len(sensors) == len(columns):
+            without = window.copy()
+            without[:, sensors] = np.nan
+            explained = self._by_steps(without[None], [stuck])
+            if 0 in explained:
+                return explained[0]
+        point = np.zeros((1, len(self.deviations)))
+        return Explained(self._refined(window[None], point, np.zeros(1, dtype=bool))[0], point[0], stuck)
+
+    def _turned(self, window: FloatArray) -> Explained | None:
+        """One window (T, C) with a reversed or two exchanged channels put right."""
+        for mended, fault in self._reversed(window):
+            explained = self._by_steps(mended[None], [(fault,)])
+            if 0 in explained:
+                return explained[0]
+        return None
+
+    def _stuck(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Channels whose samples themselves show that they are frozen or saturated."""
+        found = []
+        for c, channel in enumerate(self.system.channels):
+            samples = window[:, c]
+            if not np.isfinite(samples).all():
+                continue
+            if np.mean(np.diff(samples) == 0) > _FLAT:
+                found.append(MeasurementFault(channel.name, "frozen", float(samples[-1])))
+                continue
+            for end in (samples.max(), samples.min()):
+                there = samples == end
+                if there.mean() > _CLIPPED and np.any(there[2:] & there[1:-1] & there[:-2]):
+                    found.append(MeasurementFault(channel.name, "saturated", float(end)))
+                    break
+        return tuple(found)
+
+    def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
+        """Windows with one sign turned or two channels exchanged that fit much better at nominal values."""
+        tries: list[tuple[FloatArray, MeasurementFault]] = []
+        names = [c.name for c in self.system.channels]
+        units = [c.unit for c in self.system.channels]
+        for c in range(self.channels):
+            turned = window.copy()
+            turned[:, c] *= -1
+            tries.append((turned, MeasurementFault(names[c], "inverted", -1.0)))
+        for a, b in combinations(range(self.channels), 2):
+            if self.groups[a] == self.groups[b] and units[a] == units[b]:
+                exchanged = window.copy()
+                exchanged[:, [a, b]] = window[:, [b, a]]
+                tries.append((exchanged, MeasurementFault(f"{names[a]}|{names[b]}", "swapped", 0.0)))
+        costs = self._nominal_cost(np.array([window, *(mended for mended, _ in tries)]))
+        order = np.argsort(costs[1:])
+        return [tries[i] for i in order[:3] if costs[1 + i] < _REVERSED * costs[0]]
+
+    def _nominal_cost(self, windows: FloatArray) -> FloatArray:
+        """Weighted squares at the nominal values with the best initial state, (B,)."""
+        refiner = self.refiner(self.samples)
+        model = refiner.model
+        present = ~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0)
+        with torch.no_grad():
+            data = model.batch(model.knots(windows), windows, present)
+            nominal = torch.zeros(1, len(self.system.parameters), dtype=torch.float64)
+            at = model.linearise(nominal, WindowBatch(data.w[:1], data.measured[:1], present))
+            s = model.simulator
+            discrete = model.compressed(s.discretise(s.element_values(nominal)), data)
+            rest = torch.zeros(len(windows), discrete.Ad.shape[1], dtype=torch.float64)
+            every = type(discrete)(*(part.expand(len(windows), -1, -1) for part in (
+                discrete.Ad, discrete.G0, discrete.G1, discrete.C, discrete.D)))
+            residual = (
+                data.measured @ model.compression(present).mT
+                - s.states(every, data.w, rest) @ discrete.C.mT
+                - data.w @ discrete.D.mT
+            )
+            r = as_rows(at.whiten @ model.spectra(residual).unsqueeze(3))[:, 0]  # (B, K)
+            along = r @ at.free[0].mT  # (B, N)
+            left = r.square().sum(dim=1) - (along * torch.cholesky_solve(along.mT, at.factor[0]).mT).sum(dim=1)
+            dropped = refiner.calibration.dropped(present)
+            over = model.spectra(data.measured @ dropped.mT) * model.weight[:, None]
+            return np.asarray((left + over.abs().square().sum(dim=(1, 2))).numpy())
+
+
+def name_deviations(system: System, deviations, values: FloatArray, chosen: BoolArray, std=None):  # type: ignore[no-untyped-def]
+    """Deviations as faults of channels; one delay that a whole clock shares is one fault of its channels together."""
+    C = len(system.channels)
+    std = np.zeros(len(values)) if std is None else std
+    groups = clock_groups(system)
+    found = [
+        MeasurementFault(deviations[h].name, "gain", float(1 + values[h]), float(std[h]))
+        for h in np.flatnonzero(chosen[:C])
+    ]
+    late = values[C : 2 * C]
+    done = np.zeros(C, dtype=bool)
+    for c in np.flatnonzero(chosen[C : 2 * C]):
+        if done[c]:
+            continue
+        together = (groups == groups[c]) & chosen[C : 2 * C]
+        alike = together & (np.abs(late - late[c]) < np.maximum(0.3 * abs(late[c]), 3 * std[C + c]))
+        if alike.sum() < (groups == groups[c]).sum():
+            alike = np.arange(C) == c
+        done |= alike
+        name = "|".join(system.channels[i].name for i in np.flatnonzero(alike))
+        found.append(MeasurementFault(name, "delay", float(late[alike].mean()), float(std[C + c])))
+    return tuple(found)
