@@ -103,6 +103,8 @@ class Deviating:
     cross: FloatArray  # shape (P, H)
     information: FloatArray  # shape (H, H)
     score: FloatArray  # shape (H,)
+    freedom: float  # degrees of freedom of the window's chi-square
+    whole: bool = True  # False: it speaks of loads only; columns of gains and delays are 0
 
 
 @dataclass(frozen=True, slots=True)

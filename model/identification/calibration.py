@@ -2,8 +2,8 @@
 
 A channel reads `(1 + g) y(t - tau)` of the true signal y.  At the refined parameters the simulated outputs are known,
 so every sensitivity is nearly free: to a sensor's gain it is the sensor's own output, to its delay minus the derivative
-of it; to an input's gain and delay the same of what that input makes the sensors show (with the opposite sign: a reading
-too large is a motion too small); to the load of a body the response to its inertia forces.
+of it; to an input's gain and delay the same of what that input makes the sensors show (with the opposite sign: a
+reading too large is a motion too small); to the load of a body the response to its inertia forces.
 
     r = J_x dx + J_h dh + noise,    free responses eliminated as in the refinement
 
@@ -18,30 +18,17 @@ the gains and delays, and tells them apart from springs.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from scipy.interpolate import CubicSpline
 from torch import Tensor
 
+from sprung.model.identification.deviations import deviations
 from sprung.model.identification.linearise import Chord, Linearisation, WindowBatch, WindowModel, as_rows
-from sprung.model.signals import FloatArray, IntArray
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.fusion import fused_shares
 from sprung.model.simulate.linear import knot_columns
-from sprung.model.system import System
-
-Kind = Literal["gain", "delay", "load"]
-
-
-@dataclass(frozen=True, slots=True)
-class Deviation:
-    """One thing that the system file states and that may be otherwise."""
-
-    name: str  # of the channel, or of the body
-    kind: Kind
-    std: float  # what the data sheet leaves open: relative, or s; of the logarithm of the mass for a load
-    group: int  # channels that share a clock have the same number; -1 for a load
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,29 +41,6 @@ class Evidence:
 
     def numpy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self.cross.numpy(), self.information.numpy(), self.score.numpy()
-
-
-def deviations(system: System) -> tuple[Deviation, ...]:
-    """Gains of all channels, delays of all channels, loads of the bodies that carry passengers or goods."""
-    channels = system.channels
-    groups = clock_groups(system)
-    stated = system.tolerances
-    return (
-        *(Deviation(c.name, "gain", t.gain, g) for c, t, g in zip(channels, stated, groups, strict=True)),
-        *(Deviation(c.name, "delay", t.delay, g) for c, t, g in zip(channels, stated, groups, strict=True)),
-        *(Deviation(load.body, "load", load.std, -1) for load in system.loads),
-    )
-
-
-def clock_groups(system: System) -> IntArray:
-    """Channels of one message share its clock: the address up to its last part; shape (C,)."""
-    found: dict[str, int] = {}
-    groups = []
-    for channel in system.channels:
-        address = channel.mcap or channel.can
-        message = address.rpartition(".")[0] if address else f"\0{channel.unit}"
-        groups.append(found.setdefault(message, len(found)))
-    return np.array(groups, dtype=np.int64)
 
 
 class Calibration:

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
 
-from sprung.model.identification.calibration import clock_groups
+from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.linearise import WindowBatch, as_rows
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
@@ -25,6 +25,8 @@ from sprung.model.system import System
 FIT_SIGMAS = 6.0  # chi-square further than this above its expectation: the window does not fit
 ROUNDS = 5  # corrections of one window at most
 TRIED = 8  # windows of a batch; when none of them can be explained, the others are not tried
+_FAR = (0.03, 1e-3, 0.03)  # gain, delay (s), load: beyond, a window is refined there rather than extrapolated
+_EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
 _BETTER = 0.8  # a correction that leaves more of chi-square than this is none
 _REVERSED = 0.3  # share of the squares at nominal values that a reversed or exchanged channel leaves, at most
 _MARGIN = 2  # samples that a delay costs at either end beyond itself
@@ -82,12 +84,28 @@ class Explainer:
 
     def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
         """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
-        found: dict[int, Explained] = {}
-        first, rest = bad[:TRIED], bad[TRIED:]
-        for part in (first, rest):
-            if len(part) and (part is first or found):
-                found |= self._explain(windows[part], part)
+        found = self._explain(windows[bad[:TRIED]], bad[:TRIED])
+        common = self._common(found)
+        if common is not None:  # what most of them have is tried first with the others
+            others = np.array([b for b in bad if b not in found or self._key(found[b].point) != self._key(common)])
+            again = self._by_steps(windows[others], [()] * len(others), common) if len(others) else {}
+            found |= {int(others[i]): e for i, e in again.items()}
+        if found:
+            rest = np.array([b for b in bad[TRIED:] if b not in found], dtype=np.int64)
+            found |= self._explain(windows[rest], rest)
         return found
+
+    def _key(self, point: FloatArray) -> tuple[int, ...]:
+        return tuple(int(h) for h in np.flatnonzero(point[: 2 * self.channels]))
+
+    def _common(self, found: dict[int, Explained]) -> FloatArray | None:
+        """The deviations that most of the explained windows have in common, at their median; None: there are none."""
+        plain = [e.point for e in found.values() if self._key(e.point)]
+        keys = [self._key(point) for point in plain]
+        most = max(keys, key=keys.count, default=())
+        if keys.count(most) < 2:
+            return None
+        return np.asarray(np.median([p for p, key in zip(plain, keys, strict=True) if key == most], axis=0))
 
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, Explained]:
         stuck = [self._stuck(window) for window in windows]
@@ -101,27 +119,27 @@ class Explainer:
         return {int(names[i]): explained for i, explained in found.items()}
 
     def _by_steps(
-        self, windows: FloatArray, known: list[tuple[MeasurementFault, ...]]
+        self, windows: FloatArray, known: list[tuple[MeasurementFault, ...]], start: FloatArray | None = None
     ) -> dict[int, Explained]:
         """One deviation at a time, the one with the most evidence; `known`: faults that were mended before."""
         found: dict[int, Explained] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
+        if start is not None:
+            point[:, : 2 * self.channels] = start[: 2 * self.channels]
         before = np.full(len(windows), np.inf)
-        loads = np.zeros(len(windows), dtype=bool)
+        loads = np.full(len(windows), bool(self.system.loads))
         for _ in range(ROUNDS + 1):
             parts = self._refined(windows[active], point[active], loads[active])
             going = []
             for i, one in zip(active, parts, strict=True):
-                chi_square = float(one.chi_square[0])
-                if fits(one)[0]:
+                chi_square, weight = float(one.chi_square[0]), (one.score[0], one.information[0])
+                step, _ = self._step(*weight)
+                good = bool(fits(one)[0])
+                if good:
                     found[int(i)] = Explained(one, self._with_load(point[i], one), (*known[i], *self._named(point[i])))
-                elif chi_square < _BETTER * before[i]:
+                if self.apart(*weight) if good else chi_square < _BETTER * before[i]:
                     before[i] = chi_square
-                    step = self._step(one)
-                    if np.any(step[2 * self.channels :]):
-                        loads[i] = True
-                    else:
-                        point[i] = self._moved(point[i], step)
+                    point[i] = self._moved(point[i], step)
                     if self._credible(point[i]):
                         going.append(i)
             active = np.array(going, dtype=np.int64)
@@ -161,13 +179,20 @@ class Explainer:
                 out[b, :, c] = make_interp_spline(time, out[b, :, c], k=7)(at)
         return np.asarray(out)
 
-    def _step(self, refined: Refined) -> FloatArray:
-        """The simple deviation with the most evidence, at its most likely size, shape (H,)."""
+    def _step(self, score: FloatArray, information: FloatArray) -> tuple[FloatArray, float]:
+        """The simple deviation with the most evidence at its most likely size, shape (H,), and that evidence."""
         V = self.directions
-        slope = V @ refined.score[0]
-        curvature = np.einsum("vh,hj,vj->v", V, refined.information[0], V).clip(1e-12)
+        slope = V @ score
+        curvature = np.einsum("vh,hj,vj->v", V, information, V).clip(1e-12)
         best = int(np.argmax(slope**2 / curvature))
-        return np.asarray(V[best] * slope[best] / curvature[best])
+        return np.asarray(V[best] * slope[best] / curvature[best]), float(slope[best] ** 2 / curvature[best] / 2)
+
+    def apart(self, score: FloatArray, information: FloatArray) -> bool:
+        """Whether a window that fits should be refined elsewhere: it speaks clearly for a sizeable deviation."""
+        step, evidence = self._step(score, information)
+        C = self.channels
+        scale = np.concatenate([np.full(C, _FAR[0]), np.full(C, _FAR[1]), np.full(len(step) - 2 * C, _FAR[2])])
+        return bool(evidence > _EVIDENT and np.max(np.abs(step) / scale) > 1)
 
     def _moved(self, point: FloatArray, step: FloatArray) -> FloatArray:
         C = self.channels
@@ -187,7 +212,7 @@ class Explainer:
         return out
 
     def _named(self, point: FloatArray) -> tuple[MeasurementFault, ...]:
-        return name_deviations(self.system, self.deviations, point, np.abs(point) > 0)
+        return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
     def _without(self, window: FloatArray, stuck: tuple[MeasurementFault, ...]) -> Explained:
         """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not mended."""
@@ -258,8 +283,12 @@ class Explainer:
             s = model.simulator
             discrete = model.compressed(s.discretise(s.element_values(nominal)), data)
             rest = torch.zeros(len(windows), discrete.Ad.shape[1], dtype=torch.float64)
-            every = type(discrete)(*(part.expand(len(windows), -1, -1) for part in (
-                discrete.Ad, discrete.G0, discrete.G1, discrete.C, discrete.D)))
+            every = type(discrete)(
+                *(
+                    part.expand(len(windows), -1, -1)
+                    for part in (discrete.Ad, discrete.G0, discrete.G1, discrete.C, discrete.D)
+                )
+            )
             residual = (
                 data.measured @ model.compression(present).mT
                 - s.states(every, data.w, rest) @ discrete.C.mT
@@ -271,27 +300,3 @@ class Explainer:
             dropped = refiner.calibration.dropped(present)
             over = model.spectra(data.measured @ dropped.mT) * model.weight[:, None]
             return np.asarray((left + over.abs().square().sum(dim=(1, 2))).numpy())
-
-
-def name_deviations(system: System, deviations, values: FloatArray, chosen: BoolArray, std=None):  # type: ignore[no-untyped-def]
-    """Deviations as faults of channels; one delay that a whole clock shares is one fault of its channels together."""
-    C = len(system.channels)
-    std = np.zeros(len(values)) if std is None else std
-    groups = clock_groups(system)
-    found = [
-        MeasurementFault(deviations[h].name, "gain", float(1 + values[h]), float(std[h]))
-        for h in np.flatnonzero(chosen[:C])
-    ]
-    late = values[C : 2 * C]
-    done = np.zeros(C, dtype=bool)
-    for c in np.flatnonzero(chosen[C : 2 * C]):
-        if done[c]:
-            continue
-        together = (groups == groups[c]) & chosen[C : 2 * C]
-        alike = together & (np.abs(late - late[c]) < np.maximum(0.3 * abs(late[c]), 3 * std[C + c]))
-        if alike.sum() < (groups == groups[c]).sum():
-            alike = np.arange(C) == c
-        done |= alike
-        name = "|".join(system.channels[i].name for i in np.flatnonzero(alike))
-        found.append(MeasurementFault(name, "delay", float(late[alike].mean()), float(std[C + c])))
-    return tuple(found)

@@ -66,11 +66,14 @@ class Identifier:
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
             start = self.estimator.estimate(windows, self.workers).log_ratio
         between = time.perf_counter()
-        loads = any(load.declared for load in self.system.loads)
+        loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
         estimates = self._estimates(refined, states)
-        bad = np.array([b for b, e in enumerate(estimates) if e.informative and not e.adequate], dtype=np.int64)
-        if explain and len(bad):
+        if not explain:
+            self.times = StageTimes(between - begin, time.perf_counter() - between)
+            return estimates
+        bad = np.array([b for b, e in enumerate(estimates) if self._asks(e, windows.shape[1])], dtype=np.int64)
+        if len(bad):
             for b, found in self._explainer(windows.shape[1]).explain(windows, bad).items():
                 (mended,) = self._estimates(found.refined, False, found.point)
                 estimates[b] = replace(mended, faults=found.faults)
@@ -82,6 +85,15 @@ class Identifier:
         P = len(self.system.parameters)
         deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
         return _estimates(refined, P, states, deviating)
+
+    def _asks(self, estimate: Estimate, samples: int) -> bool:
+        """Whether a window should be explained: it does not fit, or fits better elsewhere by far."""
+        if not estimate.informative:
+            return False
+        found = estimate.deviating
+        if estimate.adequate and found is not None and found.whole:
+            return self._explainer(samples).apart(found.score, found.information)
+        return not estimate.adequate
 
     def _explainer(self, samples: int) -> Explainer:
         if samples not in self._explainers:
@@ -205,14 +217,18 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
 
 def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArray | None) -> Deviating | None:
     """What window `b` says about deviations; loads that were refined with the parameters are profiled apart."""
-    if not refined.weighed[b]:
+    whole, loaded = bool(refined.weighed[b]), refined.log_ratio.shape[1] > P
+    if not (whole or loaded):
         return None
-    C, H = len(system.channels), refined.score.shape[1]
+    C = len(system.channels)
+    H = 2 * C + len(system.loads)
     at = np.zeros(H) if point is None else point.copy()
-    covariance, cross = refined.covariance[b], refined.cross[b]
-    information, score = refined.information[b].copy(), refined.score[b].copy()
+    covariance = refined.covariance[b]
+    cross = refined.cross[b] if whole else np.zeros((len(covariance), H))
+    information = refined.information[b].copy() if whole else np.zeros((H, H))
+    score = refined.score[b].copy() if whole else np.zeros(H)
     given = covariance[:P, :P]
-    if refined.log_ratio.shape[1] > P:
+    if loaded:
         loads = slice(2 * C, H)
         at[loads] = refined.log_ratio[b, P:]
         inverse = np.linalg.inv(covariance[P:, P:])
@@ -225,12 +241,14 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
         given = given - per_load @ covariance[P:, :P]
         cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
         cross[:, loads] = per_load
-    if point is not None:  # samples were divided by the gain: a relative deviation of what is left counts that much less
+    if (
+        point is not None
+    ):  # samples were divided by the gain: a relative deviation of what is left counts that much less
         scale = np.ones(H)
         scale[:C] = 1 / (1 + at[:C])
         cross, score = cross * scale, score * scale
         information = information * np.outer(scale, scale)
-    return Deviating(at, given, cross[:P], information, score)
+    return Deviating(at, given, cross[:P], information, score, float(refined.freedom[b]), whole)
 
 
 def _estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating | None]) -> list[Estimate]:

@@ -45,6 +45,7 @@ class Transfer:
     per_force: Tensor  # per element force, shape (B, F, R, E)
     drive: Tensor  # per unit of every drive that follows its own slope, shape (B, F, R, W/2)
 
+
 @dataclass(frozen=True, slots=True)
 class Linearisation:
     """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
@@ -181,7 +182,9 @@ class WindowModel:
         prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
         covariance = torch.linalg.inv(information + prior)
         step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
-        return Linearisation(whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step)
+        return Linearisation(
+            whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step
+        )
 
     def chord(self, at: Linearisation, x: Tensor, x0: Tensor, data: WindowBatch) -> Chord:
         """One more step from (x, x0) with the products of `at`."""
@@ -244,7 +247,11 @@ class WindowModel:
         s, f = self.simulator, self.frequency
         values = s.element_values(at.x)
         transfer = self._transfer(values, data)
-        compliance, per_force, carried = transfer.compliance, transfer.per_force, transfer.drive * self.drive_noise[:, None]
+        compliance, per_force, carried = (
+            transfer.compliance,
+            transfer.per_force,
+            transfer.drive * self.drive_noise[:, None],
+        )
         kind = compliance.dtype
         dynamic = f.dynamic(values)
         load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)

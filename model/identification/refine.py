@@ -169,9 +169,7 @@ class Refiner:
             progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
             progress.score[at_rows], progress.weighed[at_rows] = found.score, True
 
-    def _result(
-        self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool, wanted: Tensor
-    ) -> Refined:
+    def _result(self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool, wanted: Tensor) -> Refined:
         left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
         if len(left):  # did not converge: where it stands is as good a point as any to ask what is wrong
             chosen, x = data.take(left), progress.x[rows[left]]

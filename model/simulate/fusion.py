@@ -54,7 +54,9 @@ def fused_shares(omega: FloatArray, dt: float, noise: tuple[float, float]) -> Fl
 def _derivative(omega: FloatArray, dt: float) -> FloatArray:
     """What the spline makes of j omega, over j."""
     one, two = omega * dt, 2 * omega * dt
-    return np.asarray((20 * np.sin(one) + 2 * np.sin(two)) / 24 / ((66 + 52 * np.cos(one) + 2 * np.cos(two)) / 120) / dt)
+    return np.asarray(
+        (20 * np.sin(one) + 2 * np.sin(two)) / 24 / ((66 + 52 * np.cos(one) + 2 * np.cos(two)) / 120) / dt
+    )
 
 
 @lru_cache(maxsize=32)

@@ -126,6 +126,12 @@ def _page(statistic: FloatArray, increment: FloatArray, most: FloatArray, thresh
     return np.minimum(np.maximum(statistic + bounded, 0.0), 2.0 * threshold)
 
 
+def restarted(changes: Changes) -> Changes:
+    """Statistics from zero: what they had gathered was a measurement's doing."""
+    zero = np.zeros_like(changes.up)
+    return replace(changes, up=zero, down=zero, recovery=zero, active=np.zeros_like(changes.active))
+
+
 def relearn(changes: Changes, rows: BoolArray) -> Changes:
     """Forgets the baseline where `rows` (..., P), e.g. after a repair."""
     zero = {

@@ -1,6 +1,7 @@
 """Kalman filter over level and rate of every log-ratio, with full covariance.
 
-State (2P,): levels first, then rates.  One window measures the identifiable levels with the correlated errors that
+State (2P + H,): levels first, then rates, then deviations of the measurements (see `model.tracking.deviations`; none
+unless the tracker was told of them).  One window measures the identifiable levels with the correlated errors that
 its covariance states.  Robust: influence of a component, and of the window as a whole, is bounded.
 """
 
@@ -17,14 +18,15 @@ from sprung.model.tracking.settings import ProcessNoise
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
-    """N(mean, covariance) of levels and rates."""
+    """N(mean, covariance) of levels, rates and deviations."""
 
-    mean: FloatArray  # shape (2P,), log-ratio and 1/s
-    covariance: FloatArray  # shape (2P, 2P)
+    mean: FloatArray  # shape (2P + H,), log-ratio and 1/s
+    covariance: FloatArray  # shape (2P + H, 2P + H)
+    deviations: int = 0  # H
 
     @property
     def size(self) -> int:
-        return len(self.mean) // 2
+        return (len(self.mean) - self.deviations) // 2
 
     @property
     def level(self) -> FloatArray:
@@ -43,22 +45,38 @@ class Innovation:
     bounded: bool  # the window as a whole lies too far out, and its influence was bounded
 
 
-def prior(size: int, std: float, process: ProcessNoise) -> Belief:
-    """Belief before any window: nominal values, stationary rates."""
+def prior(size: int, std: float, process: ProcessNoise, deviations: FloatArray | None = None) -> Belief:
+    """Belief before any window: nominal values, stationary rates; `deviations`: their covariance (H, H)."""
     variance = np.concatenate([np.full(size, std**2), np.full(size, process.drift_rate**2)])
-    return Belief(np.zeros(2 * size), np.diag(variance))
+    H = 0 if deviations is None else len(deviations)
+    covariance = np.zeros((2 * size + H, 2 * size + H))
+    np.einsum("kk->k", covariance[: 2 * size, : 2 * size])[:] = variance
+    if deviations is not None:
+        covariance[2 * size :, 2 * size :] = deviations
+    return Belief(np.zeros(2 * size + H), covariance, H)
 
 
-def predict(belief: Belief, dt: float, process: ProcessNoise, std: float) -> Belief:
-    """Belief `dt` seconds later; no level becomes less certain than its prior `std`.
+def predict(
+    belief: Belief,
+    dt: float,
+    process: ProcessNoise,
+    std: float,
+    walk: FloatArray | None = None,
+    limit: FloatArray | None = None,
+) -> Belief:
+    """Belief `dt` seconds later; no level becomes less certain than its prior `std`, no deviation than `limit` (H,).
+
+    walk: covariance per second of the deviations' random walk, (H, H).
 
     Integrated Ornstein-Uhlenbeck process, exact for any dt (e.g. Gillespie, Phys. Rev. E 54, 2084, 1996).
     """
     p, tau = belief.size, process.drift_time
     gain = -tau * float(np.expm1(-dt / tau))
     decay = 1.0 - gain / tau
-    mean = np.concatenate([belief.level + gain * belief.mean[p:], decay * belief.mean[p:]])
-    old = belief.covariance
+    rates = slice(p, 2 * p)
+    mean = np.concatenate([belief.level + gain * belief.mean[rates], decay * belief.mean[rates], belief.mean[2 * p :]])
+    whole = belief.covariance
+    old = whole[: 2 * p, : 2 * p]
     cross = old[:p, p:] + gain * old[p:, p:]
     covariance = np.empty_like(old)
     block = old[:p, :p] + gain * (old[:p, p:] + cross.T)
@@ -72,16 +90,32 @@ def predict(belief: Belief, dt: float, process: ProcessNoise, std: float) -> Bel
     noise = ((max(level, 0.0), rate * gain**2 / tau), (rate * gain**2 / tau, rate * (1.0 - decay**2)))
     for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):
         np.einsum("kk->k", blocks[i, :, j, :])[:] += noise[i][j]
-    return Belief(mean, _bounded(covariance, p, std))
+    bounds = np.full(p, std)
+    if belief.deviations:
+        covariance = _with_deviations(whole, covariance, gain, decay, p)
+        if walk is not None and limit is not None:
+            covariance[2 * p :, 2 * p :] += walk * dt
+            bounds = np.concatenate([bounds, np.full(p, np.inf), limit])
+    return Belief(mean, _bounded(covariance, bounds), belief.deviations)
 
 
-def _bounded(covariance: FloatArray, p: int, std: float) -> FloatArray:
-    """Shrinks rows and columns of levels whose variance passed the prior's; correlations are kept."""
-    variance = np.diag(covariance)[:p]
+def _with_deviations(whole: FloatArray, moved: FloatArray, gain: float, decay: float, p: int) -> FloatArray:
+    """The whole covariance after levels and rates have moved to `moved` (2p, 2p)."""
+    covariance = whole.copy()
+    covariance[: 2 * p, : 2 * p] = moved
+    covariance[:p, 2 * p :] = whole[:p, 2 * p :] + gain * whole[p : 2 * p, 2 * p :]
+    covariance[p : 2 * p, 2 * p :] = decay * whole[p : 2 * p, 2 * p :]
+    covariance[2 * p :, : 2 * p] = covariance[: 2 * p, 2 * p :].T
+    return covariance
+
+
+def _bounded(covariance: FloatArray, std: FloatArray) -> FloatArray:
+    """Shrinks the first rows and columns whose variance passed that of `std`; correlations are kept."""
+    variance = np.diag(covariance)[: len(std)]
     if np.all(variance <= std**2):
         return covariance
     scale = np.ones(len(covariance))
-    scale[:p] = np.minimum(1.0, std / np.sqrt(variance))
+    scale[: len(std)] = np.minimum(1.0, std / np.sqrt(np.maximum(variance, 1e-300)))
     return covariance * np.outer(scale, scale)
 
 
@@ -93,6 +127,7 @@ def correct(
     *,
     share: float,  # of the window that no earlier window saw, in (0, 1]
     bound: float,  # standard deviations beyond which influence no longer grows
+    cross: FloatArray | None = None,  # change of `value` per deviation, shape (P, H); taken at the believed ones
 ) -> tuple[Belief, Innovation]:
     """Belief after one window.
 
@@ -105,7 +140,12 @@ def correct(
     if len(rows) == 0:
         return belief, Innovation(score, False)
     residual = value[rows] - belief.mean[rows]
-    own = belief.covariance[np.ix_(rows, rows)]
+    across = belief.covariance[:, rows]
+    if cross is not None:
+        across = across - belief.covariance[:, 2 * belief.size :] @ cross[rows].T
+    own = across[rows]
+    if cross is not None:
+        own = own - cross[rows] @ across[2 * belief.size :]
     noise = covariance[np.ix_(rows, rows)]
     score[rows] = residual / np.sqrt(np.diag(own) + np.diag(noise))
     stretch = np.sqrt(np.maximum(1.0, np.abs(score[rows]) / bound))  # Huber: influence stays at the bound
@@ -113,11 +153,10 @@ def correct(
     distance = float(residual @ _solve(own + noise, residual)) / len(rows)
     limit = 1.0 + 2.0 * bound * np.sqrt(2.0 / len(rows))  # mean of chi-square / P, and 2 bound deviations of it
     noise = noise * (max(1.0, distance / limit) / share)
-    across = belief.covariance[:, rows]
     gain = _solve(own + noise, across.T).T
     posterior = belief.covariance - gain @ across.T
     posterior = 0.5 * (posterior + posterior.T)
-    return Belief(belief.mean + gain @ residual, posterior), Innovation(score, distance > limit)
+    return Belief(belief.mean + gain @ residual, posterior, belief.deviations), Innovation(score, distance > limit)
 
 
 def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
@@ -143,4 +182,4 @@ def reopen(belief: Belief, variance: FloatArray, process: ProcessNoise) -> Belie
     covariance[:, rates] = 0.0
     covariance[rates, rates] = process.drift_rate**2
     mean[rates] = 0.0
-    return Belief(mean, covariance)
+    return Belief(mean, covariance, belief.deviations)

@@ -10,8 +10,10 @@ from typing import Any, Literal
 import numpy as np
 
 from sprung.model.signals import FloatArray, IntArray
+from sprung.model.tracking import deviations
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
+from sprung.model.tracking.deviations import Calibration
 from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.misfit import Fit
 from sprung.model.tracking.scatter import Scatter
@@ -20,7 +22,7 @@ from sprung.model.tracking.surprise import Surprise
 FORMAT = 2
 _READ = (1, FORMAT)
 
-Kind = Literal["change", "misfit"]
+Kind = Literal["change", "misfit", "sensor", "load"]
 Severity = Literal["warning", "alarm"]
 Health = Literal["ok", "maintenance_required", "out_of_specification", "check_function", "failure"]
 
@@ -31,10 +33,11 @@ class TrackerStateError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """A change of one parameter from the vehicle's own baseline, or windows that stopped fitting."""
+    """A change of a parameter from the vehicle's own baseline, windows that stopped fitting, a wrong measurement, or a
+    load beyond what the system file allows."""
 
     kind: Kind
-    parameter: str | None  # None for a misfit
+    parameter: str | None  # None for a misfit; "bogie1_1l.gain" for a sensor; "car.load"; "*.damping": all of them
     onset: int  # ns, estimated time of the change
     opened: int  # ns, centre of the window that gave the evidence
     severity: Severity
@@ -42,11 +45,23 @@ class Alarm:
     std: float | None = None
     peak: float | None = None  # the largest change so far, signed
     closed: int | None = None  # ns; None: active
+    alternatives: tuple[str, ...] = ()  # what the evidence cannot tell it from, "bogie1_1l.gain"
 
     @property
     def key(self) -> tuple[str, str | None, int]:
         """What names an alarm for as long as it lives."""
         return self.kind, self.parameter, self.opened
+
+
+@dataclass(frozen=True, slots=True)
+class Stuck:
+    """A channel that windows found frozen, saturated, reversed or exchanged."""
+
+    channel: str
+    kind: str
+    value: float
+    count: int  # windows that said so, less those that did not; bounded
+    since: int  # ns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +80,8 @@ class TrackerState:
     surprise: Surprise
     changes: Changes
     fit: Fit
+    calibration: Calibration
+    stuck: tuple[Stuck, ...]  # frozen, saturated, reversed or exchanged channels of the last windows
     alarms: tuple[Alarm, ...]  # active and closed, oldest first
     coverage: Coverage = field(default_factory=Coverage)
 
@@ -94,6 +111,8 @@ class TrackerState:
             "surprise": _pack_all(asdict(self.surprise)),
             "changes": _pack_all(asdict(self.changes)),
             "fit": asdict(self.fit),
+            "calibration": _pack_all(asdict(self.calibration)),
+            "stuck": [asdict(stuck) for stuck in self.stuck],
             "alarms": [asdict(alarm) for alarm in self.alarms],
             "coverage": asdict(self.coverage),
         }
@@ -114,12 +133,16 @@ class TrackerState:
                 rejected=data["rejected"],
                 idle=data.get("idle", 0),
                 outliers=data["outliers"],
-                belief=_belief(**_unpack_all(data["belief"])),
+                belief=_belief(data),
                 scatter=_scatter(data),
                 surprise=Surprise(**_unpack_all(data["surprise"])),
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=Fit(**data["fit"]),
-                alarms=tuple(Alarm(**alarm) for alarm in data["alarms"]),
+                calibration=_calibration(data),
+                stuck=tuple(Stuck(**stuck) for stuck in data.get("stuck", ())),
+                alarms=tuple(
+                    Alarm(**{**alarm, "alternatives": tuple(alarm.get("alternatives", ()))}) for alarm in data["alarms"]
+                ),
                 coverage=_coverage(data),
             )
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
@@ -132,11 +155,23 @@ def _coverage(data: Mapping[str, Any]) -> Coverage:
 
 
 def _belief(mean: FloatArray, covariance: FloatArray) -> Belief:
+def _belief(data: Mapping[str, Any]) -> Belief:
+    arrays = _unpack_all(data["belief"])
+    mean, covariance = arrays["mean"], arrays["covariance"]
     upper = np.triu_indices(len(mean))
     full = np.zeros((len(mean), len(mean)))
     full[upper] = covariance
     full.T[upper] = covariance
-    return Belief(mean, full)
+    return Belief(mean, full, len(mean) - 2 * len(data["names"]))
+
+
+def _calibration(data: Mapping[str, Any]) -> Calibration:
+    """Format 1, and a tracker that was not told of deviations, have none."""
+    if "calibration" not in data:
+        return deviations.start(len(data["names"]), deviations.model_of(()))
+    arrays = _unpack_all(data["calibration"])
+    shape = len(data["names"]), len(arrays["reference"])
+    return Calibration(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 
 
 def _scatter(data: Mapping[str, Any]) -> Scatter:

@@ -12,12 +12,16 @@ from typing import Protocol
 import numpy as np
 from scipy.linalg.lapack import dpotrf
 
-from sprung.model.signals import BoolArray, Estimate, FloatArray
+from sprung.model.identification.deviations import Deviation, named
+from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, MeasurementFault
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import coverage, misfit, scatter, surprise
+from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
+from sprung.model.tracking.alarms import HARD, WINDOWS, Attribution, Drift, counted
+from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
-from sprung.model.tracking.state import Alarm, Health, Severity, TrackerState, TrackerStateError
+from sprung.model.tracking.state import Alarm, Health, TrackerState, TrackerStateError
 
 __all__ = [
     "Alarm",
@@ -31,6 +35,7 @@ __all__ = [
 ]
 
 OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
+BENT = 4.0  # standard deviations of a window that deviations may move it by without being weighed itself
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -65,14 +70,27 @@ class ParameterReport:
 
 
 class Tracker:
-    """Fuses window estimates of `parameters` (P of them, in the order of the estimates)."""
+    """Fuses window estimates of `parameters` (P of them, in the order of the estimates).
 
-    def __init__(self, parameters: Sequence[ParameterLike], settings: TrackerSettings | None = None) -> None:
+    deviations: gains, delays and loads that estimates may speak of (H of them, see `Estimate.deviating`); with none,
+    what the system file says is taken as it stands.
+    """
+
+    def __init__(
+        self,
+        parameters: Sequence[ParameterLike],
+        settings: TrackerSettings | None = None,
+        deviations: Sequence[Deviation] = (),
+    ) -> None:
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
         self.parameters = tuple(parameters)
         self.names = tuple(parameter.name for parameter in self.parameters)
         self.settings = settings or TrackerSettings()
+        self.deviations = tuple(deviations)
+        self.model = dev.model_of(self.deviations)
+        self._attribution = Attribution(self.names, self.settings, self.deviations, self.model)
+        self._limit = np.sqrt(np.diag(self.model.prior))
 
     def initial_state(self) -> TrackerState:
         """Nothing seen yet."""
@@ -85,11 +103,13 @@ class Tracker:
             rejected=0,
             idle=0,
             outliers=0,
-            belief=kalman.prior(size, self.settings.prior, self.settings.process),
+            belief=kalman.prior(size, self.settings.prior, self.settings.process, self.model.prior),
             scatter=scatter.start((size,)),
             surprise=surprise.start(size),
             changes=change_test.start((size,)),
             fit=misfit.Fit(),
+            calibration=dev.start(size, self.model),
+            stuck=(),
             alarms=(),
         )
 
@@ -105,20 +125,29 @@ class Tracker:
         if not estimate.informative:
             return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         centre = time_ns + _ns(self.settings.window / 2)
+        stuck = counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
-        new = replace(state, rejected=state.rejected + 1)
-        if usable and mask.any() and _proper(estimate.covariance[np.ix_(mask, mask)]):
-            new = self._fuse(state, estimate, mask, time_ns, centre)
-        fit = misfit.update(
-            state.fit,
-            estimate.chi_square,
-            adequate=estimate.adequate,
-            inflation=float(new.scatter.inflation.max()),
-            time=centre,
-        )
-        new = replace(new, time=time_ns, fit=fit, coverage=seen)
-        return replace(new, alarms=self._alarms(new, centre))
+        new, jump = replace(state, rejected=state.rejected + 1), None
+        if (
+            usable
+            and mask.any()
+            and not self._bent(state, estimate)
+            and _proper(estimate.covariance[np.ix_(mask, mask)])
+        ):
+            new, jump = self._fuse(state, estimate, mask, time_ns, centre)
+        if usable or not estimate.faults:  # a window whose fault is named is not a riddle
+            fit = misfit.update(
+                state.fit,
+                self._chi_square(new, estimate),
+                adequate=estimate.adequate,
+                inflation=float(new.scatter.inflation.max()),
+                time=centre,
+            )
+            new = replace(new, fit=fit)
+        new = replace(new, time=time_ns, stuck=stuck, coverage=seen)
+        told = jump if jump is not None and self._armed(state) else None
+        return replace(new, alarms=self._attribution.after(new, self._drift(new), told, centre))
 
     def missed(self, state: TrackerState) -> TrackerState:
         """State after a window that was of no use (samples lost, a gap): nobody watched the vehicle meanwhile."""
@@ -133,7 +162,8 @@ class Tracker:
         if state.time is None or time_ns > state.time:
             return state
         shift = time_ns - _ns(self.settings.hop) - state.time
-        changes, fit = state.changes, state.fit
+        changes, fit, calibration = state.changes, state.fit, state.calibration
+        weighed = calibration.recent != 0
         return replace(
             state,
             time=state.time + shift,
@@ -145,6 +175,12 @@ class Tracker:
                 rising_since=fit.rising_since + shift,
                 misfit_since=None if fit.misfit_since is None else fit.misfit_since + shift,
             ),
+            calibration=replace(
+                calibration,
+                since=calibration.since + shift,
+                recent=np.where(weighed, calibration.recent + shift, 0),
+            ),
+            stuck=tuple(replace(s, since=s.since + shift) for s in state.stuck),
         )
 
     def update_many(self, state: TrackerState, windows: Iterable[tuple[Estimate, int]]) -> TrackerState:
@@ -161,7 +197,7 @@ class Tracker:
             raise TrackerStateError(f"no parameter {unknown[0]!r} to relearn; known are {', '.join(self.names)}")
         rows = np.array([name in chosen for name in self.names])
         new = replace(state, changes=change_test.relearn(state.changes, rows))
-        return replace(new, alarms=self._alarms(new, state.time or 0))
+        return replace(new, alarms=self._attribution.after(new, self._drift(new), None, state.time or 0))
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""
@@ -170,8 +206,8 @@ class Tracker:
     def report(self, state: TrackerState) -> tuple[ParameterReport, ...]:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
         level, std = self.posterior(state)
-        drift, drift_std = self._drift(state)
-        base, base_std = state.changes.baseline, np.sqrt(state.changes.baseline_variance)
+        drift = self._drift(state)
+        base, base_std = self._baseline(state), np.sqrt(state.changes.baseline_variance)
         learned = state.changes.learned >= self.settings.learning
         reports = []
         for i, parameter in enumerate(self.parameters):
@@ -190,8 +226,8 @@ class Tracker:
                     identifiable=bool(std[i] < KNOWN * self.settings.prior),
                     baseline=healthy,
                     baseline_std=None if healthy is None else healthy * float(base_std[i]),
-                    drift=float(drift[i]) if own else None,
-                    drift_std=float(drift_std[i]) if own else None,
+                    drift=float(drift.change[i]) if own else None,
+                    drift_std=float(drift.std[i]) if own else None,
                 )
             )
         return tuple(reports)
@@ -201,11 +237,12 @@ class Tracker:
 
         A vehicle of which nothing came, or too little lately that could be used, is not monitored: check function.
         """
-        peak = max((abs(alarm.change or 0.0) for alarm in state.active), default=0.0)
+        changes = [abs(alarm.change or 0.0) for alarm in state.active if alarm.kind == "change"]
         severities = {(alarm.kind, alarm.severity) for alarm in state.active}
-        if peak >= self.settings.failure_change:
+        if max(changes, default=0.0) >= self.settings.failure_change:
             return "failure"
-        if any(kind == "misfit" for kind, _ in severities) or not state.coverage.monitored:
+        broken = any(a.kind == "sensor" and (a.parameter or "").endswith(HARD) for a in state.active)
+        if broken or any(kind == "misfit" for kind, _ in severities) or not state.coverage.monitored:
             return "check_function"
         if ("change", "alarm") in severities:
             return "out_of_specification"
@@ -222,24 +259,73 @@ class Tracker:
                 f"an estimate of {estimate.log_ratio.shape} parameters came; the tracker has {len(self.names)}"
             )
 
+    def sensors(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
+        """What is wrong with measurements: stuck channels, and gains and delays that differ from the system file."""
+        stuck = [MeasurementFault(s.channel, s.kind, s.value) for s in state.stuck if s.count >= WINDOWS]
+        H = self.model.size
+        if H == 0 or state.calibration.recent[-1] == 0:
+            return tuple(stuck)
+        value, std = state.belief.mean[-H:], np.sqrt(np.diag(state.belief.covariance)[-H:])
+        least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
+        off = value - self._shared(state)
+        chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)
+        return (*stuck, *named(self.deviations, off, std, chosen))
+
+    def _shared(self, state: TrackerState) -> FloatArray:
+        """The middle gain, and the middle delay of the clocks: what all channels share cannot be known, (H,)."""
+        H = self.model.size
+        value, out = state.belief.mean[-H:], np.zeros(H)
+        for kind in ("gain", "delay"):
+            at = np.array([k == kind for k in self.model.kinds])
+            out[at] = np.median(value[at]) if at.any() else 0.0
+        return out
+
+    def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
+        """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
+        H = self.model.size
+        found = {}
+        for h in np.flatnonzero(self.model.loads):
+            value, std = state.belief.mean[-H:][h], float(np.sqrt(np.diag(state.belief.covariance)[-H:][h]))
+            if std < KNOWN * self._limit[h]:
+                found[self.deviations[h].name] = (float(value), std)
+        return found
+
     def _fuse(
         self, state: TrackerState, estimate: Estimate, mask: BoolArray, time_ns: int, centre: int
-    ) -> TrackerState:
-        """Filter, scatter and change tests after a usable window."""
-        settings, process = self.settings, self.settings.process
+    ) -> tuple[TrackerState, Jump | None]:
+        """Filter, scatter and change tests after a usable window; a deviation that is found to have jumped."""
+        settings, model, H = self.settings, self.model, self.model.size
         elapsed = np.inf if state.last is None else (time_ns - state.last) * 1e-9
         share = min(1.0, elapsed / settings.window)
-        value = np.where(mask, estimate.log_ratio, 0.0)
-        variance = np.where(mask, np.diag(estimate.covariance), 1.0)
-
-        measured = scatter.update(state.scatter, value, variance, mask, time=time_ns, window=_ns(settings.window))
-        wide = np.sqrt(measured.inflation)
-        covariance = estimate.covariance * np.outer(wide, wide)
-        fresh = variance * measured.inflation / share
-
-        belief = state.belief
+        belief, calibration, jump = state.belief, state.calibration, None
         if state.last is not None:
-            belief = kalman.predict(belief, elapsed, process, settings.prior)
+            belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self._limit)
+            if elapsed > dev.STOPPED and H:
+                belief = dev.boarded(belief, model)
+        found = estimate.deviating if H else None
+        if found is not None and not found.whole:
+            belief = dev.loaded(belief, model, found, share)
+            gains = np.where(model.loads, found.cross, calibration.cross)
+            found = replace(found, cross=gains, point=np.where(model.loads, found.point, 0.0))
+        elif found is not None:
+            apart = (time_ns - int(calibration.recent[-1])) * 1e-9
+            calibration, belief, jump = dev.weigh(
+                calibration, model, belief, found, min(1.0, apart / settings.window), time_ns
+            )
+            if jump is not None and self._armed(state):
+                calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
+                state = replace(state, changes=change_test.restarted(state.changes))
+        value, covariance, cross = self._at_belief(estimate, found, calibration, belief, mask)
+        variance = np.where(mask, np.diag(covariance), 1.0)
+        open_ = self._open(calibration, belief, cross)
+
+        measured = scatter.update(
+            state.scatter, value, variance + open_, mask, time=time_ns, window=_ns(settings.window)
+        )
+        wide = np.sqrt(measured.inflation)
+        covariance = covariance * np.outer(wide, wide)
+        fresh = (variance + open_) * measured.inflation / share
+
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
         reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.inflation)
         plausible = np.clip(value, belief.level - reach, belief.level + reach)
@@ -247,19 +333,24 @@ class Tracker:
             state.surprise, value - belief.level, belief.level_variance + fresh, mask & known
         )
         if jumped.any():
-            belief = kalman.reopen(belief, jumped, process)
-        belief, innovation = kalman.correct(belief, value, covariance, mask, share=share, bound=settings.outlier)
+            belief = kalman.reopen(belief, jumped, settings.process)
+            if H:
+                belief = dev.unsure(belief, model)
+        belief, innovation = kalman.correct(
+            belief, value, covariance, mask, share=share, bound=settings.outlier, cross=cross if H else None
+        )
+        off = self._of_baseline(state, calibration, cross, belief)
         tested = change_test.update(
             state.changes,
-            value,
+            value - off,
             fresh,
             mask,
             seconds=share * settings.window,
             time=centre,
             settings=settings,
-            plausible=plausible,
+            plausible=plausible - off,
         )
-        return replace(
+        new = replace(
             state,
             last=time_ns,
             used=state.used + 1,
@@ -268,62 +359,108 @@ class Tracker:
             scatter=measured,
             surprise=watch,
             changes=tested,
+            calibration=self._learned(state, tested, calibration, cross, belief),
         )
+        return new, jump
 
-    def _drift(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
-        """value / baseline - 1 and its standard deviation, each of shape (P,); NaN before any window."""
+    def _bent(self, state: TrackerState, estimate: Estimate) -> bool:
+        """Whether known deviations move this window so far that mean sensitivities are not good enough for it."""
+        if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
+            return False
+        moved = state.calibration.cross @ np.where(self.model.loads, 0, state.belief.mean[-self.model.size :])
+        return bool(np.any(np.abs(moved) > BENT * np.sqrt(np.diag(estimate.covariance))))
+
+    def _armed(self, state: TrackerState) -> bool:
+        """Whether the vehicle's baseline is known: before, a deviation is found, but has not jumped."""
+        return bool(np.any(state.changes.learned >= self.settings.learning))
+
+    def _chi_square(self, state: TrackerState, estimate: Estimate) -> float:
+        """That of a window, less what known deviations of the measurements account for."""
+        if not self.model.size or estimate.faults:
+            return estimate.chi_square
+        found = estimate.deviating
+        known = (
+            float(state.calibration.excess[0])
+            if found is None or not found.whole
+            else dev.explained(state.belief, found)
+        )
+        return max(estimate.chi_square - known, 0.1 * estimate.chi_square)
+
+    def _at_belief(
+        self,
+        estimate: Estimate,
+        found: Deviating | None,
+        calibration: dev.Calibration,
+        belief: kalman.Belief,
+        mask: BoolArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Log-ratios (P,) as they are if the deviations are as believed, their covariance, sensitivities (P, H)."""
+        value = np.where(mask, estimate.log_ratio, 0.0)
+        if not self.model.size:
+            return value, estimate.covariance, np.zeros((len(value), 0))
+        here = belief.mean[-self.model.size :]
+        if found is None:
+            return value + np.where(mask, calibration.cross @ here, 0.0), estimate.covariance, calibration.cross
+        return value + np.where(mask, found.cross @ (here - found.point), 0.0), found.given, found.cross
+
+    def _open(self, calibration: dev.Calibration, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
+        """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
+        H = self.model.size
+        other = (calibration.moved > 0) | self.model.loads
+        if H == 0 or not other.any():
+            return np.zeros(len(cross))
+        at = np.flatnonzero(other)
+        own = belief.covariance[-H:, -H:][np.ix_(at, at)]
+        return np.asarray(np.einsum("ph,hj,pj->p", cross[:, at], own, cross[:, at]))
+
+    def _of_baseline(
+        self, state: TrackerState, calibration: dev.Calibration, cross: FloatArray, belief: kalman.Belief
+    ) -> FloatArray:
+        """What the deviations of the baseline's windows contribute, (P,); loads are taken out window by window.
+
+        A baseline is learned as if gains and delays were as stated, and compared at those that it was learned with.
+        """
+        if not self.model.size:
+            return np.zeros(len(cross))
+        stays = ~self.model.loads
+        learned = state.changes.learned >= self.settings.learning
+        here = np.where(stays, belief.mean[-self.model.size :], 0.0)
+        reference = np.where(stays, calibration.reference, 0.0)
+        return np.where(learned, calibration.base_cross @ reference, cross @ here)
+
+    def _learned(
+        self,
+        state: TrackerState,
+        tested: change_test.Changes,
+        calibration: dev.Calibration,
+        cross: FloatArray,
+        belief: kalman.Belief,
+    ) -> dev.Calibration:
+        """Sensitivities of the baseline's windows, and the deviations that it was learned with."""
+        if not self.model.size:
+            return calibration
+        gained = np.where(
+            tested.weight > 0, (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300), 0
+        )
+        base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
+        reference = calibration.reference
+        if (state.used + 1) * self.settings.hop < dev.SETTLED:
+            reference = np.where(calibration.moved > 0, reference, belief.mean[-self.model.size :])
+        return replace(calibration, base_cross=base, reference=reference)
+
+    def _baseline(self, state: TrackerState) -> FloatArray:
+        """Log-ratio to nominal of the vehicle's own healthy state, shape (P,); NaN before any window."""
+        calibration = state.calibration
+        if not self.model.size:
+            return state.changes.baseline
+        reference = np.where(self.model.loads, 0.0, calibration.reference)
+        return np.asarray(state.changes.baseline + calibration.base_cross @ reference)
+
+    def _drift(self, state: TrackerState) -> Drift:
+        """value / baseline - 1 and its standard deviation; NaN before any window."""
         level, std = self.posterior(state)
-        ratio = np.exp(level - state.changes.baseline)
-        return ratio - 1.0, ratio * np.sqrt(std**2 + state.changes.baseline_variance)
-
-    def _alarms(self, state: TrackerState, now: int) -> tuple[Alarm, ...]:
-        """Alarms after this window: opened, followed, closed."""
-        if not state.active and state.misfit_since is None and not state.changes.active.any():
-            return state.alarms
-        drift, drift_std = self._drift(state)
-        active = dict(zip(self.names, state.changes.active, strict=True))
-        alarms: list[Alarm] = []
-        for alarm in state.alarms:
-            if alarm.closed is not None:
-                alarms.append(alarm)
-            elif alarm.kind == "misfit":
-                alarms.append(alarm if state.misfit_since is not None else _closed(alarm, now))
-            elif active[alarm.parameter or ""] == 0:
-                alarms.append(_closed(alarm, now))
-            else:
-                i = self.names.index(alarm.parameter or "")
-                alarms.append(self._followed(alarm, float(drift[i]), float(drift_std[i])))
-        alarmed = {alarm.parameter for alarm in alarms if alarm.closed is None and alarm.kind == "change"}
-        for i in range(len(self.names)):
-            if state.changes.active[i] != 0 and self.names[i] not in alarmed:
-                since = state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since
-                alarm = Alarm("change", self.names[i], int(since[i]), now, "warning", 0.0, 0.0, 0.0)
-                alarms.append(self._followed(alarm, float(drift[i]), float(drift_std[i])))
-        if state.misfit_since is not None and not any(
-            alarm.kind == "misfit" and alarm.closed is None for alarm in alarms
-        ):
-            alarms.append(Alarm("misfit", None, state.misfit_since, now, "warning"))
-        return self._kept(alarms)
-
-    def _followed(self, alarm: Alarm, change: float, std: float) -> Alarm:
-        """An active alarm with its change as it is now; severity falls only with hysteresis."""
-        limit = self.settings.alarm_change
-        if alarm.severity == "alarm":
-            limit *= self.settings.hysteresis
-        severity: Severity = "alarm" if abs(change) >= limit else "warning"
-        peak = change if abs(change) >= abs(alarm.peak or 0.0) else alarm.peak
-        return replace(alarm, change=change, std=std, severity=severity, peak=peak)
-
-    def _kept(self, alarms: list[Alarm]) -> tuple[Alarm, ...]:
-        """All active alarms and the latest closed ones."""
-        closed = [alarm for alarm in alarms if alarm.closed is not None]
-        surplus = {alarm.key for alarm in closed[: max(0, len(closed) - self.settings.kept_alarms)]}
-        return tuple(alarm for alarm in alarms if alarm.closed is None or alarm.key not in surplus)
-
-
-def _closed(alarm: Alarm, now: int) -> Alarm:
-    """Closed now, or when it was opened if a clock that was wrong then says that this is later."""
-    return replace(alarm, closed=max(now, alarm.opened))
+        ratio = np.exp(level - self._baseline(state))
+        return Drift(ratio - 1.0, ratio * np.sqrt(std**2 + state.changes.baseline_variance))
 
 
 def _proper(covariance: FloatArray) -> bool:

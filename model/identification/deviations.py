@@ -1,0 +1,71 @@
+"""What a system file states about measurements and loads, and how far it may be otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
+from sprung.model.system import System
+
+Kind = Literal["gain", "delay", "load"]
+
+
+@dataclass(frozen=True, slots=True)
+class Deviation:
+    """One thing that the system file states and that may be otherwise."""
+
+    name: str  # of the channel, or of the body
+    kind: Kind
+    std: float  # what the data sheet leaves open: relative, or s; of the logarithm of the mass for a load
+    group: int  # channels that share a clock have the same number; -1 for a load
+
+
+def deviations(system: System) -> tuple[Deviation, ...]:
+    """Gains of all channels, delays of all channels, loads of the bodies that carry passengers or goods."""
+    channels = system.channels
+    groups = clock_groups(system)
+    stated = system.tolerances
+    return (
+        *(Deviation(c.name, "gain", t.gain, g) for c, t, g in zip(channels, stated, groups, strict=True)),
+        *(Deviation(c.name, "delay", t.delay, g) for c, t, g in zip(channels, stated, groups, strict=True)),
+        *(Deviation(load.body, "load", load.std, -1) for load in system.loads),
+    )
+
+
+def clock_groups(system: System) -> IntArray:
+    """Channels of one message share its clock: the address up to its last part; shape (C,)."""
+    found: dict[str, int] = {}
+    groups = []
+    for channel in system.channels:
+        address = channel.mcap or channel.can
+        message = address.rpartition(".")[0] if address else f"\0{channel.unit}"
+        groups.append(found.setdefault(message, len(found)))
+    return np.array(groups, dtype=np.int64)
+
+
+def named(
+    deviations: Sequence[Deviation], values: FloatArray, std: FloatArray, chosen: BoolArray
+) -> tuple[MeasurementFault, ...]:
+    """Gains and delays as faults of channels; a delay that all channels of a clock share is one fault of them all."""
+    found = [
+        MeasurementFault(deviations[h].name, "gain", float(1 + values[h]), float(std[h]))
+        for h in np.flatnonzero(chosen)
+        if deviations[h].kind == "gain"
+    ]
+    group = np.array([d.group if d.kind == "delay" else -1 for d in deviations])
+    done = np.zeros(len(values), dtype=bool)
+    for h in np.flatnonzero(chosen & (group >= 0)):
+        if done[h]:
+            continue
+        members = group == group[h]
+        alike = members & (np.abs(values - values[h]) < np.maximum(0.3 * abs(values[h]), 3 * std[h]))
+        if not alike[members].all():
+            alike = np.arange(len(values)) == h
+        done |= alike
+        name = "|".join(deviations[i].name for i in np.flatnonzero(alike))
+        found.append(MeasurementFault(name, "delay", float(values[alike].mean()), float(std[h])))
+    return tuple(found)

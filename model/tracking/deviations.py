@@ -1,0 +1,220 @@
+"""Gains, delays and loads beside the parameters: what they are believed to be, and whether one has jumped.
+
+The belief itself is part of the filter's (levels, rates, deviations).  Here is what surrounds it: the sensitivities of
+the last windows, the deviations that the baseline was learned with, and a test for jumps.  The test sees only what a
+window says about deviations whatever the parameters are (these are profiled out), so a spring that changes does not
+speak for a sensor.  H deviations, V directions: each deviation alone, and one delay for all channels of a clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.identification.deviations import Deviation
+from sprung.model.signals import Deviating, FloatArray, IntArray
+from sprung.model.tracking.filter import Belief
+
+FORGETTING = 0.9  # of the evidence for a jump, per window that is weighed
+EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
+MOST = 5.0  # standard deviations that one window counts at most: two windows at least
+RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped
+RISING = 3.0  # log-likelihood ratio at which a jump is taken to have begun
+MEMORY = 0.3  # weight of the newest window in the mean sensitivities
+SETTLED = 600.0  # s of used windows in which the gains of the learning phase go on being refined
+GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock
+GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
+CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
+LOAD_WALK = 1e-3  # per sqrt(s), of a running vehicle: 1 % in two minutes
+OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
+NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
+JUMPED = {"gain": 0.005, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
+STOPPED = 5.0  # s without a used window after which passengers may have boarded
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Model:
+    """Constants: how deviations are distributed at first, how they wander, and in which directions they jump."""
+
+    kinds: tuple[str, ...]
+    prior: FloatArray  # covariance, shape (H, H)
+    walk: FloatArray  # covariance per second, shape (H, H)
+    directions: FloatArray  # shape (V, H)
+
+    @property
+    def size(self) -> int:
+        return len(self.kinds)
+
+    @property
+    def loads(self) -> FloatArray:
+        """True at loads, shape (H,)."""
+        return np.array([kind == "load" for kind in self.kinds], dtype=bool)
+
+
+def model_of(deviations: Sequence[Deviation]) -> Model:
+    """Delays of one clock share most of their variance; everything else is independent."""
+    H = len(deviations)
+    kinds = tuple(d.kind for d in deviations)
+    std = np.array([d.std for d in deviations], dtype=np.float64)
+    group = np.array([d.group for d in deviations], dtype=np.int64)
+    late = np.array([kind == "delay" for kind in kinds], dtype=bool)
+    gain = np.array([kind == "gain" for kind in kinds], dtype=bool)
+    together = late[:, None] & late[None, :] & (group[:, None] == group[None, :])
+    own = np.eye(H)
+    shared = np.where(together, GROUP_SHARE, 0.0) + own * np.where(late, 1 - GROUP_SHARE, 1.0)
+    walk = np.diag(np.where(gain, GAIN_WALK**2, np.where(late, OWN_WALK**2, LOAD_WALK**2))) + together * CLOCK_WALK**2
+    rows = [*own]
+    for number in np.unique(group[late]):
+        members = (late & (group == number)).astype(float)
+        if members.sum() > 1:
+            rows.append(members)
+    return Model(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What the tracker keeps about deviations beside the filter's belief."""
+
+    cross: FloatArray  # mean sensitivity of the log-ratios to the deviations, shape (P, H)
+    base_cross: FloatArray  # the same over the windows of the baseline, shape (P, H)
+    reference: FloatArray  # deviations while the baseline was learned, shape (H,)
+    moved: FloatArray  # 1 where a deviation has jumped since, shape (H,)
+    slope: FloatArray  # recent evidence for a jump along each direction, shape (V,)
+    curvature: FloatArray  # its information, shape (V,)
+    since: IntArray  # ns, when the evidence began to rise, shape (V,)
+    excess: FloatArray  # part of chi-square that known deviations explain, mean over windows, shape (1,)
+    recent: IntArray  # ns, the last windows that were weighed, shape (3,); 0: none
+
+
+def start(parameters: int, model: Model) -> Calibration:
+    H, V = model.size, len(model.directions)
+    zeros = np.zeros
+    return Calibration(
+        zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), zeros(V), zeros(V),
+        zeros(V, dtype=np.int64), zeros(1), zeros(3, dtype=np.int64),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Jump:
+    """A deviation that has jumped."""
+
+    direction: FloatArray  # shape (H,)
+    size: float
+    since: int  # ns
+    kind: str
+
+
+def weigh(
+    calibration: Calibration, model: Model, belief: Belief, found: Deviating, share: float, time: int
+) -> tuple[Calibration, Belief, Jump | None]:
+    """After a window that says something about deviations: belief, evidence for jumps, and one that is certain.
+
+    share: of the window that no earlier weighed window saw.
+    """
+    H = model.size
+    here = belief.mean[-H:]
+    P = belief.covariance[-H:, -H:]
+    M = found.information * share
+    u = (found.score - found.information @ (here - found.point)) * share
+    solved = np.linalg.solve(np.eye(H) + M @ P, np.column_stack([u, M]))
+    slope, curvature = solved[:, 0], 0.5 * (solved[:, 1:] + solved[:, 1:].T)
+    along = model.directions @ slope
+    information = np.einsum("vh,hj,vj->v", model.directions, curvature, model.directions).clip(1e-12)
+    largest = float(np.max(np.abs(along) / np.sqrt(information), initial=0.0))
+    bounded = min(1.0, MOST / max(largest, 1e-12))
+    calibration, jump = _judged(calibration, model, along, information, bounded, time)
+    if jump is not None:
+        belief = _loosened(belief, model, calibration.cross, jump)
+        P = belief.covariance[-H:, -H:]
+    elif bounded < 1.0:  # one window does not turn the belief over; several will, or a jump is found
+        M, u = M * bounded**2, u * bounded
+    if jump is not None or bounded < 1.0:
+        solved = np.linalg.solve(np.eye(H) + M @ P, np.column_stack([u, M]))
+        slope, curvature = solved[:, 0], 0.5 * (solved[:, 1:] + solved[:, 1:].T)
+    across = belief.covariance[:, -H:]
+    covariance = belief.covariance - across @ curvature @ across.T
+    covariance = 0.5 * (covariance + covariance.T)
+    belief = replace(belief, mean=belief.mean + across @ slope, covariance=covariance)
+    mixed = MEMORY if calibration.recent[-1] else 1.0
+    return (
+        replace(
+            calibration,
+            cross=calibration.cross + mixed * (found.cross - calibration.cross),
+            excess=calibration.excess + mixed * (explained(belief, found) - calibration.excess),
+            recent=np.append(calibration.recent[1:], time),
+        ),
+        belief,
+        jump,
+    )
+
+
+def explained(belief: Belief, found: Deviating) -> float:
+    """Part of a window's chi-square per degree of freedom that the believed deviations account for."""
+    off = belief.mean[-len(found.point) :] - found.point
+    return float(max(0.0, 2 * found.score @ off - off @ found.information @ off) / max(found.freedom, 1.0))
+
+
+def loaded(belief: Belief, model: Model, found: Deviating, share: float) -> Belief:
+    """Belief after a window that speaks of loads only."""
+    at = np.flatnonzero(model.loads)
+    rows = at + len(belief.mean) - model.size
+    M = found.information[np.ix_(at, at)] * share
+    off = belief.mean[rows] - found.point[at]
+    across = belief.covariance[:, rows]
+    gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([-M @ off, M]))
+    covariance = belief.covariance - across @ gain[:, 1:] @ across.T
+    return replace(belief, mean=belief.mean + across @ gain[:, 0], covariance=0.5 * (covariance + covariance.T))
+
+
+def _judged(
+    calibration: Calibration, model: Model, along: FloatArray, information: FloatArray, bounded: float, time: int
+) -> tuple[Calibration, Jump | None]:
+    """Evidence after a window whose scores count by `bounded`; a jump where there is enough."""
+    # Directions for which nothing speaks begin anew: what was quiet before must not outvote a jump.
+    old = calibration.slope
+    going = (old**2 > 2 * calibration.curvature * RESTART) & (np.sign(old) == np.sign(along))
+    keep = np.where(going, FORGETTING, 0.0)
+    slope = keep * old + along * bounded
+    curvature = keep * calibration.curvature + information
+    ratio = slope**2 / (2 * curvature)
+    before = calibration.slope**2 / (2 * np.maximum(calibration.curvature, 1e-12))
+    since = np.where((ratio >= RISING) & (before < RISING), time, calibration.since)
+    best = int(np.argmax(ratio)) if len(ratio) else -1
+    jump = None
+    if best >= 0 and ratio[best] >= EVIDENCE:
+        direction = model.directions[best]
+        kind = model.kinds[int(np.argmax(direction))]
+        size = slope[best] / curvature[best] if bounded == 1.0 else along[best] / information[best]
+        jump = Jump(direction, float(size), int(since[best]), kind)
+        slope, curvature = np.zeros_like(slope), np.zeros_like(curvature)
+    return replace(calibration, slope=slope, curvature=curvature, since=since), jump
+
+
+def _loosened(belief: Belief, model: Model, cross: FloatArray, jump: Jump) -> Belief:
+    """Belief after a jump was found: the deviation, and what the parameters took of it, are open again."""
+    H = model.size
+    open_ = np.zeros(len(belief.mean))
+    open_[-H:] = 2 * jump.size * jump.direction
+    taken = np.zeros(len(belief.mean))
+    taken[: belief.size] = cross @ jump.direction * jump.size
+    return replace(belief, covariance=belief.covariance + np.outer(open_, open_) + np.outer(taken, taken))
+
+
+def boarded(belief: Belief, model: Model) -> Belief:
+    """Belief after a stop: any load."""
+    covariance = belief.covariance.copy()
+    at = np.flatnonzero(model.loads) + len(belief.mean) - model.size
+    covariance[at, :] = covariance[:, at] = 0.0
+    covariance[at, at] = np.diag(model.prior)[model.loads]
+    return replace(belief, covariance=covariance)
+
+
+def unsure(belief: Belief, model: Model) -> Belief:
+    """Belief after a parameter was lost: it may have been a sensor, whose deviation is open to a third of its prior."""
+    H = model.size
+    covariance = belief.covariance.copy()
+    covariance[-H:, -H:] += model.prior / 9 * ~(model.loads[:, None] | model.loads[None, :])
+    return replace(belief, covariance=covariance)
