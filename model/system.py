@@ -290,7 +290,8 @@ class System:
             if source["kind"] == "support":
                 source["kind"] = "displacement"
         added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
-        added += [(body, "load") for body in keep["bodies"].values()]
+        for body in keep["bodies"].values():
+            body.pop("load", None)  # what varies from ride to ride does not make another vehicle
         for part, key in [*added, (keep, "speed")]:
             if part.get(key) is None:
                 part.pop(key, None)
@@ -365,9 +366,6 @@ def unsupported(file: SystemFile) -> list[str]:
             f"window: {seconds:g} s is too short to tell vehicle from track where no input is measured; "
             f"{least} samples at the least, a minute ({round(60 * file.sample_rate)}) is usual"
         )
-    for name, body in file.bodies.items():
-        if body.load is not None and not tracks:
-            found.append(f"bodies.{name}.load: a varying load is not supported by identification yet")
     if file.speed is not None and file.speed.value is None and not tracks:
         found.append("speed: a measured speed is not supported by identification yet; give a number in m/s")
     return found

@@ -27,6 +27,7 @@ TOGETHER = 32  # windows of one batch: more gain little and let the first one wa
 class _Asked:
     values: FloatArray  # shape (T, C)
     states: bool
+    start: int | None  # ns, of a window that will be tracked
     future: Future[Estimate] = field(default_factory=Future)
     since: float = field(default_factory=time.perf_counter)
 
@@ -51,9 +52,12 @@ class Batcher:
         """Windows that no batch has taken yet."""
         return len(self._waiting)
 
-    def submit(self, values: FloatArray, states: bool = False) -> Future[Estimate]:
-        """Queue a window, shape (T, C), without waiting.  Raises Busy when too many wait."""
-        asked = _Asked(values, states)
+    def submit(self, values: FloatArray, states: bool = False, start: int | None = None) -> Future[Estimate]:
+        """Queue a window, shape (T, C), without waiting.  Raises Busy when too many wait.
+
+        start: ns, of a window that will be tracked (see `Engine.identify`).
+        """
+        asked = _Asked(values, states, start)
         with self._lock:
             if len(self._waiting) >= self._limit:
                 raise Busy("the numerics are busy; try again in a second")
@@ -75,7 +79,9 @@ class Batcher:
         for asked in wanted:
             self._observe({"queue": now - asked.since})
         for states in (False, True):
-            self._answer([asked for asked in wanted if asked.states is states], states)
+            for tracked in (False, True):
+                alike = [a for a in wanted if a.states is states and (a.start is not None) is tracked]
+                self._answer(alike, states)
 
     def _call_again(self) -> None:
         try:
@@ -91,7 +97,11 @@ class Batcher:
         if not batch:
             return
         try:
-            estimates, seconds = self._engine.identify(np.stack([asked.values for asked in batch]), states=states)
+            estimates, seconds = self._engine.identify(
+                np.stack([asked.values for asked in batch]),
+                states=states,
+                starts=None if states or batch[0].start is None else [asked.start or 0 for asked in batch],
+            )
         except BaseException as error:
             if len(batch) == 1:
                 batch[0].future.set_exception(error)

@@ -149,7 +149,8 @@ class Pipeline:
         if not whole:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
-        estimates, seconds = self._compute.run(lambda: self.engine.identify(values), priority)
+        starts = [w.start for w in windows if w.outcome != "dropped"]
+        estimates, seconds = self._compute.run(lambda: self.engine.identify(values, starts=starts), priority)
         found = iter(estimates)
         return [None if w.outcome == "dropped" else next(found) for w in windows], seconds
 

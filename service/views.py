@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from sprung.model.signals import FloatArray
+from sprung.model.signals import FloatArray, MeasurementFault
 from sprung.model.tracking.tracker import KNOWN, Alarm, TrackerState
 from sprung.service.engine import Engine
 from sprung.service.store.fleet import AlarmRow
@@ -79,6 +79,8 @@ class VehicleView:
     last: WindowRecord | None
     last_window_ns: int | None
     per_sensor: Mapping[str, float]  # nrmse of the newest window, absent sensors left out
+    sensors: tuple[MeasurementFault, ...] = ()  # what was found wrong with measurements
+    load: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # kg beside the empty mass, std, by body
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -131,6 +133,17 @@ class VehicleView:
             "fit": None if solved is None else fit_dict(solved.nrmse, self.per_sensor),
             "parameters": [p.as_dict() for p in self.parameters],
             "alarms": [alarm_dict(alarm) for alarm in self.active],
+            **self.measurements(),
+        }
+
+    def measurements(self) -> dict[str, Any]:
+        """What was found wrong with measurements, and the loads."""
+        return {
+            "sensors": [
+                {"channel": f.channel, "kind": f.kind, "value": finite(f.value), "std": finite(f.std)}
+                for f in self.sensors
+            ],
+            "load": {body: list(pair) for body, pair in self.load.items()},
         }
 
 
@@ -165,7 +178,26 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         last,
         state.time,
         per_sensor,
+        engine.tracker.sensors(state),
+        _loads(engine, state),
     )
+
+
+def _loads(engine: Engine, state: TrackerState) -> dict[str, tuple[float, float]]:
+    """(kg, standard deviation) of what every loaded body carries, by body."""
+    empty = {load.body: load.empty for load in engine.system.loads}
+    known = engine.tracker.loads(state)
+    return {b: (empty[b] * math.expm1(x), empty[b] * math.exp(x) * s) for b, (x, s) in known.items()}
+
+
+def load_parameters(engine: Engine, view: VehicleView) -> list[dict[str, Any]]:
+    """Loads that the system file names, as parameters beside those of the elements."""
+    return [
+        {"name": load.name, "value": view.load[load.body][0], "std": view.load[load.body][1], "unit": "kg"}
+        | {"nominal": 0.0, "ratio": None, "identifiable": True}
+        for load in engine.system.loads
+        if load.declared and load.body in view.load
+    ]
 
 
 def _letter(p: ParameterView) -> str:
@@ -205,6 +237,10 @@ def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
         "std": finite(alarm.std),
         "severity": alarm.severity,
     }
+    if isinstance(alarm, Alarm) and alarm.alternatives:
+        found["alternatives"] = list(alarm.alternatives)
+    if alarm.kind == "sensor":
+        found["channel"], _, found["fault"] = (alarm.parameter or "").rpartition(".")
     if isinstance(alarm, AlarmRow):
         found |= {
             "report": alarm.report_id,

@@ -10,6 +10,7 @@ import numpy as np
 
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier
+from sprung.model.identification.deviations import deviations
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.faults import Explainer, fit_limit
@@ -76,7 +77,7 @@ class Identifier:
         if len(bad):
             for b, found in self._explainer(windows.shape[1]).explain(windows, bad).items():
                 (mended,) = self._estimates(found.refined, False, found.point)
-                estimates[b] = replace(mended, faults=found.faults)
+                estimates[b] = replace(self._averaged(mended), faults=found.faults)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
         return estimates
 
@@ -86,6 +87,11 @@ class Identifier:
         deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
         return _estimates(refined, P, states, deviating)
 
+    def examine(self, windows: FloatArray, weigh: BoolArray) -> list[Estimate]:
+        """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
+        delays, and a wrong measurement is looked for where windows do not fit."""
+        return self.identify(windows, weigh=weigh, explain=True)
+
     def _asks(self, estimate: Estimate, samples: int) -> bool:
         """Whether a window should be explained: it does not fit, or fits better elsewhere by far."""
         if not estimate.informative:
@@ -94,6 +100,22 @@ class Identifier:
         if estimate.adequate and found is not None and found.whole:
             return self._explainer(samples).apart(found.score, found.information)
         return not estimate.adequate
+
+    def _averaged(self, estimate: Estimate) -> Estimate:
+        """A mended window with what is left open of its deviations in the values and their covariance."""
+        found = estimate.deviating
+        if found is None:
+            return estimate
+        prior = np.array([d.std for d in deviations(self.system)])
+        spread = np.linalg.inv(found.information + np.diag(1 / prior**2))
+        shift = spread @ found.score
+        moved = np.where(estimate.identifiable, found.cross @ shift, 0.0)
+        return replace(
+            estimate,
+            log_ratio=estimate.log_ratio + moved,
+            covariance=estimate.covariance + found.cross @ spread @ found.cross.T,
+            deviating=replace(found, point=found.point + shift, score=found.score - found.information @ shift),
+        )
 
     def _explainer(self, samples: int) -> Explainer:
         if samples not in self._explainers:

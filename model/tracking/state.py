@@ -154,7 +154,6 @@ def _coverage(data: Mapping[str, Any]) -> Coverage:
     return Coverage(**data["coverage"]) if "coverage" in data else Coverage(data["used"], 1.0)
 
 
-def _belief(mean: FloatArray, covariance: FloatArray) -> Belief:
 def _belief(data: Mapping[str, Any]) -> Belief:
     arrays = _unpack_all(data["belief"])
     mean, covariance = arrays["mean"], arrays["covariance"]

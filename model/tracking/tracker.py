@@ -439,9 +439,9 @@ class Tracker:
         """Sensitivities of the baseline's windows, and the deviations that it was learned with."""
         if not self.model.size:
             return calibration
-        gained = np.where(
-            tested.weight > 0, (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300), 0
-        )
+        first = state.changes.learned < self.settings.learning  # what refines a baseline later is taken out before
+        more = (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300)
+        gained = np.where(first & (tested.weight > 0), more, 0.0)
         base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
         reference = calibration.reference
         if (state.used + 1) * self.settings.hop < dev.SETTLED:

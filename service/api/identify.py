@@ -52,7 +52,7 @@ async def identify(
     now = now_ns()
     start = start_of(head, now)
     try:
-        estimate = await asyncio.wrap_future(core.batcher.submit(values, states))
+        estimate = await asyncio.wrap_future(core.batcher.submit(values, states, (start or now) if track else None))
     except UnusableWindow as error:
         raise Problem(422, str(error)) from error
     answer = _answer(engine, head.vehicle, estimate)

@@ -22,7 +22,7 @@ from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import AHEAD, now_ns, to_iso
-from sprung.service.views import VehicleView, alarm_dict, vehicle_view, window_dict
+from sprung.service.views import VehicleView, alarm_dict, load_parameters, vehicle_view, window_dict
 
 
 def run(
@@ -151,9 +151,10 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
         "frames": fed.tally.as_dict(),
         "samples": {"expected": fed.expected, "lost": fed.lost},
         "problems": fed.problems[:20],
-        "parameters": [p.as_dict() for p in view.parameters],
+        "parameters": [p.as_dict() for p in view.parameters] + load_parameters(pipeline.engine, view),
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
         "comfort": comfort_dict(pipeline, fed),
+        **view.measurements(),
         "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
         "wall_seconds": round(fed.wall_seconds, 3),
     }

@@ -1,0 +1,185 @@
+"""Gains, delays, loads and broken sensors: what windows say of them, and that no spring is blamed for them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.interpolate import make_interp_spline
+from tracker_windows import EPOCH
+
+from sprung.model.identification.deviations import clock_groups, deviations
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.refine import Refiner
+from sprung.model.system import MANCHESTER, load_system, parse_system
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
+
+HOP = 500_000_000
+BOGIE = [20, 21, 22, 23]  # columns of the accelerometers of bogie 1
+
+
+@pytest.fixture(scope="module")
+def system():
+    return load_system()
+
+
+@pytest.fixture(scope="module")
+def identifier(system):
+    return load_identifier(system)
+
+
+def record(seconds, seed, load=0.0, truth=None):
+    """Clean samples (T, C) of running, the car heavier by `load`."""
+    system = load_system()
+    mechanics = system.mechanics
+    heavier = mechanics.mass * np.where(mechanics.body_of_dof == 0, 1 + load, 1)
+    system.__dict__["mechanics"] = replace(mechanics, mass=heavier)
+    values = np.zeros((1, 24)) if truth is None else truth[None]
+    return simulate_runs(system, values, int(100 * seconds), np.random.default_rng(seed)).clean[0]
+
+
+def late(samples, columns, delay):
+    out, time = samples.copy(), np.arange(len(samples)) / 100
+    for c in columns:
+        out[:, c] = make_interp_spline(time, samples[:, c], k=5)(np.clip(time - delay, 0, time[-1]))
+    return out
+
+
+def noisy(system, samples, seed=0):
+    noise = np.array([channel.noise for channel in system.channels])
+    return samples + noise * np.random.default_rng(seed).standard_normal(samples.shape)
+
+
+def windows(system, samples, seed=0, hop=50):
+    values = noisy(system, samples, seed)
+    return np.stack([values[i : i + 100] for i in range(0, len(values) - 99, hop)])
+
+
+def tracked(system, identifier, samples, seed=0):
+    """Tracker and state after overlapping windows, one of three weighed."""
+    values = windows(system, samples, seed)
+    estimates = identifier.examine(values, np.arange(len(values)) % 3 == 0)
+    tracker = Tracker(system.parameters, TrackerSettings(), deviations(system))
+    state = tracker.initial_state()
+    for k, estimate in enumerate(estimates):
+        state = tracker.update(state, estimate, EPOCH + k * HOP)
+    return tracker, state
+
+
+def after(first, second, seconds):
+    return np.concatenate([first[: int(100 * seconds)], second[int(100 * seconds) :]])
+
+
+def test_every_channel_may_deviate_and_channels_of_one_message_share_a_clock(system):
+    found = deviations(system)
+    assert [d.kind for d in found].count("gain") == [d.kind for d in found].count("delay") == 28
+    assert found[-1].name == "car" and found[-1].kind == "load"
+    groups = clock_groups(system)
+    assert len(set(groups[BOGIE])) == 1 and len(set(groups)) == 7
+
+
+def test_the_estimate_moves_with_a_gain_as_the_sensitivities_say(system):
+    refiner = Refiner(system)
+    runs = windows(system, record(4, 1), hop=100)
+    everything = np.ones(len(runs), dtype=bool)
+    here = refiner.refine(runs, weigh=everything)
+    for column, change in ((20, 0.002), (16, 0.002), (0, 0.002)):
+        moved = runs.copy()
+        moved[:, :, column] *= 1 + change
+        there = refiner.refine(moved, here.log_ratio, weigh=everything)
+        std = np.sqrt(np.diagonal(here.covariance, axis1=1, axis2=2))
+        wrong = (there.log_ratio - here.log_ratio + here.cross[:, :, column] * change) / std
+        assert np.abs(wrong).max() < 0.1
+
+
+def test_what_a_window_says_of_deviations_is_as_uncertain_as_stated(system):
+    refined = Refiner(system).refine(windows(system, record(40, 2), hop=100), weigh=np.ones(40, dtype=bool))
+    z = refined.score / np.sqrt(np.einsum("bhh->bh", refined.information))
+    assert 0.9 < np.sqrt(np.mean(z**2)) < 1.1
+
+
+def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_claimed_to_be_known(system):
+    refined = Refiner(system).refine(windows(system, record(4, 3), hop=100), weigh=np.ones(4, dtype=bool))
+    for part in (slice(0, 28), slice(28, 56)):
+        common = np.zeros(57)
+        common[part] = 1.0
+        assert np.abs(common @ refined.information @ common).max() < 1e-3 * np.abs(refined.information).max()
+
+
+@pytest.mark.parametrize(
+    ("change", "channel", "kind"),
+    [
+        (lambda x: x * np.where(np.arange(28) == 20, 1.1, 1), "bogie1_1l", "gain"),
+        (lambda x: x * np.where(np.arange(28) == 0, 1.2, 1), "wheel_11l.displacement", "gain"),
+        (lambda x: late(x, BOGIE, 0.003), "bogie1_1l|bogie1_1r|bogie1_2l|bogie1_2r", "delay"),
+        (lambda x: late(x, [20], 0.01), "bogie1_1l", "delay"),
+        (lambda x: x * np.where(np.arange(28) == 17, -1, 1), "car_1r", "inverted"),
+        (lambda x: x[:, [*range(20), 21, 20, *range(22, 28)]], "bogie1_1l|bogie1_1r", "swapped"),
+    ],
+)
+def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(system, identifier, change, channel, kind):
+    values = windows(system, change(record(6, 4)), hop=100)[1:5]
+    found = identifier.examine(values, np.zeros(len(values), dtype=bool))
+    named = [{(f.channel, f.kind) for f in e.faults} for e in found]
+    assert sum((channel, kind) in faults for faults in named) >= 3
+    for estimate in found:
+        z = estimate.log_ratio / np.sqrt(np.diag(estimate.covariance))
+        assert not estimate.adequate or np.sqrt(np.mean(z**2)) < 1.6
+
+
+@pytest.mark.parametrize("kind", ["frozen", "saturated"])
+def test_a_stuck_sensor_is_named_and_the_window_used_without_it(system, identifier, kind):
+    values = windows(system, record(6, 5), hop=100)[1:5]
+    most = 1.1 * values[:, :, 21].std()
+    values[:, :, 21] = values[:, :1, 21] if kind == "frozen" else np.clip(values[:, :, 21], -most, most)
+    for estimate in identifier.examine(values, np.zeros(4, dtype=bool)):
+        if kind == "frozen" or not estimate.adequate or estimate.faults:
+            assert [(f.channel, f.kind) for f in estimate.faults] == [("bogie1_1r", kind)]
+            assert estimate.adequate
+
+
+@pytest.mark.parametrize("gain", [0.02, 0.05, 0.1])
+def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(system, identifier, gain):
+    healthy = record(70, 6)
+    wrong = healthy * np.where(np.arange(28) == 20, 1 + gain, 1)
+    tracker, state = tracked(system, identifier, after(healthy, wrong, 40))
+    assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "bogie1_1l.gain")]
+    (fault,) = tracker.sensors(state)
+    assert (fault.channel, fault.kind) == ("bogie1_1l", "gain")
+    assert fault.value == pytest.approx(1 + gain, abs=4 * fault.std)
+    mean, std = tracker.posterior(state)
+    assert np.abs(mean / std).max() < 3.5
+
+
+@pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
+def test_passengers_change_the_load_and_no_spring(system, identifier, load):
+    tracker, state = tracked(system, identifier, record(40, 7, load))
+    assert state.alarms == ()
+    assert tracker.sensors(state) == ()
+    value, std = tracker.loads(state)["car"]
+    assert abs(value - np.log1p(load)) < min(0.02, 4 * std)
+    mean, spread = tracker.posterior(state)
+    assert np.abs(mean / spread).max() < 3.5
+
+
+def test_a_true_change_is_the_elements_and_all_dampers_together_are_one_message(system, identifier):
+    one, every = np.zeros(24), np.zeros(24)
+    one[8] = np.log(0.92)
+    every[12:] = np.log(0.88)
+    for truth, name in ((one, "secondary_1l.stiffness"), (every, "*.damping")):
+        samples = after(record(60, 8), record(60, 9, truth=truth), 38)
+        tracker, state = tracked(system, identifier, samples)
+        assert [(a.kind, a.parameter) for a in state.alarms] == [("change", name)]
+        assert tracker.sensors(state) == ()
+        again = TrackerState.from_dict(state.to_dict())
+        assert np.array_equal(again.belief.covariance, state.belief.covariance)
+        assert np.array_equal(again.calibration.cross, state.calibration.cross)
+
+
+def test_a_declared_load_leaves_the_weights_usable():
+    text = MANCHESTER.read_text()
+
+    loaded = parse_system(text.replace("position: [0.0, 0.0]}", "position: [0.0, 0.0], load: true}", 1))
+    assert loaded.loads[0].declared
+    assert loaded.loads[0].name == "car.load"
+    assert loaded.digest == load_system().digest
