@@ -132,6 +132,8 @@ class Attribution:
         if not self.deviations:
             return ()
         calibration = state.calibration
+        if calibration.recent[-1] == 0:  # estimates that never speak of deviations
+            return ()
         if calibration.recent[0] < since and (now - since) * 1e-9 < PATIENCE:
             return None
         moved = np.log1p(drift.change[i])
