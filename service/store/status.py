@@ -107,7 +107,7 @@ def save_status(
         "revision": revision,
         "health": _worse(status.health, "maintenance_required" if earlier else "ok"),
         "earlier": earlier,
-        "received_ns": now if counts or old is None else old.received_ns,
+        "received_ns": now if old is None or any(counts.values()) else old.received_ns,
     }
     values |= _urgency(connection, vehicle, values["health"])
     upsert(connection, table, [values], key=("vehicle_id",))
