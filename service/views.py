@@ -227,7 +227,7 @@ def fit_dict(nrmse: float, per_sensor: Mapping[str, float]) -> dict[str, Any]:
 
 def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
     """JSON of one alarm."""
-    found = {
+    found: dict[str, Any] = {
         "parameter": alarm.parameter,
         "kind": alarm.kind,
         "onset": to_iso(alarm.onset),

@@ -57,12 +57,12 @@ def named(
     """Gains and delays as faults of channels; a delay that all channels of a clock share is one fault of them all."""
     found = [
         MeasurementFault(deviations[h].name, "gain", float(1 + values[h]), float(std[h]))
-        for h in np.flatnonzero(chosen)
+        for h in np.flatnonzero(chosen).tolist()
         if deviations[h].kind == "gain"
     ]
     group = np.array([d.group if d.kind == "delay" else -1 for d in deviations])
     done = np.zeros(len(values), dtype=bool)
-    for h in np.flatnonzero(chosen & (group >= 0)):
+    for h in np.flatnonzero(chosen & (group >= 0)).tolist():
         if done[h]:
             continue
         members = group == group[h]
@@ -70,6 +70,6 @@ def named(
         if not alike[members].all():
             alike = np.arange(len(values)) == h
         done |= alike
-        name = "|".join(deviations[i].name for i in np.flatnonzero(alike))
+        name = "|".join(deviations[i].name for i in np.flatnonzero(alike).tolist())
         found.append(MeasurementFault(name, "delay", float(values[alike].mean()), float(std[h])))
     return tuple(found)

@@ -275,7 +275,7 @@ class Explainer:
         """Weighted squares at the nominal values with the best initial state, (B,)."""
         refiner = self.refiner(self.samples)
         model = refiner.model
-        present = ~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0)
+        present: BoolArray = np.asarray(~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0))
         with torch.no_grad():
             data = model.batch(model.knots(windows), windows, present)
             nominal = torch.zeros(1, len(self.system.parameters), dtype=torch.float64)

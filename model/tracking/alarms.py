@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import FloatArray, IntArray
+from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.deviations import Jump, Model
 from sprung.model.tracking.settings import TrackerSettings
@@ -90,7 +90,7 @@ class Attribution:
         """Opens alarms of parameters whose test has left the baseline."""
         alarmed = {alarm.parameter for alarm in alarms if alarm.closed is None and alarm.kind == "change"}
         out = list(alarms)
-        for i in np.flatnonzero(state.changes.active):
+        for i in np.flatnonzero(state.changes.active).tolist():
             together = f"*.{self.kinds[i]}"
             members = self._of_kind(self.kinds[i])
             if self.names[i] in alarmed or (together in alarmed and self._moves_along(i, drift, members)):
@@ -216,13 +216,13 @@ def _common(drift: Drift, members: IntArray) -> tuple[float, float]:
     return float(np.nanmedian(change)), float(1.25 * np.sqrt(np.nanmean(std**2) / len(members)))
 
 
-def counted(stuck: Sequence[Stuck], said: Sequence[tuple[str, str, float]], time: int) -> tuple[Stuck, ...]:
+def counted(stuck: Sequence[Stuck], said: Sequence[tuple[str, FaultKind, float]], time: int) -> tuple[Stuck, ...]:
     """Counts of frozen, saturated, reversed and exchanged channels after a window that said so of some."""
     old = {(s.channel, s.kind): s for s in stuck}
-    now = {(channel, kind): value for channel, kind, value in said if kind in HARD}
+    now: dict[tuple[str, FaultKind], float] = {(channel, kind): value for channel, kind, value in said if kind in HARD}
     out = []
-    for key in {**old, **now}:
-        s = old.get(key) or Stuck(*key, now[key], 0, time)
+    for key in dict.fromkeys([*old, *now]):
+        s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time)
         count = min(s.count + 1, 2 * WINDOWS) if key in now else s.count - 1
         if count > 0:
             out.append(replace(s, count=count, value=now.get(key, s.value)))

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import Deviating, FloatArray, IntArray
+from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
 
 FORGETTING = 0.9  # of the evidence for a jump, per window that is weighed
@@ -48,7 +48,7 @@ class Model:
         return len(self.kinds)
 
     @property
-    def loads(self) -> FloatArray:
+    def loads(self) -> BoolArray:
         """True at loads, shape (H,)."""
         return np.array([kind == "load" for kind in self.kinds], dtype=bool)
 
@@ -154,7 +154,8 @@ def weigh(
 def explained(belief: Belief, found: Deviating) -> float:
     """Part of a window's chi-square per degree of freedom that the believed deviations account for."""
     off = belief.mean[-len(found.point) :] - found.point
-    return float(max(0.0, 2 * found.score @ off - off @ found.information @ off) / max(found.freedom, 1.0))
+    gained = float(2 * found.score @ off - off @ found.information @ off)
+    return max(0.0, gained) / max(found.freedom, 1.0)
 
 
 def loaded(belief: Belief, model: Model, found: Deviating, share: float) -> Belief:

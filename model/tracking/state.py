@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sprung.model.signals import FloatArray, IntArray
+from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
@@ -58,7 +58,7 @@ class Stuck:
     """A channel that windows found frozen, saturated, reversed or exchanged."""
 
     channel: str
-    kind: str
+    kind: FaultKind
     value: float
     count: int  # windows that said so, less those that did not; bounded
     since: int  # ns

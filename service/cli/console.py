@@ -116,8 +116,8 @@ def parameter_table(view: VehicleView, width: int = 120) -> Table:
             "drift": percent(p.drift),
             "state": _state(p.alarm, told, p.drift),
         }
-        style = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
-        table.add_row(*(cells[name] for name in shown), style=style)
+        colour = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
+        table.add_row(*(cells[name] for name in shown), style=colour)
     return table
 
 

@@ -86,7 +86,7 @@ def _model(settings: Settings) -> Iterator[Finding]:
     system = load_system(settings.system) if settings.system is not None else load_system()
     identifier = load_identifier(system, settings.weights)
     parameters = f"{len(system.parameters)} parameters"
-    if identifier.estimator is None:
+    if getattr(identifier, "estimator", None) is None:
         text = f"{system.name}, {parameters}; no trained estimator: identified from the nominal values, which is slower"
         yield Finding("warning", "model", text)
     else:
