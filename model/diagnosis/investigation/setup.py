@@ -34,6 +34,7 @@ class SetupRules:
     strange: float = 4e-3  # misfit of a sensor from which a set-up is suspected: vehicles fitted well have 1e-3
     promising: float = 0.85  # of the present misfit that a hypothesis may leave, by spectra, to be fitted
     tried: int = 5  # hypotheses that are fitted
+    beside: int = 2  # faults of single sensors that are fitted beside them
     explains: float = 0.3  # of the misfit that one may leave, once fitted, to be accepted
     latest: float = 0.5  # s, of a node
     scale: float = 1.3  # ratio from which a scale is wrong: less is a sensor's gain
@@ -43,6 +44,7 @@ class SetupRules:
 
 
 RULES = SetupRules()
+ORDINARY = ("sensor_gain", "sensor_lag")  # that screening seeks; they only have to be beaten
 _EDGE = 5  # samples beside a cut that a shift between samples spoils
 _STEPS = 4  # of a delay
 _ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
@@ -130,7 +132,11 @@ def _best(
             share = replace(hypothesis, left=hypothesis.left / one.total)
             if share.left < RULES.promising and (key not in promising or share.left < promising[key].left):
                 promising[key] = share
-    ranked = sorted(promising.values(), key=lambda h: h.left)[: RULES.tried]
+    by_left = sorted(promising.values(), key=lambda h: h.left)
+    ranked = [h for h in by_left if h.effect not in ORDINARY][: RULES.tried]
+    if not ranked:
+        return None
+    ranked += [h for h in by_left if h.effect in ORDINARY][: RULES.beside]
     total, best = float(np.sum(present)), None
     for hypothesis in ranked:
         changed, mended = hypothesis.undo(system, signals)
@@ -145,7 +151,9 @@ def _best(
                 hypothesis.effect, hypothesis.location, hypothesis.value, std, total, left, hypothesis.axis
             )
             best = fault, changed, mended, other, again
-    return best if best is None else _sharpened(best, declared, fitted_samples(signals, best[2], split))
+    if best is None or best[0].effect in ORDINARY:
+        return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
+    return _sharpened(best, declared, fitted_samples(signals, best[2], split))
 
 
 def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
@@ -230,6 +238,21 @@ class Shown:
         yield from self._exchanges(system, signals)
         yield from self._nodes(system, signals)
         yield from self._positions(system, signals)
+        yield from self._ordinary(signals)
+
+    def _ordinary(self, signals: Signals) -> Iterator[Hypothesis]:
+        """Gain and lag of single sensors: no faults of a set-up, but what a position may be mistaken for."""
+        shown, own = self.sensors, _relative(self.measured - self.sensors, self.measured)
+        for i, name in enumerate(signals.sensor_names):
+            ratio, late = self.ratio([i]), self.late([i], 0.0)
+            turned = np.exp(-1j * self.omega * late)
+            for effect, value, answer, undo in (
+                ("sensor_gain", ratio, ratio * shown[:, [i]], _scale_sensors([i], ratio)),
+                ("sensor_lag", late, turned[:, None] * shown[:, [i]], _advance_sensors([i], late)),
+            ):
+                alone = _relative(self.measured[:, [i]] - answer, self.measured[:, [i]])[0]
+                if ratio > 0 and abs(late) < RULES.latest:
+                    yield Hypothesis(effect, name, value, float(np.sum(own) - own[i] + alone), undo)
 
     def _signs(self, signals: Signals) -> Iterator[Hypothesis]:
         shown, own = self.sensors, _relative(self.measured - self.sensors, self.measured)
