@@ -11,6 +11,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report
+from sprung.model.laws import ElementLaw
 from sprung.model.system import System, parse_system
 
 _NOISE = "sensor_noise"  # written as the channel's noise, not as a law
@@ -81,10 +82,14 @@ def _place(file: Any, system: System, law: IdentifiedLaw) -> None:
     if entry is None:
         return
     values = CommentedMap()
-    for parameter in law.parameters:
+    known = next((one for one in system.catalogue if one.name == law.effect), None)
+    corner = known.corner if isinstance(known, ElementLaw) else None
+    for index, parameter in enumerate(law.parameters):
         setting = CommentedMap(value=_rounded(parameter.value))
         if parameter.std > 0:
             setting["std"] = float(f"{parameter.std:.3g}")
+        if index == corner:  # a minute of running tells the width of friction's corner, a window does not
+            setting["fixed"] = True
         setting.fa.set_flow_style()
         values[parameter.name] = setting
     if law.variant and law.variant != "wider":

@@ -67,6 +67,7 @@ def test_values_laws_and_noise_are_written_and_comments_stay() -> None:
     assert again.file.elements["strut"].stiffness.value == 20123.5
     assert [law.law.name for law in again.laws] == ["coulomb_friction", "sensor_bias"]
     assert again.laws[0].values == (41.2346, 0.02) and again.laws[0].std == (0.512, 0.001)
+    assert again.laws[0].fixed == (False, True)  # the corner's width is not for single windows
     assert again.file.sensors["car_a"].noise == 0.0123
     assert again.file.inputs["road"].velocity.noise == 6e-4
     assert again.file.elements["tyre"].damping.fixed

@@ -39,7 +39,7 @@ from sprung.model.schema import ForceInput
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System
 
-OVERSAMPLING = 4
+OVERSAMPLING = 16
 ROUNDS = 8  # of motion and forces
 PROFILES = 4  # of the laws' values
 _SETTLED = 0.3  # rms change of a force's effect on the sensors, in their noise, at which rounds end
