@@ -30,6 +30,8 @@ from sprung.model.signals import FloatArray
 from sprung.model.simulate.fusion import fused_shares
 from sprung.model.simulate.linear import knot_columns
 
+_ROUNDING = 1e-6  # of sums in single precision, relative
+
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
@@ -101,9 +103,12 @@ class Calibration:
             common = torch.zeros(len(self.deviations), 1, dtype=information.dtype)
             common[part] = 1.0
             along = information @ common  # (B, H, 1)
-            size = (common.mT @ along).clamp_min(1e-300)
-            score = score - (along * (score.unsqueeze(1) @ common) / size).squeeze(2)
-            information = information - along @ along.mT / size
+            size = common.mT @ along  # (B, 1, 1)
+            # Below single precision's rounding the direction is empty already, and dividing by it would fill it.
+            rounding = _ROUNDING * torch.diagonal(information, dim1=1, dim2=2)[:, part].sum(dim=1)[:, None, None]
+            share = torch.where(size > rounding, 1 / size.clamp_min(1e-300), torch.zeros_like(size))
+            score = score - (along * (score.unsqueeze(1) @ common) * share).squeeze(2)
+            information = information - along @ along.mT * share
         return information, score
 
     def _columns(self, at: Linearisation, after: Chord, data: WindowBatch) -> tuple[Tensor, Tensor | None]:
