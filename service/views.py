@@ -149,7 +149,7 @@ class VehicleView:
 
 def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: WindowRecord | None) -> VehicleView:
     """The view of a vehicle after its newest window."""
-    alarmed = {alarm.parameter: alarm.severity for alarm in state.active}
+    alarmed = {alarm.parameter: alarm.severity for alarm in state.active}  # "*.damping": of all dampers together
     reports = engine.tracker.report(state)
     parameters = tuple(
         ParameterView(
@@ -164,7 +164,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
             r.baseline,
             r.drift,
             r.drift_std,
-            alarmed.get(r.name),
+            alarmed.get(r.name) or (alarmed.get(f"*.{p.quantity}") if r.baseline is not None else None),
         )
         for r, p in zip(reports, engine.system.tracked, strict=True)
     )

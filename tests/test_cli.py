@@ -113,7 +113,7 @@ def test_a_changed_vehicle_is_exit_status_one_with_its_alarms(
     path = write(tmp_path / "worn.csv", system, lambda row: 0.2 if row >= 3500 else 0.0, range(6000))
     assert main(["replay", str(path), "--system", str(csv_system), "--json"]) == 1
     alarms = lines(capsys.readouterr().out)[-1]["summary"]["alarms"]
-    assert {a["parameter"] for a in alarms} == {p.name for p in system.parameters}
+    assert {a["parameter"] for a in alarms} == {"*.stiffness", "*.damping"}  # all at once is one message a kind
     for alarm in alarms:
         assert set(alarm) >= {"parameter", "onset", "change", "std", "severity"}
         assert alarm["onset"].startswith("2026-09-21T14:13:5")

@@ -102,7 +102,7 @@ def test_a_table_without_times_is_looked_at_by_samples_and_likely_times_are_name
 def test_the_command_prints_a_table_remarks_and_json(ride, capfd):
     assert main(["inspect", str(ride)]) == 0
     out, err = capfd.readouterr()
-    assert "ride.csv: 59.99 s, times count from 0" in out
+    assert "ride.csv: 59.99 s, times count from 0" in out.replace("\n", "")
     assert "Turned [g]: is Accel [g] with the other sign" in out
     assert "Weg mm: stands still from 0 to 9.99 s" in out
     assert "off: always 0" in out

@@ -288,6 +288,8 @@ class WindowModel:
 
     def spectra(self, signals: Tensor) -> Tensor:
         """Bins within the band of signals (B, T, ...), (B, F, ...)."""
+        if signals.numel() == 0:  # no redundant sensor: a transform of nothing is an error
+            return signals.new_zeros((len(signals), self.bins, *signals.shape[2:]), dtype=self.frequency.jw.dtype)
         return torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
 
     def _signals(self, data: WindowBatch) -> Tensor:

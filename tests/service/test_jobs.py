@@ -175,7 +175,7 @@ def test_a_running_diagnosis_is_cancelled_over_http_and_does_not_hold_up_a_stop(
         job = ask_for(client, "endless.mcap")
         eventually(lambda: stored(core.store, job).progress > 0)
         answer = client.delete(f"/jobs/{job}").json()
-        assert (answer["state"], answer["error"]) == ("failed", "cancelled by a user")
+        assert (answer["state"], answer["error"]) == ("failed", "cancelled by local")
         assert client.delete("/jobs/nothing").status_code == 404
         second = ask_for(client, "endless too.mcap")
         eventually(lambda: stored(core.store, second).progress > 0)

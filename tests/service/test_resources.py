@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sqlite3
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -67,7 +68,11 @@ def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.
 def test_what_is_lacking_is_told_as_what_it_is(
     client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch, error: Exception, status: int
 ) -> None:
-    def broken(*_: Any, **__: Any) -> None:
+    reading = core.store.read
+
+    def broken(*_: Any, **__: Any) -> Any:
+        if threading.current_thread().name.startswith("sprung-"):  # housekeeping and jobs go on as they were
+            return reading()
         raise error
 
     monkeypatch.setattr(core.store, "read", broken)
