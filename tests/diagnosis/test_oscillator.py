@@ -137,7 +137,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
 
 
 @pytest.mark.xfail(
-    reason="found in its place, but read as a damper that saturates (blow-off to 0.02 +- 0.03): friction's fit stops short"
+    reason="found in its place, but read as a damper that saturates (blow-off to 0.02): friction's own fit stops short"
 )
 def test_friction_shows_in_a_free_decay_without_any_input():
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
