@@ -47,10 +47,10 @@ def compare(measured: Path, other: Path, system: System, dbc: Path | None) -> Co
 
     Errors: `UserError` when they have nothing in common; the readers' own.
     """
-    record = load_record(measured, system.channels, system.sample_rate, dbc=dbc)
+    record = load_record(measured, system.channels, system.sample_rate, dbc=dbc, time=system.time)
     if other.suffix.lower() in SYSTEM_FILES:
         return _against_system(record, load_system(other, system.catalogue), (measured.name, other.name))
-    second = load_record(other, system.channels, system.sample_rate, dbc=dbc)
+    second = load_record(other, system.channels, system.sample_rate, dbc=dbc, time=system.time)
     first, last, offset = _overlap(record, second, measured, other)
     inputs = len(system.inputs)
     return Comparison(

@@ -1,6 +1,6 @@
 """The linear system as matrices with names: x' = A x + B u, y = C x + D u, and their derivatives by the parameters.
 
-Laws are left out: they act as the force of `laws_input` columns where a program can supply it (docs/exchange.md).
+Laws are left out: no matrix holds them; the FMU and Modelica exports do (docs/exchange.md).
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def simulate(
         raise UserError(f"{out}: is the file that the inputs come from")
     system = load_system(system_file, catalogue)
     database = dbc or (MANCHESTER_DBC if system_file == MANCHESTER else None)
-    record = load_record(inputs, system.channels, system.sample_rate, dbc=database)
+    record = load_record(inputs, system.channels, system.sample_rate, dbc=database, time=system.time)
     driven = record.values[:, : len(system.inputs)]
     ride = simulate_ride(
         system, driven, dict(map(_setting, settings)), noise=np.random.default_rng(seed) if noise else None
