@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE
-from sprung.benchmarks.generator.ride import SYSTEM, Ride, draw_ride, record, transfer
+from sprung.benchmarks.generator.ride import SYSTEM, DrawnRide, draw_ride, record, transfer
 from sprung.benchmarks.generator.track import SHORTEST
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.model.ambient.identify import AmbientIdentifier
@@ -167,7 +167,7 @@ def verdict(rng: np.random.Generator, values: Array, seconds: float) -> tuple[in
     return best, float(size[best])
 
 
-def bound(vehicle: Vehicle, ride: Ride, sensors: list[int], seconds: float) -> Array:
+def bound(vehicle: Vehicle, ride: DrawnRide, sensors: list[int], seconds: float) -> Array:
     """Standard deviations (24 parameters, load) that no unbiased estimator can beat, for a stationary record.
 
     Slepian-Bangs: F_ij = T integral over f of tr S^-1 dS/dx_i S^-1 dS/dx_j, everything else free: two levels and one
@@ -206,20 +206,20 @@ def _octaves(frequency: Array) -> Array:
     return np.asarray(np.maximum(1 - np.abs(place), 0.0))
 
 
-def _nuisances(ride: Ride, frequency: Array, wheels: int) -> Array:
+def _nuisances(ride: DrawnRide, frequency: Array, wheels: int) -> Array:
     """Truth of [levels left, levels right (relative, log), coherence per octave, own shares, log-speed]."""
     count = _octaves(frequency).shape[1]
     return np.concatenate([np.zeros(2 * count), np.full(count, ride.coherence), np.full(wheels, ride.own_share), [0.0]])
 
 
-def _response(vehicle: Vehicle, ride: Ride, x: Array, frequency: Array) -> NDArray[np.complex128]:
+def _response(vehicle: Vehicle, ride: DrawnRide, x: Array, frequency: Array) -> NDArray[np.complex128]:
     """Sensors per wheel, (F, S, wheels)."""
     loaded = replace(ride, log_ratio=x[:24], load=float(x[24]))
     return np.asarray(transfer(vehicle, loaded, 2 * np.pi * frequency).to_sensors)
 
 
 def _spectrum(
-    vehicle: Vehicle, ride: Ride, x: Array, frequency: Array, A: NDArray[np.complex128]
+    vehicle: Vehicle, ride: DrawnRide, x: Array, frequency: Array, A: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Spectral matrix of the sensors, in the units of a sample's variance, (F, S, S)."""
     hats, omega = _octaves(frequency), 2 * np.pi * frequency

@@ -72,7 +72,7 @@ def measure(system: System, records: int, rng: np.random.Generator) -> Statistic
     return Statistics(truth, estimates)
 
 
-class Errors:
+class CorrelatedErrors:
     """Errors with measured covariances for many vehicles; overlapping windows share what they share."""
 
     def __init__(self, covariances: FloatArray, vehicles: int, rng: np.random.Generator) -> None:
@@ -121,7 +121,7 @@ def step_delays(
     """Seconds from a step of parameter `index` to its alarm, (vehicles,), inf where none came; alarms of others."""
     settings = TrackerSettings()
     size = covariances.shape[1]
-    fleet, errors = Fleet(vehicles, size, settings), Errors(covariances, vehicles, rng)
+    fleet, errors = Fleet(vehicles, size, settings), CorrelatedErrors(covariances, vehicles, rng)
     learning = round(2 * settings.learning / settings.hop)
     delay = np.full(vehicles, np.inf)
     for k in range(learning + round(2 * WITHIN / settings.hop)):
@@ -164,7 +164,7 @@ def false_alarms(covariances: FloatArray, months: float, rng: np.random.Generato
     """Healthy vehicles, each with its own learned baseline, until `months` vehicle-months have run."""
     settings = TrackerSettings()
     size = covariances.shape[1]
-    fleet, errors = Fleet(vehicles, size, settings), Errors(covariances, vehicles, rng)
+    fleet, errors = Fleet(vehicles, size, settings), CorrelatedErrors(covariances, vehicles, rng)
     windows = int(np.ceil(months * SECONDS_PER_MONTH / settings.hop / vehicles))
     alarms, contradictions, crossings = 0, 0, np.zeros(len(NOISE_LEVELS))
     evidence = settings.evidence(size)

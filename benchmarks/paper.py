@@ -16,12 +16,12 @@ from typing import Any, cast, get_args
 import torch
 
 from sprung.benchmarks import paper_analysis, paper_train, paper_visual
-from sprung.benchmarks.paper_settings import Settings
+from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import OutOfTime
 from sprung.service.errors import UserError
 
-TASKS: dict[str, tuple[Callable[[Settings], Iterator[dict[str, Any]]], tuple[str, ...]]] = {
+TASKS: dict[str, tuple[Callable[[PaperSettings], Iterator[dict[str, Any]]], tuple[str, ...]]] = {
     "systems": (paper_visual.system_rows, ()),
     "pendulum": (paper_visual.rows, paper_visual.METHODS),
     "mass_spring_damper": (paper_visual.rows, paper_visual.METHODS),
@@ -56,7 +56,7 @@ def run(
     for name in [task] if task else TASKS:
         rows, _ = TASKS[name]
         for at in range(seed, seed + seeds):
-            settings = Settings(name, method, cast(Budget, budget), at, out or Path("runs/paper"), device, until)
+            settings = PaperSettings(name, method, cast(Budget, budget), at, out or Path("runs/paper"), device, until)
             settings.folder.mkdir(parents=True, exist_ok=True)
             try:
                 for row in rows(settings):
@@ -67,7 +67,7 @@ def run(
                 return
 
 
-def _keep(settings: Settings, row: dict[str, Any]) -> None:
+def _keep(settings: PaperSettings, row: dict[str, Any]) -> None:
     """Write a row beside the checkpoints, for `benchmarks.paper_report`."""
     folder = settings.out / settings.budget / "rows"
     folder.mkdir(parents=True, exist_ok=True)

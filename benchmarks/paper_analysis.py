@@ -8,11 +8,11 @@ from typing import Any
 import torch
 
 from sprung.benchmarks import paper_pictures
-from sprung.benchmarks.paper_settings import Settings
+from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.benchmarks.paper_visual import TASKS
 from sprung.model.alps import kernels, metrics, phase
 from sprung.model.alps.config import NetworkConfig, TrainingConfig, training_config
-from sprung.model.alps.estimator import Estimator, Features, log_magnitudes, raw
+from sprung.model.alps.estimator import AlpsEstimator, Features, log_magnitudes, raw
 from sprung.model.alps.fit import draw_rollouts, pick_windows
 from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 
@@ -21,7 +21,7 @@ FEATURE_UPDATES = 1000
 FEATURE_BATCH = 64
 
 
-def kernel_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def kernel_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """Spectra of the four composed kernels on the paper's signal."""
     views = {name: kernels.view(name) for name in kernels.FEATURES}
     for name, found in views.items():
@@ -36,7 +36,7 @@ def kernel_rows(settings: Settings) -> Iterator[dict[str, Any]]:
     paper_pictures.kernels(views, settings.pictures / "kernels.png")
 
 
-def phase_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def phase_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """Mean relative error of the spring constants over the number of independent inputs."""
     windows, updates = (10_000, 600) if settings.budget == "quick" else (100_000, 10_000)
     rows = []
@@ -56,7 +56,7 @@ def phase_rows(settings: Settings) -> Iterator[dict[str, Any]]:
         paper_pictures.phases(rows, settings.pictures / "phase.png")
 
 
-def feature_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def feature_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """PE of the estimator from true states, trained with labels: a bound on what its features allow."""
     for task in TASKS.values():
         config = training_config(task.name, settings.budget, settings.seed)
@@ -69,9 +69,9 @@ def feature_rows(settings: Settings) -> Iterator[dict[str, Any]]:
         yield row | {"updates": FEATURE_UPDATES, "batch": FEATURE_BATCH}
 
 
-def _labelled(task: Task, config: TrainingConfig, features: Features) -> Estimator:
+def _labelled(task: Task, config: TrainingConfig, features: Features) -> AlpsEstimator:
     torch.manual_seed(config.seed)
-    estimator = Estimator(task, NetworkConfig(), features)
+    estimator = AlpsEstimator(task, NetworkConfig(), features)
     rollouts = draw_rollouts(task, config, "train")
     optimiser = torch.optim.Adam(estimator.parameters(), lr=2e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, FEATURE_UPDATES)
@@ -86,7 +86,7 @@ def _labelled(task: Task, config: TrainingConfig, features: Features) -> Estimat
 
 
 @torch.no_grad()
-def _parameter_error(estimator: Estimator, rollouts: Rollouts) -> float:
+def _parameter_error(estimator: AlpsEstimator, rollouts: Rollouts) -> float:
     rows = torch.arange(len(rollouts.states))
     shown = windows(rollouts.states, rows % (ROLLOUT - WINDOW + 1), rows)
     return metrics.parameter_error(estimator(shown), rollouts.parameters)

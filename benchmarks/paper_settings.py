@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sprung.model.alps.config import Budget
-from sprung.model.alps.fit import Clock
+from sprung.model.alps.fit import TimeLimit
 
 
 @dataclass(frozen=True)
-class Settings:
+class PaperSettings:
     """One task, one seed."""
 
     task: str
@@ -34,8 +34,8 @@ class Settings:
         return folder
 
     @property
-    def clock(self) -> Clock:
-        return Clock() if self.until is None else Clock(self.until)
+    def clock(self) -> TimeLimit:
+        return TimeLimit() if self.until is None else TimeLimit(self.until)
 
     def wants(self, method: str) -> bool:
         return self.method in (None, method)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from sprung.benchmarks import paper_pictures
 from sprung.benchmarks.bounds import shared_bound
-from sprung.benchmarks.paper_settings import Settings
+from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import train_fit
 from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
@@ -51,14 +51,14 @@ def data_of(changing: bool) -> TrainData:
     return generate(changing, np.random.default_rng([8, int(changing)]))
 
 
-def _config(settings: Settings, method: str) -> TrainConfig:
+def _config(settings: PaperSettings, method: str) -> TrainConfig:
     config = TrainConfig(seed=settings.seed, updates=UPDATES[settings.budget][method])
     if method in ("alps_from_sensors", "alps_known_sensors"):
         return replace(config, longest_gradient=1.0)  # with 10, one spike drove parameters to their bounds
     return config
 
 
-def constant_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def constant_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """The paper's benchmark: 20 trajectories, one parameter vector; SE over states in units of their rms."""
     data = data_of(False)
     _, test = train_fit.halves(data)
@@ -81,7 +81,7 @@ def constant_rows(settings: Settings) -> Iterator[dict[str, Any]]:
             _states_picture(settings, model, data, int(test[0]))
 
 
-def _bound_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]]:
+def _bound_rows(settings: PaperSettings, data: TrainData) -> Iterator[dict[str, Any]]:
     """What the 12 accelerometers can tell of a constant vehicle: five windows of each training trajectory."""
     train, _ = train_fit.halves(data)
     starts = torch.arange(0, STEPS, WINDOW)
@@ -92,7 +92,7 @@ def _bound_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]]
         yield _row(settings, "train", method, {"PE_relative": float(np.sqrt(2 / np.pi) * deviation.mean())})
 
 
-def changing_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def changing_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """Every trajectory with its own parameters: the paper's estimator, and what keeps the phase."""
     data = data_of(True)
     yield _row(settings, "train_changing", "guess_nominal", _mean_guess(data))
@@ -130,7 +130,7 @@ def _case(data: TrainData, starts: Tensor, length: int, known_inputs: bool) -> _
     )
 
 
-def _refined_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]]:
+def _refined_rows(settings: PaperSettings, data: TrainData) -> Iterator[dict[str, Any]]:
     """From measured states: force balance alone, refined from it, refined from the nominal values."""
     starts = torch.arange(0, STEPS - WINDOW + 1, 25 if settings.budget == "quick" else 10)
     second = _case(data, starts, WINDOW, known_inputs=True)
@@ -163,7 +163,9 @@ def _balance(case: _Case) -> np.ndarray:
     return estimator.estimate(case.measured).log_ratio
 
 
-def _refine(settings: Settings, data: TrainData, method: str, case: _Case, first: np.ndarray | None) -> dict[str, Any]:
+def _refine(
+    settings: PaperSettings, data: TrainData, method: str, case: _Case, first: np.ndarray | None
+) -> dict[str, Any]:
     begin = time.perf_counter()
     found = Refiner(case.system, case.measured.shape[1]).refine(case.measured, first, states=True)
     seconds = time.perf_counter() - begin
@@ -177,7 +179,7 @@ def _refine(settings: Settings, data: TrainData, method: str, case: _Case, first
     )  # fmt: skip
 
 
-def _sensor_rows(settings: Settings, data: TrainData) -> Iterator[dict[str, Any]]:
+def _sensor_rows(settings: PaperSettings, data: TrainData) -> Iterator[dict[str, Any]]:
     """From the 12 accelerometers: the service, and the refinement from the nominal values."""
     system = load_system()
     _, test = train_fit.halves(data)
@@ -219,13 +221,13 @@ def _mean_guess(data: TrainData) -> dict[str, float | None]:
 
 
 def _row(
-    settings: Settings, task: str, method: str, figures: Mapping[str, float | None], /, **more: Any
+    settings: PaperSettings, task: str, method: str, figures: Mapping[str, float | None], /, **more: Any
 ) -> dict[str, Any]:
     rounded = {key: None if value is None else float(f"{value:.4g}") for key, value in figures.items()}
     return {"task": task, "method": method, **rounded, "seed": settings.seed, "budget": settings.budget, **more}
 
 
-def _states_picture(settings: Settings, model: torch.nn.Module, data: TrainData, row: int) -> None:
+def _states_picture(settings: PaperSettings, model: torch.nn.Module, data: TrainData, row: int) -> None:
     assert isinstance(model, StateEstimator)
     measured, knots = data.measured[row : row + 1, :WINDOW], data.known[row : row + 1, :WINDOW]
     with torch.no_grad():

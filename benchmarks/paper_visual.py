@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from sprung.benchmarks import paper_pictures
-from sprung.benchmarks.paper_settings import Settings
+from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import evaluate, mass_spring_damper, pendulum, two_body
 from sprung.model.alps.config import METHODS, NetworkConfig, training_config
 from sprung.model.alps.evaluate import Predicted
@@ -40,7 +40,7 @@ PAPER: dict[tuple[str, str], tuple[float, float, float | None]] = {  # (SE, OE, 
 }
 
 
-def system_rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def system_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """What the three systems look like, and how long a picture takes."""
     drawn = {}
     for name, task in TASKS.items():
@@ -59,7 +59,7 @@ def system_rows(settings: Settings) -> Iterator[dict[str, Any]]:
     paper_pictures.systems(drawn, settings.pictures / "systems.png")
 
 
-def rows(settings: Settings) -> Iterator[dict[str, Any]]:
+def rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """One row per method."""
     task = TASKS[settings.task]
     config = training_config(task.name, settings.budget, settings.seed)

@@ -44,7 +44,7 @@ def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iter
         for server in servers:
             server.start()
         try:
-            echo, identify = Client(ports[0], "/echo", body), Client(ports[1], "/identify", body)
+            echo, identify = KeptConnection(ports[0], "/echo", body), KeptConnection(ports[1], "/identify", body)
             echo.wait()
             identify.wait()
             echo.connection = None  # idle while the other server started: it may have been closed
@@ -66,7 +66,7 @@ def window_body(system: System) -> bytes:
 
 
 @dataclass(slots=True)
-class Client:
+class KeptConnection:
     """One kept-alive connection."""
 
     port: int
@@ -160,7 +160,7 @@ def _ask_together(
     begun = time.monotonic() + 0.2
 
     def ask(number: int) -> None:
-        client = Client(port, "/identify", body)
+        client = KeptConnection(port, "/identify", body)
         period = 0.0 if rate is None else clients / rate
         due = begun + number * period / clients
         while max(due, time.monotonic()) < begun + seconds:

@@ -24,7 +24,7 @@ _IN_NAME = re.compile(
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class TableLayout:
     """How to read the rows of a table."""
 
     separator: str | None  # None: runs of blanks
@@ -60,9 +60,9 @@ def is_number(cell: str, comma: bool) -> bool:
     return _NUMBER.match(cell.replace(",", ".") if comma else cell) is not None
 
 
-def sniff(lines: list[str]) -> Layout | None:
+def sniff(lines: list[str]) -> TableLayout | None:
     """The layout of a table that begins with these lines; None when no rows of numbers are among them."""
-    best: tuple[float, Layout] | None = None
+    best: tuple[float, TableLayout] | None = None
     for separator, comma in _ways(lines):
         found = _try(lines, separator, comma)
         if found is not None and (best is None or found[0] > best[0]):
@@ -83,7 +83,7 @@ def _ways(lines: list[str]) -> Iterator[tuple[str | None, bool]]:
         yield None, True
 
 
-def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, Layout] | None:
+def _try(lines: list[str], separator: str | None, comma: bool) -> tuple[float, TableLayout] | None:
     """How many cells are understood this way, and the layout."""
     rows: list[list[str]] = []
     for line in lines:
@@ -123,7 +123,7 @@ def _layout(
     numeric: tuple[bool, ...],
     separator: str | None,
     comma: bool,
-) -> Layout:
+) -> TableLayout:
     """Header and units from the lines before the first row of data."""
     width = len(numeric)
     above = [(i, row) for i, row in enumerate(rows[:first]) if len(row) == width and any(row)]
@@ -134,7 +134,9 @@ def _layout(
     ]
     heads = above or [(i, row) for i, row in marked if len(row) == width]
     if not heads:
-        return Layout(separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False, numeric)
+        return TableLayout(
+            separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False, numeric
+        )
     names = heads[-1][1]
     units: list[str | None] = [None] * width
     if len(heads) > 1 and _are_units(heads[-1][1]):
@@ -142,7 +144,7 @@ def _layout(
     elif len(heads) > 2 and _are_units(heads[-2][1]):  # another row below the units
         names, units = heads[-3][1], [_bare(cell) for cell in heads[-2][1]]
     units = [unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True)]
-    return Layout(separator, comma, first, tuple(names), tuple(units), True, numeric)
+    return TableLayout(separator, comma, first, tuple(names), tuple(units), True, numeric)
 
 
 def _are_units(row: list[str]) -> bool:

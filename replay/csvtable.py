@@ -12,7 +12,7 @@ import numpy as np
 
 from sprung.model.signals import ANY_TIME, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.csvlayout import COMMENTS, SAMPLE, Layout, cells, is_number, number, sniff
+from sprung.replay.csvlayout import COMMENTS, SAMPLE, TableLayout, cells, is_number, number, sniff
 from sprung.replay.tables import Rows
 
 BATCH_ROWS = 4096
@@ -56,7 +56,7 @@ class Head:
         self.lines = lines[: 2 * SAMPLE] if len(raw) < CHUNK or len(lines) > 1 else []
 
 
-def read_layout(path: Path) -> tuple[Layout, Head]:
+def read_layout(path: Path) -> tuple[TableLayout, Head]:
     """What the table looks like; raises UnreadableRecording when it is none."""
     head = Head(path)
     layout = sniff(head.lines)
@@ -96,7 +96,7 @@ def _lines(path: Path, encoding: str, account: Account) -> Iterator[str]:
 class _Reader:
     """Lines to blocks of samples."""
 
-    def __init__(self, layout: Layout, rows: Rows, account: Account) -> None:
+    def __init__(self, layout: TableLayout, rows: Rows, account: Account) -> None:
         self.layout, self.rows, self.account = layout, rows, account
         self.columns = ([] if rows.time is None else [rows.time]) + rows.columns
         self.written: bool | None = None  # the time is written as a date, not as a number

@@ -13,7 +13,7 @@ from sprung.model.signals import ANY_TIME, BoolArray, Channel, FloatArray, Sampl
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import REACH, place, resample, uneven
 from sprung.replay.recording import Recording, open_recording
-from sprung.replay.stream import Jump, Order
+from sprung.replay.stream import ClockJump, Order
 
 MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
 CELLS_ALWAYS, CELLS_PER_SAMPLE = 2_000_000, 50  # and at most so many: a record that is nearly all gaps is none
@@ -91,7 +91,7 @@ def _stretches(recording: Recording, order: Order, sample_rate: float) -> list[S
     runs: list[list[SampleBlock]] = [[]]
     for block in recording.at_rate(sample_rate):
         for piece in order.push(block):
-            if isinstance(piece, Jump):
+            if isinstance(piece, ClockJump):
                 runs.append([])
             else:
                 runs[-1].append(piece)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.extras import needed
 from sprung.replay.stamps import SECOND
-from sprung.replay.tables import Clock, Column, whole
+from sprung.replay.tables import Column, EvenTimes, whole
 
 DEEPEST = 8  # structures inside each other
 WIDEST = 512  # columns of one matrix
@@ -180,16 +180,16 @@ def _reader(channel: Any) -> Read:
     return lambda a, b: channel.read_data(a, b - a)
 
 
-def _waveform(said: Mapping[str, Any]) -> Clock | None:
+def _waveform(said: Mapping[str, Any]) -> EvenTimes | None:
     step = float(said.get("wf_increment") or 0.0)
     if not step > 0:
         return None
     start = said.get("wf_start_time")
     offset = round(float(said.get("wf_start_offset") or 0.0) * SECOND)
     if start is None:
-        return Clock(offset, step, True)
+        return EvenTimes(offset, step, True)
     began = int(np.datetime64(start).astype("datetime64[ns]").astype(np.int64))
-    return Clock(began + offset, step, began < 0)
+    return EvenTimes(began + offset, step, began < 0)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from sprung.model.signals import SampleBlock
 
 
 @dataclass(frozen=True, slots=True)
-class Jump:
+class ClockJump:
     """The clock jumped (or the sender paused): what follows starts anew."""
 
     seconds: float
@@ -36,7 +36,7 @@ class Order:
         self._waiting: list[tuple[int, int, float]] = []  # time, channel, value
         self._waiting_newest = 0
 
-    def push(self, block: SampleBlock) -> list[SampleBlock | Jump]:
+    def push(self, block: SampleBlock) -> list[SampleBlock | ClockJump]:
         """The samples that belong to the stream, with jumps between them."""
         if not len(block.time):
             return []
@@ -52,8 +52,8 @@ class Order:
         """At the end: what still waits never became a stream."""
         self._discard_waiting()
 
-    def _one_by_one(self, block: SampleBlock, newest: int) -> list[SampleBlock | Jump]:
-        out: list[SampleBlock | Jump] = []
+    def _one_by_one(self, block: SampleBlock, newest: int) -> list[SampleBlock | ClockJump]:
+        out: list[SampleBlock | ClockJump] = []
         taken: list[int] = []
         for index, time in enumerate(block.time.tolist()):
             if -self.delay <= time - newest <= self.pause:
@@ -69,11 +69,11 @@ class Order:
                 out.append(_take(block, taken))
                 taken = []
                 first = self._waiting[0][0]
-                out += [Jump((first - newest) / 1e9, first), _joined(self._waiting)]
+                out += [ClockJump((first - newest) / 1e9, first), _joined(self._waiting)]
                 newest = self.newest = self._waiting_newest
                 self._waiting = []
         out.append(_take(block, taken))
-        return [piece for piece in out if isinstance(piece, Jump) or len(piece.time)]
+        return [piece for piece in out if isinstance(piece, ClockJump) or len(piece.time)]
 
     def _discard_waiting(self) -> None:
         for time, _, _ in self._waiting:

@@ -27,7 +27,7 @@ TIME_NAMES = (
 
 
 @dataclass(frozen=True, slots=True)
-class Clock:
+class EvenTimes:
     """Even times that a file states for a column by itself."""
 
     start: int  # ns since the Unix epoch, or from the start of the measurement
@@ -43,7 +43,7 @@ class Column:
     length: int
     read: Callable[[int, int], NDArray[Any]]  # rows a to b
     unit: str | None = None
-    clock: Clock | None = None
+    clock: EvenTimes | None = None
 
     @property
     def group(self) -> str:
@@ -52,7 +52,7 @@ class Column:
         return self.name[: cut + 1]
 
 
-def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: Clock | None = None) -> Column:
+def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: EvenTimes | None = None) -> Column:
     """A column whose values are in memory."""
     return Column(name, len(values), lambda a, b: values[a:b], unit, clock)
 
@@ -220,11 +220,11 @@ def column_blocks(
         yield SampleBlock(block.time[order], block.channel[order], block.value[order])
 
 
-def time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | Clock:
+def time_of(path: Path, column: Column, columns: Sequence[Column], time: TimeColumn) -> Column | EvenTimes:
     """The times of a column: what the system file says, a time column of its length in its group or anywhere, else
     its own clock."""
     if time.rate is not None:
-        return Clock(0, 1.0 / time.rate, True)
+        return EvenTimes(0, 1.0 / time.rate, True)
     if column.clock is not None and time.name is None:
         return column.clock
     names = [one.name for one in columns if one.length == column.length]
@@ -254,7 +254,7 @@ class _Series:
     """Columns that share their times, read piece by piece."""
 
     def __init__(
-        self, time: Column | Clock, members: list[tuple[int, Column]], key: TimeColumn, account: Account
+        self, time: Column | EvenTimes, members: list[tuple[int, Column]], key: TimeColumn, account: Account
     ) -> None:
         self.time, self.members, self.account = time, members, account
         self.length = members[0][1].length
@@ -265,7 +265,7 @@ class _Series:
         self._epoch = key.epoch or 0
         self._at = 0
         self._held: list[SampleBlock] = []
-        if isinstance(time, Clock):
+        if isinstance(time, EvenTimes):
             account.relative = account.relative or (time.relative and key.epoch is None)
 
     def more(self) -> bool:
@@ -294,7 +294,7 @@ class _Series:
     def _read(self) -> SampleBlock:
         a, b = self._at, min(self._at + ROWS, self.length)
         self._at = b
-        if isinstance(self.time, Clock):
+        if isinstance(self.time, EvenTimes):
             shift = self._epoch if self.time.relative else 0
             stamps = self.time.start + shift + np.rint(np.arange(a, b) * (self.time.step * SECOND)).astype(np.int64)
             good = np.ones(b - a, dtype=bool)

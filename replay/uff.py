@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.stamps import SECOND
-from sprung.replay.tables import Clock, Column, whole
+from sprung.replay.tables import Column, EvenTimes, whole
 
 BORDER = b"    -1"
 TIME_RESPONSE, TIME = 1, 17  # function type; specific data type of the abscissa
@@ -34,7 +34,7 @@ class _Function:
     title: str
     place: str  # node and direction
     unit: str | None
-    clock: Clock | None  # None: uneven, `times` holds them
+    clock: EvenTimes | None  # None: uneven, `times` holds them
     times: NDArray[np.float64] | None  # s
     values: NDArray[np.float64]
 
@@ -163,7 +163,7 @@ def _function(lines: list[bytes], numbers: NDArray[np.float64]) -> _Function | N
         return _Function(title, place, label or None, None, pairs[:, 0], pairs[:, 1])
     if not step > 0:
         raise ValueError("its time step is not positive")
-    clock = Clock((began or 0) + round(first * SECOND), step, began is None)
+    clock = EvenTimes((began or 0) + round(first * SECOND), step, began is None)
     return _Function(title, place, label or None, clock, None, numbers[:count])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
 from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample, uneven
-from sprung.replay.stream import Jump, Order
+from sprung.replay.stream import ClockJump, Order
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
 MOST_WINDOWS = 64  # that are made together
@@ -63,7 +63,7 @@ class Windower:
         self.delay = delay
         self.stamped = stamped
         self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
-        self.jumps: list[Jump] = []  # of the clock, and pauses; the first ones
+        self.jumps: list[ClockJump] = []  # of the clock, and pauses; the first ones
         self.samples = 0  # that belonged to the stream
         self.longest = 0.0  # s, the longest stretch of samples without a jump
         self.expected = 0  # samples that the emitted windows should hold, each counted once
@@ -84,7 +84,7 @@ class Windower:
         """Windows that this block completed."""
         out: list[Window] = []
         for piece in self.order.push(block):
-            if isinstance(piece, Jump):
+            if isinstance(piece, ClockJump):
                 out += self._finish()
                 self.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
                 self._new_segment = True

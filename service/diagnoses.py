@@ -22,7 +22,7 @@ from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.worker import Limits, Task, Worker
+from sprung.service.worker import ProcessLimits, Task, Worker
 
 
 class Diagnoses:
@@ -135,7 +135,7 @@ class DiagnosisJobs:
         request = DiagnosisRequest(path, row.name, self._engine.system, self._engine.dbc, part)
         seconds = self._settings.diagnosis_seconds
         worker = Worker(
-            self.task, request, Limits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"
+            self.task, request, ProcessLimits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"
         )
         try:
             for stage in worker.messages(progress.check):

@@ -7,11 +7,12 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from sprung.model.identification.deviations import deviations
+from sprung.model.identifier import Identifies
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
@@ -22,33 +23,6 @@ WEIGHED_OF = 4  # windows, one is weighed for gains and delays: it costs as much
 _SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall far apart
 
 log = logging.getLogger("sprung.engine")
-
-
-class StageTimes(Protocol):
-    """Seconds by stage."""
-
-    @property
-    def estimate(self) -> float:
-        """The trained estimator."""
-
-    @property
-    def refine(self) -> float:
-        """The refinement through the simulator."""
-
-
-class Identifies(Protocol):
-    """The part of `model.identification.identify.Identifier` that the service uses."""
-
-    @property
-    def digest(self) -> str:
-        """Names system and estimator; estimates of another digest are not comparable."""
-
-    @property
-    def times(self) -> StageTimes:
-        """Seconds spent in the stages of the last batch."""
-
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
-        """Estimates of windows, shape (B, T, C); `start`: log-ratios to begin from, shape (B, P)."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,7 @@ from sprung.service.compute import Priority
 from sprung.service.pipeline import Batch, Identified, Pipeline
 from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
 from sprung.service.times import NANOSECONDS
-from sprung.service.worker import Limits
+from sprung.service.worker import ProcessLimits
 
 MOST_LOST = 0.1  # of the samples; with more, too few windows can be used
 NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
@@ -99,7 +99,7 @@ def feed_file(
     recording_id: str | None = None,
     batch_windows: int = 128,
     speed: float = 0.0,
-    limits: Limits | None = None,
+    limits: ProcessLimits | None = None,
     on_batch: OnBatch = lambda batch: None,
     on_tally: OnTally = lambda tally: None,
     check: Callable[[], None] = lambda: None,

@@ -105,7 +105,7 @@ class Housekeeping:
     def once(self, now: int, keep: bool = True) -> retention.Forgotten:
         """One round, as if it were `now`, ns since epoch; keep: False only tells what would be forgotten."""
         settings = self._settings
-        limits = retention.Limits(
+        limits = retention.RetentionLimits(
             now - round(settings.retention_windows_days * DAY),
             now - round(settings.retention_minutes_days * DAY),
             now - round(settings.retention_uploads_days * DAY),

@@ -30,7 +30,7 @@ from sprung.service.live import LiveFeed
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
 from sprung.service.store.work import add_recording
-from sprung.service.worker import Limits
+from sprung.service.worker import ProcessLimits
 
 log = logging.getLogger("sprung")
 
@@ -165,7 +165,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 recording_id=row.id,
                 batch_windows=core.settings.batch_windows,
                 speed=feeds.speed,
-                limits=Limits(inf, inf, core.settings.worker_memory_bytes),
+                limits=ProcessLimits(inf, inf, core.settings.worker_memory_bytes),
                 on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
                 check=check,

@@ -16,7 +16,7 @@ from sprung.replay import open_recording
 from sprung.replay.pacing import paced
 from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
-from sprung.service.worker import Emit, Limits, Worker
+from sprung.service.worker import Emit, ProcessLimits, Worker
 
 T = TypeVar("T")
 READ_AHEAD = 2  # batches; with them memory stays flat however long the file is
@@ -37,7 +37,7 @@ class ReadRequest:
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class ReadWindows:
     """Windows in order of time, and what had become of the messages when they were whole."""
 
     windows: list[Window]
@@ -66,7 +66,7 @@ class Reading(Protocol):
     def ending(self) -> Ending:
         """Known when `pieces` has ended."""
 
-    def pieces(self, check: Callable[[], None]) -> Iterator[Piece]:
+    def pieces(self, check: Callable[[], None]) -> Iterator[ReadWindows]:
         """Windows as they become whole; `check` is called while waiting and may raise to give up."""
 
     def close(self) -> None:
@@ -102,7 +102,7 @@ def windower_of(system: System, stamped: bool = False) -> Windower:
     )
 
 
-def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
+def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     """Read to the end, handing over pieces of `batch_windows` windows.  Raises UnreadableRecording."""
     system = request.system
     start = request.path.stat().st_mtime_ns if request.start is None and request.path.is_file() else request.start
@@ -114,7 +114,7 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
 
     def tell() -> None:
         nonlocal held, told
-        emit(Piece(held, _copy(recording.tally), recording.vehicle))
+        emit(ReadWindows(held, _copy(recording.tally), recording.vehicle))
         held, told = [], time.monotonic()
 
     for block in paced(spans.watch(recording.at_rate(system.sample_rate)), request.speed):
@@ -128,7 +128,7 @@ def read(request: ReadRequest, emit: Emit[Piece]) -> Ending:
     last = windower.flush()
     held += last
     for first in range(0, len(held), request.batch_windows):
-        emit(Piece(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
+        emit(ReadWindows(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
     said = remarks(windower, whole + len(last))
     return Ending(
         recording.tally,
@@ -156,10 +156,10 @@ class Here:
         assert self._ending is not None, "the recording is not read yet"
         return self._ending
 
-    def pieces(self, check: Callable[[], None]) -> Iterator[Piece]:
+    def pieces(self, check: Callable[[], None]) -> Iterator[ReadWindows]:
         """Windows as they become whole."""
 
-        def produce(put: Callable[[Piece], None]) -> None:
+        def produce(put: Callable[[ReadWindows], None]) -> None:
             self._ending = read(self._request, put)
 
         found = produced(produce, READ_AHEAD, check)
@@ -179,15 +179,15 @@ class Here:
 class Apart:
     """Reads in a process of its own: for files of strangers."""
 
-    def __init__(self, request: ReadRequest, limits: Limits) -> None:
-        self._worker: Worker[Piece, Ending] = Worker(read, request, limits, "the reading of the recording")
+    def __init__(self, request: ReadRequest, limits: ProcessLimits) -> None:
+        self._worker: Worker[ReadWindows, Ending] = Worker(read, request, limits, "the reading of the recording")
 
     @property
     def ending(self) -> Ending:
         """What the recording came to."""
         return self._worker.result
 
-    def pieces(self, check: Callable[[], None]) -> Iterator[Piece]:
+    def pieces(self, check: Callable[[], None]) -> Iterator[ReadWindows]:
         """Windows as they become whole."""
         return self._worker.messages(check)
 

@@ -15,7 +15,7 @@ from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow
 from sprung.service.times import now_ns
-from sprung.service.worker import Limits
+from sprung.service.worker import ProcessLimits
 
 SLOWEST_BYTES_PER_SECOND = 100_000  # any reader is faster, by an order of magnitude
 
@@ -55,9 +55,9 @@ class RecordingJobs:
         return {"recording": row.id} | fed.summary()
 
 
-def reading_limits(settings: Settings, path: Path) -> Limits:
+def reading_limits(settings: Settings, path: Path) -> ProcessLimits:
     """What reading a recording of a stranger may use."""
-    return Limits(
+    return ProcessLimits(
         settings.reading_silence_seconds,
         settings.recording_seconds,
         settings.worker_memory_bytes,

@@ -42,7 +42,7 @@ class WorkerFailed(RuntimeError):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ProcessLimits:
     """What a process may use."""
 
     silence_seconds: float  # without any message
@@ -74,7 +74,9 @@ class _Broken:
 class Worker(Generic[Message, Result]):
     """One run of a task.  Iterate `messages`, then read `result`; `kill` may be called from any thread."""
 
-    def __init__(self, task: Task[Request, Message, Result], request: Request, limits: Limits, what: str) -> None:
+    def __init__(
+        self, task: Task[Request, Message, Result], request: Request, limits: ProcessLimits, what: str
+    ) -> None:
         """what: names the work in errors, as in `the diagnosis`."""
         self._limits = limits
         self._what = what
@@ -157,7 +159,7 @@ class Worker(Generic[Message, Result]):
         return f"the process of {self._what} ended without an answer (status {code})"
 
 
-def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits: Limits, parent: int) -> None:
+def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits: ProcessLimits, parent: int) -> None:
     """The new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
@@ -196,7 +198,7 @@ def end_with_parent(lifeline: Connection, parent: int) -> None:
     threading.Thread(target=watch, name="sprung-lifeline", daemon=True).start()
 
 
-def be_modest(limits: Limits) -> None:
+def be_modest(limits: ProcessLimits) -> None:
     """Low priority, first to go when memory runs out, and bounds of the kernel's where the platform has them."""
     with suppress(OSError, AttributeError):
         os.nice(10)

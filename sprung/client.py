@@ -57,14 +57,14 @@ class Client:
             if after is None:
                 return
 
-    def vehicle(self, vehicle: str) -> models.Vehicle:
+    def vehicle(self, vehicle: str) -> models.VehicleAnswer:
         """A vehicle as it stands."""
-        return self._get(f"/vehicles/{_quoted(vehicle)}", models.Vehicle)
+        return self._get(f"/vehicles/{_quoted(vehicle)}", models.VehicleAnswer)
 
-    def history(self, vehicle: str, parameters: Sequence[str], **query: Any) -> models.Columns:
+    def history(self, vehicle: str, parameters: Sequence[str], **query: Any) -> models.ColumnsAnswer:
         """Parameters over time, as columns; `since`, `until`, `resolution` as in the API."""
         wanted = {"parameter": list(parameters), "format": "columns"} | query
-        return self._get(f"/vehicles/{_quoted(vehicle)}/history", models.Columns, wanted)
+        return self._get(f"/vehicles/{_quoted(vehicle)}/history", models.ColumnsAnswer, wanted)
 
     def export(self, vehicle: str, kind: str = "csv", **query: Any) -> bytes:
         """The history of every parameter as a file: csv, parquet or mcap."""
@@ -74,7 +74,7 @@ class Client:
         """Signals, simulation, estimates and events as MCAP."""
         return self._send("GET", f"/vehicles/{_quoted(vehicle)}/bundle")
 
-    def alarms(self, **query: Any) -> Iterator[models.Alarm]:
+    def alarms(self, **query: Any) -> Iterator[models.AlarmAnswer]:
         """Alarms of the fleet, newest first (`active`, `vehicle`, `severity`, `kind`, ...)."""
         after = None
         while True:
@@ -84,22 +84,22 @@ class Client:
             if after is None:
                 return
 
-    def acknowledge(self, vehicle: str, alarm: int | None = None) -> models.Vehicle:
+    def acknowledge(self, vehicle: str, alarm: int | None = None) -> models.VehicleAnswer:
         """Somebody has seen an alarm, or all that are active."""
-        return self._post(f"/vehicles/{_quoted(vehicle)}/acknowledge", models.Vehicle, {"alarm": alarm})
+        return self._post(f"/vehicles/{_quoted(vehicle)}/acknowledge", models.VehicleAnswer, {"alarm": alarm})
 
-    def note(self, vehicle: str, text: str) -> models.Mark:
+    def note(self, vehicle: str, text: str) -> models.MarkAnswer:
         """Write a note on the time line."""
-        return self._post(f"/vehicles/{_quoted(vehicle)}/notes", models.Mark, {"text": text})
+        return self._post(f"/vehicles/{_quoted(vehicle)}/notes", models.MarkAnswer, {"text": text})
 
-    def maintenance(self, vehicle: str, text: str, parameters: Sequence[str] | None = None) -> models.Mark:
+    def maintenance(self, vehicle: str, text: str, parameters: Sequence[str] | None = None) -> models.MarkAnswer:
         """Mark a maintenance; baselines of `parameters` (None: of all) are learned anew."""
         body = {"text": text, "parameters": None if parameters is None else list(parameters)}
-        return self._post(f"/vehicles/{_quoted(vehicle)}/maintenance", models.Mark, body)
+        return self._post(f"/vehicles/{_quoted(vehicle)}/maintenance", models.MarkAnswer, body)
 
-    def identify(self, window: Mapping[str, Any], **query: Any) -> models.Identified:
+    def identify(self, window: Mapping[str, Any], **query: Any) -> models.IdentifyAnswer:
         """Identify one window; its form is that of `POST /identify`."""
-        return self._post("/identify", models.Identified, window, query)
+        return self._post("/identify", models.IdentifyAnswer, window, query)
 
     def upload(self, path: Path, vehicle: str | None = None, diagnose: bool = False) -> models.Job:
         """Send a recording to be followed, or to be diagnosed; `wait` for the job."""

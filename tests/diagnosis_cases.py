@@ -42,14 +42,14 @@ def quarter_car() -> System:
 
 
 @dataclass
-class Recorded:
+class MadeRecord:
     values: np.ndarray
     sample_rate: float = 100.0
     lost: int = 0
     extra: dict = field(default_factory=dict)
 
 
-def simulate(law=None, *, seconds: float = 30.0, seed: int = 0, noise: float = 1.0, level: float = 1.0) -> Recorded:
+def simulate(law=None, *, seconds: float = 30.0, seed: int = 0, noise: float = 1.0, level: float = 1.0) -> MadeRecord:
     """Columns wheel displacement, velocity, four accelerations; `law(d, v)` adds a force to the secondary element.
 
     Road of random phases from 0.5 to 18 Hz, Runge-Kutta at 1 kHz, every channel low-passed at 42 Hz alike, decimated.
@@ -91,7 +91,7 @@ def simulate(law=None, *, seconds: float = 30.0, seed: int = 0, noise: float = 1
     channels = np.column_stack([road[: 2 * n : 2], slope[: 2 * n : 2], out[:, 0], out[:, 0], out[:, 1], out[:, 1]])
     values = _decimated(channels)
     values += noise * rng.standard_normal(values.shape) * np.array([1e-5, 5e-4, 4e-3, 4e-3, 3e-2, 3e-2])
-    return Recorded(values)
+    return MadeRecord(values)
 
 
 def _decimated(channels: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ def _decimated(channels: np.ndarray) -> np.ndarray:
     return filtered[margin:-margin:FINE]
 
 
-def problem_of(record: Recorded, system: System | None = None) -> Problem:
+def problem_of(record: MadeRecord, system: System | None = None) -> Problem:
     """A recording of the quarter car as a problem with declared noise."""
     system = system or quarter_car()
     signals = prepare(system, record.values, record.sample_rate).signals

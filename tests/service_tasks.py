@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sprung.service.worker import Emit, Limits, Worker
+from sprung.service.worker import Emit, ProcessLimits, Worker
 
 
 def count(to: int, emit: Emit[int]) -> str:
@@ -41,6 +41,6 @@ def misbehave(how: str, emit: Emit[int]) -> str:
 
 
 if __name__ == "__main__":  # a parent that is killed: starts a worker, writes down its process, waits
-    worker: Worker[int, str] = Worker(misbehave, "hang", Limits(600, 600), "the work")
+    worker: Worker[int, str] = Worker(misbehave, "hang", ProcessLimits(600, 600), "the work")
     for pid in worker.messages():
         Path(sys.argv[1]).write_text(str(pid))

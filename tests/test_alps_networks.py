@@ -15,7 +15,7 @@ from sprung.model.alps.config import METHODS, NetworkConfig, TrainingConfig
 from sprung.model.alps.context import ContextDynamics
 from sprung.model.alps.embedding import ConvolutionalEmbedding, positions
 from sprung.model.alps.encoder import AttentionEncoder, DifferenceEncoder
-from sprung.model.alps.estimator import Estimator, log_magnitudes
+from sprung.model.alps.estimator import AlpsEstimator, log_magnitudes
 from sprung.model.alps.losses import loss_of
 from sprung.model.alps.network import Network
 from sprung.model.alps.posterior import (
@@ -115,7 +115,7 @@ def test_magnitudes_do_not_see_a_circular_shift_and_raw_states_do() -> None:
 
 def test_estimates_start_in_the_middle_and_stay_positive() -> None:
     task = mass_spring_damper.TASK
-    estimator = Estimator(task, SIZES, log_magnitudes).requires_grad_(False)
+    estimator = AlpsEstimator(task, SIZES, log_magnitudes).requires_grad_(False)
     states = task.sample(4, np.random.default_rng(0), task.seen).states[:, :WINDOW].float()
     torch.testing.assert_close(estimator(states), estimator.at_middle(4))
     assert float(estimator.at_middle(1)) == pytest.approx(2.002e6, rel=1e-3)

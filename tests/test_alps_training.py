@@ -15,7 +15,7 @@ from sprung.benchmarks.physics_overhead import _stepwise
 from sprung.model.alps import fit, mass_spring_damper, train_fit, two_body
 from sprung.model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
 from sprung.model.alps.evaluate import every_window, predict, state_figures
-from sprung.model.alps.fit import Clock, OutOfTime, Split
+from sprung.model.alps.fit import OutOfTime, Split, TimeLimit
 from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import tempered
 from sprung.model.alps.task import WINDOW
@@ -62,14 +62,14 @@ def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
     def trained(folder: Path) -> list[torch.Tensor]:
         folder.mkdir(exist_ok=True)
         frames = FrameAutoencoder(SIZES)
-        model = fit.train_method(task, "alps", data, frames, TINY, SIZES, folder, Clock())
+        model = fit.train_method(task, "alps", data, frames, TINY, SIZES, folder, TimeLimit())
         return [p.detach().clone() for p in model.network.parameters()]
 
     straight = trained(tmp_path / "straight")
     folder = tmp_path / "broken"
     folder.mkdir()
 
-    class Stops(Clock):
+    class Stops(TimeLimit):
         def check(self, run) -> None:  # type: ignore[no-untyped-def]
             if run.step == 3:
                 run.save()
@@ -84,7 +84,7 @@ def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
 def test_the_frame_autoencoder_learns_and_is_kept(tmp_path: Path) -> None:
     task = mass_spring_damper.TASK
     config = replace(TINY, frame_updates=12, learning_rate=5e-3)
-    frames = fit.train_frames(task, config, SIZES, tmp_path, Clock())
+    frames = fit.train_frames(task, config, SIZES, tmp_path, TimeLimit())
     assert task.render is not None
     pictures = task.render(fit.draw_rollouts(task, config, "test").states[:, 60])
     untrained = FrameAutoencoder(SIZES)
@@ -94,7 +94,7 @@ def test_the_frame_autoencoder_learns_and_is_kept(tmp_path: Path) -> None:
         embeddings = frames.encode(task.render(fit.draw_rollouts(task, config, "train").states[:, ::5].flatten(0, 1)))
         assert float((embeddings.std(0) - 1).abs().max()) < 0.3
         torch.testing.assert_close(frames.decode(frames.encode(pictures)), frames(pictures), atol=1e-4, rtol=1e-3)
-    again = fit.train_frames(task, config, SIZES, tmp_path, Clock(until=0.0))  # no time left, none needed
+    again = fit.train_frames(task, config, SIZES, tmp_path, TimeLimit(until=0.0))  # no time left, none needed
     torch.testing.assert_close(again.outer, frames.outer)
 
 
@@ -107,7 +107,7 @@ def test_end_to_end_training_reaches_the_convolutions(tmp_path: Path) -> None:
     before = frames.embed.maps[0].weight.detach().clone()  # type: ignore[union-attr,operator]
     rollouts = fit.draw_rollouts(task, config, "train")
     fit.train_method(
-        task, "alps", Split(rollouts, data.embeddings), frames, config, SIZES, tmp_path, Clock()
+        task, "alps", Split(rollouts, data.embeddings), frames, config, SIZES, tmp_path, TimeLimit()
     )  # fmt: skip
     assert not torch.equal(before, frames.embed.maps[0].weight)  # type: ignore[arg-type]
 
@@ -145,12 +145,12 @@ def test_phases_follow_each_other_with_their_learning_rates() -> None:
 def test_only_the_estimator_moves_while_the_encoder_rests(tmp_path: Path) -> None:
     task, frames = two_body.TASK, FrameAutoencoder(SIZES)
     before = fit.train_method(
-        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:1]), SIZES, tmp_path, Clock()
+        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:1]), SIZES, tmp_path, TimeLimit()
     )
     path = tmp_path / "longer"
     path.mkdir()
     after = fit.train_method(
-        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:2]), SIZES, path, Clock()
+        task, "alps", fake_split(), frames, replace(TINY, phases=TINY.phases[:2]), SIZES, path, TimeLimit()
     )
     for (name, left), right in zip(before.network.named_parameters(), after.network.parameters(), strict=True):
         if not name.startswith("estimator"):
@@ -234,7 +234,7 @@ def test_a_start_from_the_whole_window_carries_less_noise_than_its_first_sample(
 def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path: Path) -> None:
     data = generate(False, np.random.default_rng(1), 6)
     config = train_fit.TrainConfig(updates=25, batch=8, checkpoint_every=50)
-    model = train_fit.fit("alps", data, config, tmp_path, Clock(), "test")
+    model = train_fit.fit("alps", data, config, tmp_path, TimeLimit(), "test")
     figures = train_fit.figures(model, data, hop=100)
     untrained = train_fit.figures(train_fit.build("alps", data), data, hop=100)
     assert figures["PE_relative"] < 0.35 * untrained["PE_relative"]
@@ -244,7 +244,7 @@ def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path:
 @pytest.mark.parametrize("method", ["cdm", "alps_smoothed", "alps_from_sensors", "alps_known_sensors", "no_fourier"])
 def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> None:
     config = train_fit.TrainConfig(updates=2, batch=2, checkpoint_every=50)
-    model = train_fit.fit(method, train_data, config, tmp_path, Clock(), "test")
+    model = train_fit.fit(method, train_data, config, tmp_path, TimeLimit(), "test")
     figures = train_fit.figures(model, train_data, hop=200)
     assert np.isfinite(figures["SE"])
 
@@ -300,7 +300,7 @@ def test_a_bench_without_time_says_how_to_go_on(tmp_path: Path) -> None:
 def test_positions_rest_as_opened_while_rates_are_learned(tmp_path: Path) -> None:
     task, data, frames = two_body.TASK, fake_split(), FrameAutoencoder(SIZES)
     config = replace(TINY, phases=(Phase("rates", 9, 2, (2e-3, 2e-3)),))
-    trained = fit.train_method(task, "alps", data, frames, config, SIZES, tmp_path, Clock()).network.encoder
+    trained = fit.train_method(task, "alps", data, frames, config, SIZES, tmp_path, TimeLimit()).network.encoder
     torch.manual_seed(config.seed)
     opened = fit.Network(task, "alps", SIZES).encoder
     opened.head.open_with_components(data.embeddings.flatten(0, 1)[::7])

@@ -11,7 +11,7 @@ import scipy.linalg
 import scipy.signal
 
 import sprung
-from sprung.benchmarks.generator.ride import Ride, draw_ride, record
+from sprung.benchmarks.generator.ride import DrawnRide, draw_ride, record
 from sprung.model.ambient.forces import ForceExcitation
 from sprung.model.ambient.identify import AmbientIdentifier
 from sprung.model.ambient.periodogram import Spectra, spectra
@@ -245,7 +245,7 @@ def test_intervals_hold_what_they_promise(vehicle: System) -> None:
     inside = []
     for seed in range(24):
         rng = np.random.default_rng([10, seed])
-        ride: Ride = draw_ride(rng)
+        ride: DrawnRide = draw_ride(rng)
         told = AmbientIdentifier(vehicle).told(record(rng, ride, 60.0))
         assert told is not None
         error = told.log_ratio - np.append(ride.log_ratio, ride.load)

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ast
+import re
+from collections import defaultdict
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -42,14 +45,31 @@ CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_co
 STANDARD_BUT_NOT_FOR_THE_CORE = {"socket", "http", "sqlite3", "logging", "argparse", "asyncio"}
 
 
+@cache
 def modules(folder: str) -> list[Path]:
     return sorted((ROOT / folder).rglob("*.py"))
+
+
+@cache
+def nodes(path: Path) -> tuple[ast.stmt, ...]:
+    """Every statement of a file, those inside others too; read once."""
+    found: list[ast.stmt] = []
+    waiting: list[ast.AST] = [ast.parse(path.read_bytes())]
+    while waiting:
+        node = waiting.pop()
+        for field in ("body", "orelse", "finalbody", "handlers", "cases"):
+            inner = getattr(node, field, None)
+            if isinstance(inner, list):
+                waiting += inner
+        if isinstance(node, ast.stmt):
+            found.append(node)
+    return tuple(found)
 
 
 def imported(path: Path) -> set[str]:
     """Every module that a file names in an import, at the top or inside a function."""
     found: set[str] = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found |= {alias.name.removeprefix("sprung.") for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -59,13 +79,14 @@ def imported(path: Path) -> set[str]:
     return found
 
 
+@cache
 def edges() -> dict[str, set[str]]:
     """Which file imports which, as dotted names below `sprung`; names imported from a package count for its files."""
     files = {_dotted(path): path for folder in OURS for path in modules(folder)}
     graph: dict[str, set[str]] = {}
     for name, path in files.items():
         targets = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             if isinstance(node, ast.Import):
                 targets |= {alias.name.removeprefix("sprung.") for alias in node.names}
             elif isinstance(node, ast.ImportFrom):
@@ -137,12 +158,21 @@ def test_the_diagnosis_is_built_in_one_order() -> None:
     assert wrong == []
 
 
+def test_class_names_are_unique() -> None:
+    named = defaultdict(list)
+    files = [path for folder in (*OURS, "tests") for path in modules(folder)] + sorted((ROOT / "sprung").glob("*.py"))
+    for path in files:
+        for name in re.findall(r"^ *class (\w+)[:(\[]", path.read_text(encoding="utf-8"), re.MULTILINE):
+            named[name].append(path.relative_to(ROOT).as_posix())
+    assert {name: where for name, where in named.items() if len(where) > 1} == {}
+
+
 @pytest.mark.parametrize("folder", OURS)
 def test_no_import_is_hidden_from_those_who_run_the_code(folder: str) -> None:
     users = [
         path.relative_to(ROOT).as_posix()
         for path in modules(folder)
-        if any(isinstance(n, ast.Name) and n.id == "TYPE_CHECKING" for n in ast.walk(ast.parse(path.read_text())))
+        if "TYPE_CHECKING" in path.read_text(encoding="utf-8")
     ]
     assert users == []
 
@@ -150,7 +180,7 @@ def test_no_import_is_hidden_from_those_who_run_the_code(folder: str) -> None:
 def test_the_core_imports_at_the_top_of_its_files() -> None:
     late = set()
     for path in modules("model"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in nodes(path):
             if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
                 inner = [n for n in ast.walk(node) if isinstance(n, (ast.Import, ast.ImportFrom))]
                 late |= {f"{path.relative_to(ROOT).as_posix()}:{node.name}" for _ in inner}

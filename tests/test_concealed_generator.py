@@ -14,7 +14,7 @@ from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicl
 from sprung.benchmarks.generator.draw import FAULTS
 from sprung.benchmarks.generator.exact import exact_response
 from sprung.benchmarks.generator.files import WRITERS
-from sprung.benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, Motion, Plant, Slot
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, BatchMotion, PlantBatch, Slot
 from sprung.benchmarks.generator.laws import LAWS
 from sprung.benchmarks.generator.make import _integrated
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
@@ -23,16 +23,16 @@ from sprung.replay.record import load_record
 VEHICLE = read_vehicle(MANCHESTER)
 
 
-def plant(slots: list[Slot], batch: int = 1) -> Plant:
+def plant(slots: list[Slot], batch: int = 1) -> PlantBatch:
     def tile(values: np.ndarray) -> np.ndarray:
         return np.repeat(values[:, None], batch, 1)
 
     zeros = np.zeros((4, batch))
-    return Plant(tile(VEHICLE.stiffness), tile(VEHICLE.damping), tile(VEHICLE.inertia), zeros, zeros, slots)
+    return PlantBatch(tile(VEHICLE.stiffness), tile(VEHICLE.damping), tile(VEHICLE.inertia), zeros, zeros, slots)
 
 
 def test_the_vehicle_has_the_published_modes() -> None:
-    motion, matrix = Motion(VEHICLE, plant([])), np.zeros((20, 20))
+    motion, matrix = BatchMotion(VEHICLE, plant([])), np.zeros((20, 20))
     for column in range(20):
         state = np.zeros((20, 1))
         state[column] = 1.0
@@ -70,7 +70,7 @@ def test_a_law_acts_on_its_own_element_and_column_alone(name: str) -> None:
     law, rng = LAWS[name], np.random.default_rng(5)
     p = law.draw(rng, 0.1, 4.3e5, 2e4, 2.5e-3, 0.026)
     slots = [Slot(1, 8, name, p)]
-    plain, hidden = Motion(VEHICLE, plant([], 2)), Motion(VEHICLE, plant(slots, 2))
+    plain, hidden = BatchMotion(VEHICLE, plant([], 2)), BatchMotion(VEHICLE, plant(slots, 2))
     state = np.zeros((20, 2))
     state[0], state[10] = -8e-3, 0.1  # the car lies low and rises
     memory = np.full(1, 2e-4 if name == "bouc_wen" else 0.0)
@@ -82,8 +82,8 @@ def test_a_law_acts_on_its_own_element_and_column_alone(name: str) -> None:
 
 
 def test_a_constant_force_of_friction_decelerates_the_car_by_force_over_mass() -> None:
-    motion = Motion(VEHICLE, plant([Slot(0, 8, "coulomb_friction", [320.0, 1e-3])]))
-    plain = Motion(VEHICLE, plant([]))
+    motion = BatchMotion(VEHICLE, plant([Slot(0, 8, "coulomb_friction", [320.0, 1e-3])]))
+    plain = BatchMotion(VEHICLE, plant([]))
     state = np.zeros((20, 1))
     state[10] = 0.5  # the car rises
     rates = [m(state, np.zeros(n), np.zeros((16, 1)), 0.0)[0] for m, n in ((motion, 1), (plain, 0))]

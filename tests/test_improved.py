@@ -13,9 +13,9 @@ from sprung.model.diagnosis.report.report import (
     FitFigures,
     IdentifiedLaw,
     LawParameter,
-    ParameterValue,
     RecordingFacts,
     Report,
+    ReportedParameter,
 )
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import parse_system
@@ -47,7 +47,7 @@ sensors:
 
 def report(laws: tuple[IdentifiedLaw, ...], findings: tuple[Finding, ...] = ()) -> Report:
     figures = FitFigures(0.1, {})
-    values = (ParameterValue("strut.stiffness", 20123.4567, 10.0, 18000.0, "N/m"),)
+    values = (ReportedParameter("strut.stiffness", 20123.4567, 10.0, 18000.0, "N/m"),)
     return Report(
         "quarter-car", RecordingFacts("a", 1.0, 100, 0), "missing_physics", values, figures, findings, values, figures,
         figures, {}, laws=laws, noise={"car_a": 0.0123, "road.velocity": 6e-4},

@@ -38,7 +38,7 @@ def frame(value, frame_id=0x123):
     return can.Message(arbitration_id=frame_id, is_extended_id=False, data=value.to_bytes(8, "little"))
 
 
-class Listener:
+class CollectingListener:
     """Collects blocks in a thread, with the moment at which each came."""
 
     def __init__(self, bus):
@@ -68,7 +68,7 @@ class Listener:
 
 def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc, bus_name):
     live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.05)
-    listener = Listener(live)
+    listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)
     with can.Bus(interface="virtual", channel=bus_name) as sender:
         begun = time.monotonic()
@@ -88,7 +88,7 @@ def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc, bus_
 
 def test_a_silent_bus_stops_at_once(dbc, bus_name):
     live = LiveBus("virtual", bus_name, [CHANNEL], dbc)
-    listener = Listener(live)
+    listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)
     begun = time.monotonic()
     listener.stop()
@@ -126,7 +126,7 @@ def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
         return Breaking(number)
 
     live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.02, open_bus=open_bus)
-    listener = Listener(live)
+    listener = CollectingListener(live)
     assert listener.wait(lambda: len(listener.values()) == 6)
     listener.stop()
     assert listener.values() == [21, 22, 23, 31, 32, 33]
@@ -149,7 +149,7 @@ def write_log(path, seconds=1.0):
 
 def test_a_recording_is_played_in_real_time_and_comes_out_as_windows(dbc, bus_name, tmp_path):
     frames = write_log(tmp_path / "run.log", 1.2)
-    listener = Listener(LiveBus("virtual", bus_name, [CHANNEL], dbc))
+    listener = CollectingListener(LiveBus("virtual", bus_name, [CHANNEL], dbc))
     assert listener.wait(lambda: listener.bus.connected)
     begun = time.monotonic()
     assert send(tmp_path / "run.log", "virtual", bus_name) == frames
@@ -188,7 +188,7 @@ def test_udp_multicast_carries_frames_between_buses(dbc):
     if reached is None:
         pytest.skip("no multicast here")
     live = LiveBus("udp_multicast", group["channel"], [CHANNEL], dbc, port=group["port"])
-    listener = Listener(live)
+    listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)
     with can.Bus(**group) as sender:
         for value in range(10):

@@ -66,7 +66,7 @@ def test_after_a_clock_jump_the_longest_stretch_is_kept_and_named(tmp_path):
     assert "the clock jumps 1 times; the longest stretch is used, 200 samples are not" in record.problems
 
 
-class Clock:
+class SleptClock:
     """Stands still but for those who sleep."""
 
     def __init__(self):
@@ -88,7 +88,7 @@ def blocks(seconds=4.0):
 
 @pytest.mark.parametrize("speed", [1.0, 5.0])
 def test_paced_replay_takes_the_recorded_time_over_the_speed(speed):
-    clock = Clock()
+    clock = SleptClock()
     seen = []
     for block in paced(blocks(), speed, clock, clock.sleep):
         seen.append(len(block.time))
@@ -100,14 +100,14 @@ def test_paced_replay_takes_the_recorded_time_over_the_speed(speed):
 
 
 def test_unpaced_replay_never_waits_and_bad_speeds_are_refused():
-    assert len(list(paced(blocks(), 0.0, Clock(), None))) == 3
-    assert len(list(paced(blocks(), float("inf"), Clock(), None))) == 3
+    assert len(list(paced(blocks(), 0.0, SleptClock(), None))) == 3
+    assert len(list(paced(blocks(), float("inf"), SleptClock(), None))) == 3
     with pytest.raises(ValueError, match="speed must be positive"):
         list(paced(blocks(), -1.0))
 
 
 def test_a_long_pause_in_the_recording_is_not_waited_for():
-    clock = Clock()
+    clock = SleptClock()
     pause = [SampleBlock(np.array([START + t]), np.zeros(1, dtype=np.int32), np.zeros(1)) for t in (0, 3600 * 10**9)]
     assert len(list(paced(pause, 1.0, clock, clock.sleep))) == 2
     assert clock.now - 100.0 <= 5.0

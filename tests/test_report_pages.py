@@ -15,9 +15,9 @@ from sprung.model.diagnosis.report.report import (
     Finding,
     FitFigures,
     LawParameter,
-    ParameterValue,
     RecordingFacts,
     Report,
+    ReportedParameter,
 )
 from sprung.model.system import System, load_system
 from sprung.service.report import words, write_report
@@ -40,7 +40,9 @@ def friction_report(system: System = SYSTEM) -> Report:
     x = np.linspace(-0.06, 0.06, 41)
     law = 395 * np.tanh(x / 2e-3)
     place = system.elements[-3] if len(system.elements) > 3 else system.elements[0]
-    augmented = tuple(ParameterValue(p.name, p.nominal, 0.01 * p.nominal, p.nominal, p.unit) for p in system.parameters)
+    augmented = tuple(
+        ReportedParameter(p.name, p.nominal, 0.01 * p.nominal, p.nominal, p.unit) for p in system.parameters
+    )
     baseline = tuple(replace(p, value=2.48 * p.value) if p.name == f"{place}.damping" else p for p in augmented)
     friction = LawParameter("force", 395.2, 6.1, "N"), LawParameter("smoothing", 2.1e-3, 3e-4, "m/s")
     return Report(

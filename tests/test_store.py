@@ -160,7 +160,7 @@ def test_forgetting_counts_from_when_a_window_was_stored(store: Store) -> None:
     fill(store, [record(0)], stored_ns=START)
     fill(store, [record(1)], stored_ns=late)
     with store.write() as connection:
-        forgotten = retention.forget(connection, retention.Limits(late, 0, 0))
+        forgotten = retention.forget(connection, retention.RetentionLimits(late, 0, 0))
     assert forgotten.windows == 1
     with store.read() as connection:
         assert connection.execute(select(windows.c.start_ns)).scalars().all() == [START + HOP]
@@ -174,7 +174,7 @@ def test_forgetting_names_old_uploads_but_not_those_a_job_needs(store: Store) ->
             row = work.RecordingRow(name, None, f"{name}.blf", "upload", f"{name}.blf", 1, None, created, None)
             work.add_recording(connection, row)
         work.add_job(connection, work.JobRow("j", "recording", "queued", "needed", None, 0.0, None, None, 100, 100))
-        assert retention.forget(connection, retention.Limits(0, 0, START + 150)).upload_files == ("old.blf",)
+        assert retention.forget(connection, retention.RetentionLimits(0, 0, START + 150)).upload_files == ("old.blf",)
 
 
 def test_two_processes_can_share_a_file(store: Store, tmp_path: Path) -> None:

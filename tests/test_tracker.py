@@ -9,7 +9,7 @@ import pytest
 from tracker_windows import (
     EPOCH,
     WINDOW_STD,
-    Parameter,
+    TrackedParameter,
     constant,
     correlated,
     estimate,
@@ -316,7 +316,9 @@ def test_a_repaired_vehicle_learns_a_new_baseline() -> None:
 
 def test_report_is_in_physical_units_and_relative_to_both_references() -> None:
     rng = np.random.default_rng(16)
-    tracker = Tracker([Parameter("spring.stiffness", "N/m", 4e5), Parameter("spring.damping", "N s/m", 2e4)])
+    tracker = Tracker(
+        [TrackedParameter("spring.stiffness", "N/m", 4e5), TrackedParameter("spring.damping", "N s/m", 2e4)]
+    )
     truth = np.log([1.1, 0.8])
     covariance = np.diag([1e-5, 1e-4])
     state = tracker.update_many(tracker.initial_state(), windows(rng, constant(truth), 60, covariance))

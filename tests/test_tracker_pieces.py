@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
-from tracker_windows import Parameter, correlated, estimate
+from tracker_windows import TrackedParameter, correlated, estimate
 
-from sprung.benchmarks.drift import Errors, Fleet, step_delays
+from sprung.benchmarks.drift import CorrelatedErrors, Fleet, step_delays
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
@@ -94,7 +94,7 @@ def test_false_alarms_do_not_exceed_the_stated_rate(std: float) -> None:
     rate = SECONDS_PER_MONTH / (3000 * 0.5)
     settings = TrackerSettings(learning=300.0, baseline_std=1e-3, false_alarms_per_month=rate)
     fleet = Fleet(vehicles, size, settings)
-    errors = Errors(np.eye(size)[None] * std**2, vehicles, np.random.default_rng(3))
+    errors = CorrelatedErrors(np.eye(size)[None] * std**2, vehicles, np.random.default_rng(3))
     opened = 0
     for k in range(600 + windows):
         before = fleet.changes.active
@@ -109,8 +109,8 @@ def test_batched_change_test_alarms_exactly_when_the_tracker_does() -> None:
     rng = np.random.default_rng(4)
     size, vehicles = 5, 3
     covariance = correlated(rng, np.array([0.003, 0.01, 0.02, 0.03, 0.03]))
-    errors = Errors(covariance[None], vehicles, rng)
-    tracker = Tracker([Parameter(f"element_{i}.damping") for i in range(size)])
+    errors = CorrelatedErrors(covariance[None], vehicles, rng)
+    tracker = Tracker([TrackedParameter(f"element_{i}.damping") for i in range(size)])
     states = [tracker.initial_state() for _ in range(vehicles)]
     fleet = Fleet(vehicles, size, tracker.settings)
     jump = np.array([[0.06, 0, 0, 0, 0], [0, 0, -0.08, 0, 0], [0, 0, 0, 0.1, 0]])
@@ -161,7 +161,7 @@ def test_surprise_fires_for_a_lasting_offset_and_hardly_ever_without() -> None:
 
 
 def test_one_bad_window_is_no_misfit() -> None:
-    fit = misfit.Fit()
+    fit = misfit.MisfitFloor()
     for k in range(50):
         fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, time=k)
     fit = misfit.update(fit, 50.0, adequate=False, inflation=1.0, time=50)

@@ -17,14 +17,14 @@ Stream = list[tuple[Estimate, int]]
 
 
 @dataclass(frozen=True)
-class Parameter:
+class TrackedParameter:
     name: str
     unit: str = "N/m"
     nominal: float = 1e6
 
 
 def make_tracker(size: int = 24, settings: TrackerSettings | None = None) -> Tracker:
-    return Tracker([Parameter(f"element_{i}.stiffness") for i in range(size)], settings)
+    return Tracker([TrackedParameter(f"element_{i}.stiffness") for i in range(size)], settings)
 
 
 def correlated(rng: np.random.Generator, std: FloatArray = WINDOW_STD) -> FloatArray:

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
-class Transfer:
+class VehicleTransfer:
     """Frequency responses of one vehicle from the wheels to the sensors, and to element motions."""
 
     def __init__(
@@ -67,7 +67,7 @@ def exact_response(vehicle: Vehicle, case: Case, seconds: float) -> Array:
     inertia = vehicle.inertia.copy()
     if case.mass_scale:
         inertia[vehicle.on_body(case.mass_scale[0])] *= case.mass_scale[1]
-    transfer = Transfer(vehicle, values[0], values[1], omega, inertia)
+    transfer = VehicleTransfer(vehicle, values[0], values[1], omega, inertia)
     felt = np.einsum("fsw,fw->fs", transfer.to_sensors, spectra)
     every = np.concatenate([spectra, 1j * omega[:, None] * spectra, felt], axis=1) * passed[:, None]
     padded = np.zeros((samples // 2 + 1, every.shape[1]), complex)

@@ -38,7 +38,7 @@ class Slot:
 
 
 @dataclass
-class Plant:
+class PlantBatch:
     """What differs between the recordings of a batch."""
 
     stiffness: Array  # N/m, shape (E, B)
@@ -49,10 +49,10 @@ class Plant:
     slots: list[Slot]
 
 
-class Motion:
+class BatchMotion:
     """The equations of motion of a batch, with buffers reused from step to step."""
 
-    def __init__(self, vehicle: Vehicle, plant: Plant) -> None:
+    def __init__(self, vehicle: Vehicle, plant: PlantBatch) -> None:
         self.vehicle, self.plant = vehicle, plant
         elements, batch = plant.stiffness.shape
         n = self.degrees = vehicle.inertia.size
@@ -159,7 +159,7 @@ def _hermite(displacement: Array, velocity: Array, first: int, count: int) -> Ar
 
 def simulate(
     vehicle: Vehicle,
-    plant: Plant,
+    plant: PlantBatch,
     displacement: Array,
     velocity: Array,
     seconds: float,
@@ -170,7 +170,7 @@ def simulate(
     `displacement` and `velocity` are tables at 1 kHz, shape (N, wheels, B), that start WARM_UP before the first
     sample.  The strength of a slot is the rms of its law's force over the rms of k d + c v.
     """
-    motion = Motion(vehicle, plant)
+    motion = BatchMotion(vehicle, plant)
     batch, wheels, sensors = plant.stiffness.shape[1], len(vehicle.inputs), len(vehicle.sensors)
     state = np.zeros((2 * motion.degrees + 2, batch))
     memory = np.zeros(len(plant.slots))
@@ -210,7 +210,9 @@ def simulate(
     return out, strength
 
 
-def _advance(motion: Motion, state: Array, memory: Array, support: Array, time: float) -> tuple[Array, Array, Array]:
+def _advance(
+    motion: BatchMotion, state: Array, memory: Array, support: Array, time: float
+) -> tuple[Array, Array, Array]:
     """One step from the supports at its start, middle and end, (3, 2 wheels, B); also what was felt at its start."""
     h = 1 / STEP_RATE
     k1, m1 = motion(state, memory, support[0], time)
@@ -226,7 +228,7 @@ def _advance(motion: Motion, state: Array, memory: Array, support: Array, time: 
     return state + h / 6 * k2, memory + h / 6 * (m1 + 2 * (m2 + m3) + m4), felt
 
 
-def _power(motion: Motion) -> Array:
+def _power(motion: BatchMotion) -> Array:
     """Squares of the laws' forces and of the linear forces at the start of a step, shape (2, slots)."""
     linear, extra = motion.first
     return np.stack([extra**2, linear[motion.row, motion.column] ** 2])

@@ -15,7 +15,7 @@ from sprung.benchmarks.generator import track
 from sprung.benchmarks.generator.draw import Case
 from sprung.benchmarks.generator.exact import exact_response, is_linear
 from sprung.benchmarks.generator.files import WRITERS
-from sprung.benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, Plant, Slot, simulate
+from sprung.benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, PlantBatch, Slot, simulate
 from sprung.benchmarks.generator.oracle import SETTLE, oracle_snr
 from sprung.benchmarks.generator.vehicle import Vehicle
 
@@ -25,7 +25,7 @@ SLACK = 0.6  # s simulated beyond the last sample, for the filter and for lags
 FORMATS = ("mcap", "blf", "mcap", "log", "mcap", "asc")
 
 
-def _plant(vehicle: Vehicle, cases: list[Case]) -> Plant:
+def _plant(vehicle: Vehicle, cases: list[Case]) -> PlantBatch:
     batch = len(cases)
     inertia = np.repeat(vehicle.inertia[:, None], batch, 1)
     mode, drive = np.zeros((4, batch)), np.zeros((4, batch))
@@ -40,7 +40,7 @@ def _plant(vehicle: Vehicle, cases: list[Case]) -> Plant:
             drive[:, column] = [*case.drive, np.random.default_rng(case.seed + 1).uniform(0, 2 * np.pi)]
         slots += [Slot(column, vehicle.elements.index(e), law, p) for e, law, p in case.effects]
     values = [[[getattr(c, q)[e] for c in cases] for e in vehicle.elements] for q in ("stiffness", "damping")]
-    return Plant(np.array(values[0]), np.array(values[1]), inertia, mode, drive, slots)
+    return PlantBatch(np.array(values[0]), np.array(values[1]), inertia, mode, drive, slots)
 
 
 def _delayed(signal: Array, lag: float) -> Array:
@@ -88,7 +88,7 @@ def _noisy(vehicle: Vehicle, case: Case, values: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Recording:
+class MadeRecording:
     """One made recording and the truth about it."""
 
     case: Case
@@ -103,7 +103,7 @@ def make_recordings(
     seconds: float = 60.0,
     batch: int = 32,
     progress: Callable[[str], None] | None = None,
-) -> Iterator[Recording]:
+) -> Iterator[MadeRecording]:
     """The recordings of the cases, in their order; linear vehicles by their exact response, the others integrated."""
     samples = round(seconds * SAMPLE_RATE)
     for first in range(0, len(cases), batch):
@@ -115,7 +115,7 @@ def make_recordings(
             clean, own = (exact_response(vehicle, case, seconds + 2), []) if is_linear(case) else next(integrated)
             faulty = _faulty(vehicle, case, clean, samples)
             snr = oracle_snr(vehicle, case, clean[:samples], faulty) if seconds > 2 * SETTLE else None
-            yield Recording(case, _noisy(vehicle, case, faulty), own, snr)
+            yield MadeRecording(case, _noisy(vehicle, case, faulty), own, snr)
 
 
 def _integrated(
@@ -142,7 +142,7 @@ def _integrated(
         yield clean[:, :, column], own
 
 
-def label(made: Recording, seconds: float) -> dict[str, Any]:
+def label(made: MadeRecording, seconds: float) -> dict[str, Any]:
     """One entry of labels.json, in the form of the published labels, with the generator's extras."""
     case = made.case
     entry: dict[str, Any] = {

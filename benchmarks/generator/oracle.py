@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.benchmarks.generator.draw import Case
-from sprung.benchmarks.generator.exact import Transfer
+from sprung.benchmarks.generator.exact import VehicleTransfer
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE
 from sprung.benchmarks.generator.vehicle import Vehicle
 
@@ -43,7 +43,7 @@ def _periodic(x: Array) -> Array:
     return np.vstack([x, bridge])
 
 
-def _sensitivities(transfer: Transfer, wheels: Complex, omega: Array) -> Complex:
+def _sensitivities(transfer: VehicleTransfer, wheels: Complex, omega: Array) -> Complex:
     """Response of the sensors to a relative change of every stiffness and damping (unscaled), (F, S, 2 E)."""
     deflection = np.einsum("few,fw->fe", transfer.stretch, wheels)
     by_stiffness = transfer.load_to_sensors * deflection[:, None, :]
@@ -75,7 +75,7 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
     periodic = _periodic(clean[:, :wheels])
     omega_full = np.asarray(2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE), dtype=np.float64)
     stiffness, damping = (np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping))
-    full = Transfer(vehicle, stiffness, damping, omega_full)
+    full = VehicleTransfer(vehicle, stiffness, damping, omega_full)
     spectrum = np.fft.rfft(periodic, axis=0)
 
     def back(values: Complex) -> Array:
@@ -90,7 +90,7 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
     frequency = np.fft.rfftfreq(n, 1 / SAMPLE_RATE)
     band = (frequency > 0) & (frequency < TOP)
     omega = np.asarray(2 * np.pi * frequency[band], dtype=np.float64)
-    there = Transfer(vehicle, stiffness, damping, omega)
+    there = VehicleTransfer(vehicle, stiffness, damping, omega)
     s_d, s_v = vehicle.input_noise
     variance = 1 / (1 / s_d**2 + (omega[:, None] / s_v) ** 2)  # of the fused displacement, (F, wheels)
     delta = delta[band]

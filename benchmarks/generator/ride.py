@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.benchmarks.generator import track
-from sprung.benchmarks.generator.exact import Transfer
+from sprung.benchmarks.generator.exact import VehicleTransfer
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 
@@ -23,7 +23,7 @@ ALIASED = 49.0  # Hz, above which nothing may reach a sensor
 
 
 @dataclass(frozen=True)
-class Ride:
+class DrawnRide:
     """One vehicle, its load and its track."""
 
     log_ratio: Array  # of the elements' values to nominal: stiffnesses, then dampings, shape (2 E,)
@@ -45,10 +45,10 @@ def draw_ride(
     speed: tuple[float, float] = (25.0, 50.0),
     load: tuple[float, float] = (0.85, 1.3),
     own_share: tuple[float, float] = (0.03, 0.2),
-) -> Ride:
+) -> DrawnRide:
     """Elements within nominal (1 +- spread), everything else within the ranges given."""
     elements = len(read_vehicle(SYSTEM).elements)
-    return Ride(
+    return DrawnRide(
         log_ratio=np.log(rng.uniform(1 - spread, 1 + spread, 2 * elements)),
         load=float(np.log(rng.uniform(*load))),
         speed=float(rng.uniform(*speed)),
@@ -58,16 +58,16 @@ def draw_ride(
     )
 
 
-def transfer(vehicle: Vehicle, ride: Ride, omega: Array) -> Transfer:
+def transfer(vehicle: Vehicle, ride: DrawnRide, omega: Array) -> VehicleTransfer:
     """Frequency responses of the vehicle as it rides."""
     E = len(vehicle.elements)
     values = np.exp(ride.log_ratio)
     inertia = vehicle.inertia.copy()
     inertia[vehicle.on_body(vehicle.bodies[0])] *= np.exp(ride.load)
-    return Transfer(vehicle, vehicle.stiffness * values[:E], vehicle.damping * values[E:], omega, inertia)
+    return VehicleTransfer(vehicle, vehicle.stiffness * values[:E], vehicle.damping * values[E:], omega, inertia)
 
 
-def record(rng: np.random.Generator, ride: Ride, seconds: float) -> Array:
+def record(rng: np.random.Generator, ride: DrawnRide, seconds: float) -> Array:
     """Noisy accelerations at 100 Hz of all sensors of the bundled vehicle, shape (T, S)."""
     vehicle = read_vehicle(SYSTEM)
     spectra, omega, samples = track.wheel_spectra(

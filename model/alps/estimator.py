@@ -29,7 +29,7 @@ def raw(chart: Tensor) -> Tensor:
     return chart.flatten(1)
 
 
-class Estimator(nn.Module):
+class AlpsEstimator(nn.Module):
     """Feed-forward network on features of the encoded states -> parameters (B, P)."""
 
     low: Tensor

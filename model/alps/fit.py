@@ -22,7 +22,7 @@ from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import loss_of, picture_loss, state_loss
 from sprung.model.alps.network import Network
 from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
-from sprung.model.identification.training import Run
+from sprung.model.identification.training import TrainingRun
 
 _STREAMS = {"train": 0, "test": 1, "unseen": 2}
 
@@ -32,12 +32,12 @@ class OutOfTime(Exception):
 
 
 @dataclass(frozen=True)
-class Clock:
+class TimeLimit:
     """Stops long runs between two updates."""
 
     until: float = float("inf")  # of time.monotonic()
 
-    def check(self, run: Run) -> None:
+    def check(self, run: TrainingRun) -> None:
         if time.monotonic() > self.until:
             run.save()
             raise OutOfTime(f"stopped at update {run.step}; run the same command again to go on")
@@ -75,7 +75,7 @@ def pick_windows(config: TrainingConfig, step: int, batch: int) -> tuple[Tensor,
 
 
 def train_frames(
-    task: Task, config: TrainingConfig, sizes: NetworkConfig, folder: Path, clock: Clock, device: str = "cpu"
+    task: Task, config: TrainingConfig, sizes: NetworkConfig, folder: Path, clock: TimeLimit, device: str = "cpu"
 ) -> FrameAutoencoder:
     """The frame autoencoder of a task, trained or from its checkpoint."""
     assert task.render is not None
@@ -88,7 +88,7 @@ def train_frames(
         return task.render(states[torch.from_numpy(pick)].to(device))  # type: ignore[misc]
 
     frames.standardise(draw(1000, 5), before=True)
-    run = Run(frames, folder / "frames", config, _frames_name(task, config))
+    run = TrainingRun(frames, folder / "frames", config, _frames_name(task, config))
     run.resume()
     while run.step < config.frame_updates:
         clock.check(run)
@@ -98,7 +98,9 @@ def train_frames(
         if run.step == config.frame_updates:
             frames.standardise(draw(1000, 5), before=False)
             run.save()
-    drawing = Run(frames.draw, folder / "drawing", config, f"{_frames_name(task, config)} {config.drawing_updates}")
+    drawing = TrainingRun(
+        frames.draw, folder / "drawing", config, f"{_frames_name(task, config)} {config.drawing_updates}"
+    )
     drawing.resume()
     while drawing.step < config.drawing_updates:
         clock.check(drawing)
@@ -136,7 +138,7 @@ def train_method(
     config: TrainingConfig,
     sizes: NetworkConfig,
     folder: Path,
-    clock: Clock,
+    clock: TimeLimit,
     device: str = "cpu",
 ) -> VisualModel:
     """One method of one task, trained or from its checkpoint."""
@@ -145,7 +147,7 @@ def train_method(
     if model.network.estimator is not None:  # methods without physics have no positions to start with
         model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1)[::7].to(device))
     trained = model if config.end_to_end else model.network
-    run = Run(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))
+    run = TrainingRun(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))
     run.resume()
     model.train()
     encoded: Tensor | None = None  # only while the encoder rests

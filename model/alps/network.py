@@ -20,7 +20,7 @@ from sprung.model.alps.config import Method, NetworkConfig
 from sprung.model.alps.context import ContextDynamics
 from sprung.model.alps.decoder import StateDecoder
 from sprung.model.alps.encoder import AttentionEncoder, DifferenceEncoder, Encoded
-from sprung.model.alps.estimator import Estimator, log_magnitudes, raw
+from sprung.model.alps.estimator import AlpsEstimator, log_magnitudes, raw
 from sprung.model.alps.task import WINDOW, Task
 
 
@@ -47,12 +47,12 @@ class Network(nn.Module):
         self.shown = tuple(range(len(task.states))) if method in ("autoencoder", "cdm") else task.placed
         seen = len(self.shown) + len(task.angles)
         self.decoder = StateDecoder(seen, config.embedding, config)
-        self.estimator: Estimator | None = None
+        self.estimator: AlpsEstimator | None = None
         self.context: ContextDynamics | None = None
         if method == "cdm":
             self.context = ContextDynamics(task, config)
         elif method != "autoencoder":
-            self.estimator = Estimator(task, config, raw if method == "no_fourier" else log_magnitudes)
+            self.estimator = AlpsEstimator(task, config, raw if method == "no_fourier" else log_magnitudes)
             self.encoder.head.straighten(task.placed)
 
     def forward(self, embeddings: Tensor, inputs: Tensor, horizon: int = WINDOW - 1, warm_up: bool = False) -> Passed:

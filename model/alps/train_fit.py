@@ -16,12 +16,12 @@ from sprung.model.alps.config import NetworkConfig
 from sprung.model.alps.context import ContextDynamics
 from sprung.model.alps.embedding import FeedForwardEmbedding
 from sprung.model.alps.encoder import AttentionEncoder
-from sprung.model.alps.fit import Clock
+from sprung.model.alps.fit import TimeLimit
 from sprung.model.alps.task import WINDOW, Task, windows
 from sprung.model.alps.train_estimator import LogRatioEstimator
 from sprung.model.alps.train_system import STEPS, TrainData, smoothed, train_task
 from sprung.model.identification.features import magnitudes
-from sprung.model.identification.training import Run
+from sprung.model.identification.training import TrainingRun
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 
@@ -171,12 +171,16 @@ def build(method: TrainMethod, data: TrainData) -> nn.Module:
     return StateEstimator(task, fourier=method != "no_fourier", smooth=smooth)
 
 
-def fit(method: TrainMethod, data: TrainData, config: TrainConfig, folder: Path, clock: Clock, what: str) -> nn.Module:
+def fit(
+    method: TrainMethod, data: TrainData, config: TrainConfig, folder: Path, clock: TimeLimit, what: str
+) -> nn.Module:
     """Train on the first half of the trajectories, without labels; or go on from the checkpoint."""
     torch.manual_seed(config.seed)
     model = build(method, data)
     train, _ = halves(data)
-    run = Run(model, folder / f"{method}-s{config.seed}", config, f"{what} {method} " + json.dumps(asdict(config)))
+    run = TrainingRun(
+        model, folder / f"{method}-s{config.seed}", config, f"{what} {method} " + json.dumps(asdict(config))
+    )
     run.resume()
     model.train()
     while run.step < config.updates:

@@ -20,7 +20,7 @@ from sprung.model.system import System
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class EquationSite:
     """One law along one combination of elements."""
 
     placed: PlacedLaw
@@ -31,7 +31,7 @@ class Site:
     memory: Expression | None
 
 
-def sites(system: System) -> list[Site]:
+def sites(system: System) -> list[EquationSite]:
     """The laws of a system's elements, with formulas.  Errors: `ExchangeError` for laws that no formula describes."""
     found = []
     for placed in system.laws:
@@ -48,7 +48,7 @@ def sites(system: System) -> list[Site]:
             weights[group[0]] = 1.0
             if len(group) == 2:
                 weights[group[1]] = -1.0
-            found.append(Site(placed, law, weights, group[0], parse(law.formula, known), memory))
+            found.append(EquationSite(placed, law, weights, group[0], parse(law.formula, known), memory))
     return found
 
 

@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from sprung.model.exchange.equations import Site, identifier, linear, output, sites
+from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites
 from sprung.model.exchange.statespace import ExchangeError, state_space
 from sprung.model.laws import CLOCK_LEAD
 from sprung.model.simulate.ride import with_values
@@ -71,7 +71,7 @@ def _compile(compiler: str, sources: Path, folder: Path, name: str) -> None:
         raise ExchangeError(f"{compiler}: {done.stderr.strip().splitlines()[-1] if done.stderr else 'failed'}")
 
 
-def parameters(system: System, laws: list[Site]) -> Iterator[tuple[str, float, str]]:
+def parameters(system: System, laws: list[EquationSite]) -> Iterator[tuple[str, float, str]]:
     """Name, value and unit of every parameter, in the order of their value references."""
     for quantity, unit in (("stiffness", "N/m"), ("damping", "N.s/m")):
         for name, value in zip(system.elements, getattr(system.mechanics, quantity).tolist(), strict=True):
@@ -81,7 +81,7 @@ def parameters(system: System, laws: list[Site]) -> Iterator[tuple[str, float, s
             yield full, value, spec.unit
 
 
-def _equations(system: System, laws: list[Site]) -> str:
+def _equations(system: System, laws: list[EquationSite]) -> str:
     """The generated header but for its GUID."""
     m, E, n = system.mechanics, len(system.elements), system.mechanics.n
     names = [name for name, _, _ in parameters(system, laws)]
@@ -114,7 +114,7 @@ def _equations(system: System, laws: list[Site]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _law(site: Site, index: int, names: list[str], state: int | None, memories: list[int], E: int) -> list[str]:
+def _law(site: EquationSite, index: int, names: list[str], state: int | None, memories: list[int], E: int) -> list[str]:
     """Force of a law, added to the elements it acts on, and the rate of its state."""
     at = {own: f"p[{names.index(full)}]" for own, full in zip(site.law.names, site.placed.names, strict=True)}
     rename = at | {
@@ -166,7 +166,7 @@ def _internal_step(system: System) -> float:
     return min(1 / system.sample_rate, 1 / (_STEPS_PER_RADIAN * fastest))
 
 
-def _description(system: System, laws: list[Site], name: str, guid: str) -> bytes:
+def _description(system: System, laws: list[EquationSite], name: str, guid: str) -> bytes:
     """modelDescription.xml."""
     space = state_space(system)
     given = list(parameters(system, laws))

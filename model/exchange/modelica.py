@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sprung.model.exchange.equations import Site, identifier, linear, output, sites
+from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites
 from sprung.model.laws import CLOCK_LEAD
 from sprung.model.system import System
 
@@ -27,11 +27,11 @@ def modelica(system: System, package: str) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _name(site: Site, index: int) -> str:
+def _name(site: EquationSite, index: int) -> str:
     return f"{identifier(site.law.name)}_{identifier(site.placed.location)}_{index}"
 
 
-def _block(site: Site, index: int) -> list[str]:
+def _block(site: EquationSite, index: int) -> list[str]:
     """A law: its motion in, its force out."""
     name = _name(site, index)
     rename = {"t": f"(time + {CLOCK_LEAD!r})"}
@@ -53,7 +53,7 @@ def _block(site: Site, index: int) -> list[str]:
     return [*lines, f"  end {name};", ""]
 
 
-def _vehicle(system: System, laws: list[Site]) -> list[str]:
+def _vehicle(system: System, laws: list[EquationSite]) -> list[str]:
     m = system.mechanics
     dofs = [identifier(dof) for dof in m.dofs]
     names = [identifier(element) for element in system.elements]

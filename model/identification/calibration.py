@@ -45,7 +45,7 @@ class Evidence:
         return self.cross.numpy(), self.information.numpy(), self.score.numpy()
 
 
-class Calibration:
+class DeviationSensitivity:
     """Sensitivities of a window model to the deviations of its system."""
 
     def __init__(self, model: WindowModel) -> None:

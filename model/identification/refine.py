@@ -26,7 +26,7 @@ import torch
 from torch import Tensor
 
 from sprung.model.chunks import alike, chunks, share
-from sprung.model.identification.calibration import Calibration
+from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
@@ -72,7 +72,7 @@ class Refiner:
     def __init__(self, system: System, samples: int | None = None, workers: int = 1) -> None:
         self.system, self.workers = system, workers
         self.model = WindowModel(system, samples or system.window)
-        self.calibration = Calibration(self.model)
+        self.calibration = DeviationSensitivity(self.model)
 
     @property
     def observations(self) -> int:

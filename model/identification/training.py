@@ -71,7 +71,7 @@ def train(
     data = _simulated_rows(features, settings, report)
     net = new_estimator(system, settings.seed).double()
     _initialise(net, features, data, settings)
-    run = Run(net, out / "checkpoint", settings, _fingerprint(system, settings))
+    run = TrainingRun(net, out / "checkpoint", settings, _fingerprint(system, settings))
     run.resume()
     _fit_simulated(run, settings, data, report)
     if recordings is not None and len(recordings):
@@ -161,7 +161,7 @@ class RunSettings(Protocol):
         """Steps between checkpoints."""
 
 
-class Run:
+class TrainingRun:
     """The network with its optimiser, saved every so often as tensors (never a pickle)."""
 
     def __init__(self, net: nn.Module, path: Path, settings: RunSettings, fingerprint: str) -> None:
@@ -220,7 +220,7 @@ class Run:
         self.path.with_suffix(".safetensors").unlink(missing_ok=True)
 
 
-def _fit_simulated(run: Run, settings: TrainingSettings, data: _Rows, report: Progress) -> None:
+def _fit_simulated(run: TrainingRun, settings: TrainingSettings, data: _Rows, report: Progress) -> None:
     while run.step < settings.steps:
         rng = run.generator()
         run.rate(settings.steps)
@@ -246,7 +246,7 @@ def _likelihood(error: Tensor, covariance: Tensor) -> Tensor:
 
 
 def _fit_recordings(
-    run: Run, settings: TrainingSettings, features: ForceBalance, windows: FloatArray, report: Progress
+    run: TrainingRun, settings: TrainingSettings, features: ForceBalance, windows: FloatArray, report: Progress
 ) -> None:
     """Physics in the loop: the misfit of the simulated outputs, per degree of freedom, as the loss."""
     refiner = Refiner(features.system)

@@ -129,7 +129,7 @@ class Maxwell(NamedTuple):
     replaces: float  # N s/m, what of the element's own damper is in the branch
 
 
-class Reading(NamedTuple):
+class FittedElement(NamedTuple):
     """An element as it was identified without a law."""
 
     stiffness: float  # N/m
@@ -182,7 +182,7 @@ class ElementLaw(Parametrised):
     branch: Callable[[Values, float], Maxwell] | None = None
     # Force along a whole deflection (T,), quicker than step by step; None: as the memory's rate says
     path: Callable[[FloatArray, Values], FloatArray] | None = None
-    restarts: Callable[[Reading], tuple[Restart, ...]] | None = None  # besides the start that screening finds
+    restarts: Callable[[FittedElement], tuple[Restart, ...]] | None = None  # besides the start that screening finds
     prior_cost: float = 0.0
     named: bool = True
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s

@@ -9,11 +9,11 @@ import numpy as np
 from sprung.model.laws.base import (
     RARE,
     ElementLaw,
+    FittedElement,
     Maxwell,
     Motion,
     Observed,
     ParameterSpec,
-    Reading,
     Restart,
     SpringDamper,
     Values,
@@ -51,7 +51,7 @@ def _series_branch(p: Values, damping: float) -> Maxwell:
     return Maxwell(p[0], damping / p[0], damping)
 
 
-def _behind_a_spring(read: Reading) -> tuple[Restart, ...]:
+def _behind_a_spring(read: FittedElement) -> tuple[Restart, ...]:
     """A damper that gives way was read as a weaker one beside a stiffer spring: start from a stronger one, too.
 
     At w, c behind ks acts as a damper c / (1 + r^2) and a spring w c r / (1 + r^2), r = w c / ks.  With w the motion's

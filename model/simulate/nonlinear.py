@@ -49,7 +49,7 @@ class Placement:
         return rows[:1] - rows[1:2] if self.law.where == "pair" else rows
 
 
-class Model:
+class DiscreteSystem:
     """A system at given element values with laws in place, discretised: what runs and sensitivities share."""
 
     def __init__(self, mechanics: Mechanics, sample_rate: float, placements: tuple[Placement, ...], parts: int) -> None:
@@ -116,7 +116,7 @@ class Model:
 
 
 @dataclass(frozen=True)
-class Run:
+class NonlinearRun:
     """One simulated recording."""
 
     outputs: FloatArray  # what sensors show behind their anti-alias filter, without noise, (T, S)
@@ -124,7 +124,7 @@ class Run:
     deflection: FloatArray  # of every element, m, (T, E)
     rate: FloatArray  # m/s, (T, E)
     force: FloatArray  # of the law at every site, N, (T, L)
-    model: Model
+    model: DiscreteSystem
     knots: FloatArray  # (T, 2K)
     solution: Solution  # the laws' part alone
     start: float  # the laws' clock at the first sample, s
@@ -146,8 +146,8 @@ class NonlinearSimulator:
         mass: FloatArray | None = None,
         x0: FloatArray | None = None,
         start: float = CLOCK_LEAD,
-        near: Run | None = None,
-    ) -> Run:
+        near: NonlinearRun | None = None,
+    ) -> NonlinearRun:
         """Simulate a recording.
 
         knots (T, 2K): value and slope of every drive at the samples, in the order of u.  stiffness, damping (E,) and
@@ -163,11 +163,11 @@ class NonlinearSimulator:
         first = np.zeros(2 * mechanics.n) if x0 is None else np.asarray(x0, dtype=float)
         chain = cubic_chain(knots, 1 / self.sample_rate)[..., None]
         parts = self.parts or _parts_for_modes(mechanics, self.sample_rate)
-        model = Model(mechanics, self.sample_rate, tuple(placements), parts)
+        model = DiscreteSystem(mechanics, self.sample_rate, tuple(placements), parts)
         linear = model.exact.path(chain, first[:, None])
         known = model.known_motion(linear, chain)
         if self.parts is None and (needed := _parts_for_laws(model, known[..., 0], start)) > parts:
-            model = Model(mechanics, self.sample_rate, model.placements, needed)
+            model = DiscreteSystem(mechanics, self.sample_rate, model.placements, needed)
             known = model.known_motion(linear, chain)
         guess = near.solution if near is not None and near.model.names == model.names else None
         solution = solve(
@@ -176,12 +176,14 @@ class NonlinearSimulator:
         return _assemble(model, knots, linear[..., 0], solution, start)
 
 
-def _assemble(model: Model, knots: FloatArray, linear: FloatArray, solution: Solution, start: float) -> Run:
+def _assemble(
+    model: DiscreteSystem, knots: FloatArray, linear: FloatArray, solution: Solution, start: float
+) -> NonlinearRun:
     m = model.mechanics
     states = linear + solution.states[..., 0]
     u, fine = drive_vector(m, knots), solution.force[..., 0]
     shown = band_limited(fine, model.parts)
-    return Run(
+    return NonlinearRun(
         outputs=states @ model.C.T + u @ model.D.T + shown @ model.force_outputs.T,
         states=states,
         deflection=states[:, : m.n] @ m.H.T + u[:, m.support_drive] @ m.G.T,
@@ -218,7 +220,7 @@ def _parts_for_modes(mechanics: Mechanics, sample_rate: float) -> int:
     return _power_of_two(_STEPS_PER_RADIAN * fastest / sample_rate)
 
 
-def _parts_for_laws(model: Model, known: FloatArray, start: float) -> int:
+def _parts_for_laws(model: DiscreteSystem, known: FloatArray, start: float) -> int:
     """Steps per sample at which the steepest slopes of the laws are followed stably."""
     L = len(model.weights)
     time = start + np.arange(len(known)) * model.dt / (2 * model.parts)

@@ -17,7 +17,7 @@ import numpy as np
 from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations as dev
-from sprung.model.tracking.deviations import Jump, Model
+from sprung.model.tracking.deviations import DeviationModel, Jump
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 
@@ -46,7 +46,7 @@ class Attribution:
     names: tuple[str, ...]
     settings: TrackerSettings
     deviations: tuple[Deviation, ...]
-    model: Model
+    model: DeviationModel
 
     @property
     def kinds(self) -> list[str]:

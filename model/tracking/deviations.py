@@ -35,7 +35,7 @@ STOPPED = 5.0  # s without a used window after which passengers may have boarded
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Model:
+class DeviationModel:
     """Constants: how deviations are distributed at first, how they wander, and in which directions they jump."""
 
     kinds: tuple[str, ...]
@@ -53,7 +53,7 @@ class Model:
         return np.array([kind == "load" for kind in self.kinds], dtype=bool)
 
 
-def model_of(deviations: Sequence[Deviation]) -> Model:
+def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     """Delays of one clock share most of their variance; everything else is independent."""
     H = len(deviations)
     kinds = tuple(d.kind for d in deviations)
@@ -70,11 +70,11 @@ def model_of(deviations: Sequence[Deviation]) -> Model:
         members = (late & (group == number)).astype(float)
         if members.sum() > 1:
             rows.append(members)
-    return Model(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H))
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibration:
+class DeviationRecord:
     """What the tracker keeps about deviations beside the filter's belief."""
 
     cross: FloatArray  # mean sensitivity of the log-ratios to the deviations, shape (P, H)
@@ -88,10 +88,10 @@ class Calibration:
     recent: IntArray  # ns, the last windows that were weighed, shape (3,); 0: none
 
 
-def start(parameters: int, model: Model) -> Calibration:
+def start(parameters: int, model: DeviationModel) -> DeviationRecord:
     H, V = model.size, len(model.directions)
     zeros = np.zeros
-    return Calibration(
+    return DeviationRecord(
         zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), zeros(V), zeros(V),
         zeros(V, dtype=np.int64), zeros(1), zeros(3, dtype=np.int64),
     )  # fmt: skip
@@ -108,8 +108,8 @@ class Jump:
 
 
 def weigh(
-    calibration: Calibration, model: Model, belief: Belief, found: Deviating, share: float, time: int
-) -> tuple[Calibration, Belief, Jump | None]:
+    calibration: DeviationRecord, model: DeviationModel, belief: Belief, found: Deviating, share: float, time: int
+) -> tuple[DeviationRecord, Belief, Jump | None]:
     """After a window that says something about deviations: belief, evidence for jumps, and one that is certain.
 
     share: of the window that no earlier weighed window saw.
@@ -158,7 +158,7 @@ def explained(belief: Belief, found: Deviating) -> float:
     return max(0.0, gained) / max(found.freedom, 1.0)
 
 
-def loaded(belief: Belief, model: Model, found: Deviating, share: float) -> Belief:
+def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float) -> Belief:
     """Belief after a window that speaks of loads only."""
     at = np.flatnonzero(model.loads)
     rows = at + len(belief.mean) - model.size
@@ -171,8 +171,13 @@ def loaded(belief: Belief, model: Model, found: Deviating, share: float) -> Beli
 
 
 def _judged(
-    calibration: Calibration, model: Model, along: FloatArray, information: FloatArray, bounded: float, time: int
-) -> tuple[Calibration, Jump | None]:
+    calibration: DeviationRecord,
+    model: DeviationModel,
+    along: FloatArray,
+    information: FloatArray,
+    bounded: float,
+    time: int,
+) -> tuple[DeviationRecord, Jump | None]:
     """Evidence after a window whose scores count by `bounded`; a jump where there is enough."""
     # Directions for which nothing speaks begin anew: what was quiet before must not outvote a jump.
     old = calibration.slope
@@ -194,7 +199,7 @@ def _judged(
     return replace(calibration, slope=slope, curvature=curvature, since=since), jump
 
 
-def _loosened(belief: Belief, model: Model, cross: FloatArray, jump: Jump) -> Belief:
+def _loosened(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Jump) -> Belief:
     """Belief after a jump was found: the deviation, and what the parameters took of it, are open again."""
     H = model.size
     open_ = np.zeros(len(belief.mean))
@@ -204,7 +209,7 @@ def _loosened(belief: Belief, model: Model, cross: FloatArray, jump: Jump) -> Be
     return replace(belief, covariance=belief.covariance + np.outer(open_, open_) + np.outer(taken, taken))
 
 
-def boarded(belief: Belief, model: Model) -> Belief:
+def boarded(belief: Belief, model: DeviationModel) -> Belief:
     """Belief after a stop: any load."""
     covariance = belief.covariance.copy()
     at = np.flatnonzero(model.loads) + len(belief.mean) - model.size
@@ -213,7 +218,7 @@ def boarded(belief: Belief, model: Model) -> Belief:
     return replace(belief, covariance=covariance)
 
 
-def unsure(belief: Belief, model: Model) -> Belief:
+def unsure(belief: Belief, model: DeviationModel) -> Belief:
     """Belief after a parameter was lost: it may have been a sensor, whose deviation is open to a third of its prior."""
     H = model.size
     covariance = belief.covariance.copy()

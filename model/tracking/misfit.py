@@ -20,7 +20,7 @@ LEAST_SPREAD = 0.1  # of log chi-square; windows of one vehicle differ by that w
 
 
 @dataclass(frozen=True, slots=True)
-class Fit:
+class MisfitFloor:
     """Noise floor of log chi-square (mean and spread over learning) and a one-sided Page test on it."""
 
     windows: int = 0  # that the floor was learned from
@@ -31,7 +31,7 @@ class Fit:
     misfit_since: int | None = None  # ns; None: windows fit
 
 
-def update(fit: Fit, chi_square: float, *, adequate: bool, inflation: float, time: int) -> Fit:
+def update(fit: MisfitFloor, chi_square: float, *, adequate: bool, inflation: float, time: int) -> MisfitFloor:
     """After one window; `time` in ns, `inflation` the largest scatter of a parameter over what windows state.
 
     The floor is learned from the first `FLOOR_WINDOWS` adequate windows of the vehicle and then stays: a floor that

@@ -13,9 +13,9 @@ from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
-from sprung.model.tracking.deviations import Calibration
+from sprung.model.tracking.deviations import DeviationRecord
 from sprung.model.tracking.filter import Belief
-from sprung.model.tracking.misfit import Fit
+from sprung.model.tracking.misfit import MisfitFloor
 from sprung.model.tracking.scatter import Scatter
 from sprung.model.tracking.surprise import Surprise
 
@@ -79,8 +79,8 @@ class TrackerState:
     scatter: Scatter
     surprise: Surprise
     changes: Changes
-    fit: Fit
-    calibration: Calibration
+    fit: MisfitFloor
+    calibration: DeviationRecord
     stuck: tuple[Stuck, ...]  # frozen, saturated, reversed or exchanged channels of the last windows
     alarms: tuple[Alarm, ...]  # active and closed, oldest first
     coverage: Coverage = field(default_factory=Coverage)
@@ -137,7 +137,7 @@ class TrackerState:
                 scatter=_scatter(data),
                 surprise=Surprise(**_unpack_all(data["surprise"])),
                 changes=Changes(**_unpack_all(data["changes"])),
-                fit=Fit(**data["fit"]),
+                fit=MisfitFloor(**data["fit"]),
                 calibration=_calibration(data),
                 stuck=tuple(Stuck(**stuck) for stuck in data.get("stuck", ())),
                 alarms=tuple(
@@ -164,13 +164,13 @@ def _belief(data: Mapping[str, Any]) -> Belief:
     return Belief(mean, full, len(mean) - 2 * len(data["names"]))
 
 
-def _calibration(data: Mapping[str, Any]) -> Calibration:
+def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     """Format 1, and a tracker that was not told of deviations, have none."""
     if "calibration" not in data:
         return deviations.start(len(data["names"]), deviations.model_of(()))
     arrays = _unpack_all(data["calibration"])
     shape = len(data["names"]), len(arrays["reference"])
-    return Calibration(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
+    return DeviationRecord(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 
 
 def _scatter(data: Mapping[str, Any]) -> Scatter:

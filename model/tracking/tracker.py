@@ -107,7 +107,7 @@ class Tracker:
             scatter=scatter.start((size,)),
             surprise=surprise.start(size),
             changes=change_test.start((size,)),
-            fit=misfit.Fit(),
+            fit=misfit.MisfitFloor(),
             calibration=dev.start(size, self.model),
             stuck=(),
             alarms=(),
@@ -390,7 +390,7 @@ class Tracker:
         self,
         estimate: Estimate,
         found: Deviating | None,
-        calibration: dev.Calibration,
+        calibration: dev.DeviationRecord,
         belief: kalman.Belief,
         mask: BoolArray,
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -403,7 +403,7 @@ class Tracker:
             return value + np.where(mask, calibration.cross @ here, 0.0), estimate.covariance, calibration.cross
         return value + np.where(mask, found.cross @ (here - found.point), 0.0), found.given, found.cross
 
-    def _open(self, calibration: dev.Calibration, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
+    def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
         H = self.model.size
         other = (calibration.moved > 0) | self.model.loads
@@ -414,7 +414,7 @@ class Tracker:
         return np.asarray(np.einsum("ph,hj,pj->p", cross[:, at], own, cross[:, at]))
 
     def _of_baseline(
-        self, state: TrackerState, calibration: dev.Calibration, cross: FloatArray, belief: kalman.Belief
+        self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray, belief: kalman.Belief
     ) -> FloatArray:
         """What the deviations of the baseline's windows contribute, (P,); loads are taken out window by window.
 
@@ -432,10 +432,10 @@ class Tracker:
         self,
         state: TrackerState,
         tested: change_test.Changes,
-        calibration: dev.Calibration,
+        calibration: dev.DeviationRecord,
         cross: FloatArray,
         belief: kalman.Belief,
-    ) -> dev.Calibration:
+    ) -> dev.DeviationRecord:
         """Sensitivities of the baseline's windows, and the deviations that it was learned with."""
         if not self.model.size:
             return calibration

@@ -11,7 +11,7 @@ from fastapi.responses import Response
 from pydantic import TypeAdapter
 from sqlalchemy import Connection
 
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
 from sprung.service.store import audit
 from sprung.service.times import now_ns
@@ -61,14 +61,14 @@ async def note(core: Core, actor: Actor, action: str, target: str, detail: dict[
 def known_vehicle(found: bool, vehicle: str) -> None:
     """404 for a vehicle of which nothing was stored."""
     if not found:
-        raise Problem(404, f"nothing is known of vehicle {vehicle[:128]!r}")
+        raise ApiProblem(404, f"nothing is known of vehicle {vehicle[:128]!r}")
 
 
 def own_vehicle(actor: Actor, vehicle: str | None) -> None:
     """403 for a vehicle of another fleet, and for work of which nobody knows whose vehicle it is about."""
     if not actor.sees(vehicle):
         what = "name the vehicle" if vehicle is None else f"vehicle {vehicle[:128]!r} is of another fleet"
-        raise Problem(403, f"{what}; the token is for those that begin with {actor.fleet!r}")
+        raise ApiProblem(403, f"{what}; the token is for those that begin with {actor.fleet!r}")
 
 
 _ANY: TypeAdapter[object] = TypeAdapter(object)

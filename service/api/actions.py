@@ -12,10 +12,10 @@ from pydantic import Field
 from sprung.model.tracking.tracker import TrackerStateError
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
-from sprung.service.api.bodies import Strict
+from sprung.service.api.bodies import StrictBody
 from sprung.service.api.fleet import vehicle_answer
 from sprung.service.api.idempotency import Once, OnceOf
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Limit
 from sprung.service.store import fleet, marks
 from sprung.service.store.marks import MarkRow
@@ -25,13 +25,13 @@ router = APIRouter(tags=["operation"])
 Text = Annotated[str, Field(min_length=1, max_length=2000, examples=["damper 2l replaced, order 4711"])]
 
 
-class AcknowledgeBody(Strict):
+class AcknowledgeBody(StrictBody):
     """Which alarm was seen."""
 
     alarm: int | None = Field(default=None, ge=1, le=2**63 - 1, description="its id; left out: all that are active")
 
 
-class NoteBody(Strict):
+class NoteBody(StrictBody):
     """A note on the time line."""
 
     text: Text
@@ -49,14 +49,14 @@ class MaintenanceBody(NoteBody):
     )
 
 
-class VehicleBody(Strict):
+class VehicleBody(StrictBody):
     """What is to be changed; what is left out stays."""
 
     label: str | None = Field(default=None, max_length=128, description="what people call it; empty takes it away")
     retired: bool | None = Field(default=None, description="out of service: not listed, data kept")
 
 
-@router.post("/vehicles/{id}/acknowledge", summary="Acknowledge alarms", response_model=models.Vehicle)
+@router.post("/vehicles/{id}/acknowledge", summary="Acknowledge alarms", response_model=models.VehicleAnswer)
 async def acknowledge(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: AcknowledgeBody) -> Response:
     """Somebody has seen them; they stay active until the vehicle is well again."""
 
@@ -78,7 +78,7 @@ async def list_marks(core: CoreOf, id_: Id, limit: Limit = 100) -> Response:
     return json_response({"vehicle": id_, "marks": [mark_dict(row) for row in await read(core, query)]})
 
 
-@router.post("/vehicles/{id}/notes", status_code=201, summary="Write a note", response_model=models.Mark)
+@router.post("/vehicles/{id}/notes", status_code=201, summary="Write a note", response_model=models.MarkAnswer)
 async def note(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: NoteBody) -> Response:
     """A line on the vehicle's time line."""
 
@@ -89,7 +89,9 @@ async def note(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: NoteBo
     return await _once(once, act)
 
 
-@router.post("/vehicles/{id}/maintenance", status_code=201, summary="Mark a maintenance", response_model=models.Mark)
+@router.post(
+    "/vehicles/{id}/maintenance", status_code=201, summary="Mark a maintenance", response_model=models.MarkAnswer
+)
 async def maintenance(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body: MaintenanceBody) -> Response:
     """Closes the alarms of the parameters that were worked on and learns their baselines anew."""
 
@@ -100,13 +102,13 @@ async def maintenance(core: CoreOf, actor: ActorOf, once: OnceOf, id_: Id, body:
                 core.operations.maintenance, actor.name, id_, body.text, time, body.parameters
             )
         except TrackerStateError as error:
-            raise Problem(422, str(error), [{"field": "parameters", "detail": str(error)}]) from error
+            raise ApiProblem(422, str(error), [{"field": "parameters", "detail": str(error)}]) from error
         return json_response(mark_dict(kept), 201)
 
     return await _once(once, act)
 
 
-@router.patch("/vehicles/{id}", summary="Rename or retire a vehicle", response_model=models.Vehicle)
+@router.patch("/vehicles/{id}", summary="Rename or retire a vehicle", response_model=models.VehicleAnswer)
 async def change(core: CoreOf, actor: ActorOf, id_: Id, body: VehicleBody) -> Response:
     """What is left out stays as it is."""
     if "label" in body.model_fields_set:
@@ -125,7 +127,7 @@ async def remove(
 ) -> Response:
     """Windows, alarms, marks, reports and uploaded files go; the audit log keeps that they did."""
     if confirm != id_:
-        raise Problem(422, "confirm must repeat the vehicle's id", [{"field": "confirm", "detail": "is another id"}])
+        raise ApiProblem(422, "confirm must repeat the vehicle's id", [{"field": "confirm", "detail": "is another id"}])
     await run_in_threadpool(core.operations.remove, actor.name, id_)
     return Response(status_code=204)
 
@@ -156,5 +158,5 @@ def _time(text: str | None) -> int | None:
     except (ValueError, OverflowError):
         time = -1
     if not 0 <= time < 2**63:
-        raise Problem(422, "time is no RFC 3339 time", [{"field": "time", "detail": "is no RFC 3339 time"}])
+        raise ApiProblem(422, "time is no RFC 3339 time", [{"field": "time", "detail": "is no RFC 3339 time"}])
     return time

@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse,
 from pydantic import Field
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response, read
-from sprung.service.api.bodies import Strict
+from sprung.service.api.bodies import StrictBody
 from sprung.service.api.guard import COOKIE, session_of
 from sprung.service.pages.render import render
 from sprung.service.store import audit
@@ -30,7 +30,7 @@ SAMPLE_SECONDS = 0.01
 MOST_STACKS = 2000
 
 
-class TokenBody(Strict):
+class TokenBody(StrictBody):
     """A token to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=128)]

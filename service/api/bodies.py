@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from pydantic_core import from_json
 
 from sprung.model.signals import FloatArray
-from sprung.service.api.problems import SHOWN_ERRORS, Problem, from_validation
+from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.engine import Engine
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
@@ -22,13 +22,13 @@ FUTURE_SECONDS = 300  # by which a client's clock may be ahead
 RATE_TOLERANCE = 1e-3  # relative; a clock that is off by more would shift stiffnesses by more than their bound
 
 
-class Strict(BaseModel):
+class StrictBody(BaseModel):
     """No coercion, no unknown keys."""
 
     model_config = ConfigDict(strict=True, extra="forbid")
 
 
-class WindowBody(Strict):
+class WindowBody(StrictBody):
     """One window: the same number of samples of every channel, SI units."""
 
     vehicle: VehicleId | None = None
@@ -41,14 +41,14 @@ class WindowBody(Strict):
     )
 
 
-class DiagnoseBody(Strict):
+class DiagnoseBody(StrictBody):
     """What to look into: a recording that was uploaded before, or a vehicle's last minute."""
 
     recording: str | None = Field(default=None, max_length=36)
     vehicle: VehicleId | None = None
 
 
-class WindowHead(Strict):
+class WindowHead(StrictBody):
     """A window's body without its samples, which are looked at by themselves."""
 
     vehicle: VehicleId | None = None
@@ -60,18 +60,18 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
     """The head of a `WindowBody` and its samples, shape (T, C), NaN for absent sensors.
 
     Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
-    Raises a 422 Problem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
+    Raises a 422 ApiProblem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
     """
     # counted before they are made into anything
     if max(content.count(mark) for mark in (b'"', b"[", b"{")) > 4 * MOST_CHANNELS:
         detail = "holds too many strings or lists: a window has a list of plain numbers a channel"
-        raise Problem(422, f"body {detail}", [_wrong("body", detail)])
+        raise ApiProblem(422, f"body {detail}", [_wrong("body", detail)])
     try:
         raw = from_json(content, allow_inf_nan=False)
     except ValueError as error:
-        raise Problem(422, f"body: {error}", [_wrong("body", str(error))]) from None
+        raise ApiProblem(422, f"body: {error}", [_wrong("body", str(error))]) from None
     if not isinstance(raw, dict):
-        raise Problem(422, "body: should be an object", [_wrong("body", "should be an object")])
+        raise ApiProblem(422, "body: should be an object", [_wrong("body", "should be an object")])
     channels = raw.pop("channels", None)
     wrong: list[dict[str, str]] = []
     head = _head(raw, wrong)
@@ -82,7 +82,7 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
     values = _samples(channels, engine, wrong)
     if wrong or head is None:
         more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-        raise Problem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
+        raise ApiProblem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
     return head, values
 
 
@@ -144,7 +144,7 @@ def _not_numbers(samples: object, length: int) -> tuple[str, str] | None:
 def start_of(head: WindowHead, now: int) -> int | None:
     """The window's start, ns since epoch, or None where the body has none.
 
-    A 422 Problem when it is no time, or one that is still to come: the vehicle's tracker would take nothing that
+    A 422 ApiProblem when it is no time, or one that is still to come: the vehicle's tracker would take nothing that
     comes before it any more.
     """
     if head.start is None:
@@ -154,10 +154,10 @@ def start_of(head: WindowHead, now: int) -> int | None:
     except ValueError:
         start = -1
     if not 0 <= start < 2**63:
-        raise Problem(422, "start is no RFC 3339 time", [_wrong("start", "is no RFC 3339 time")])
+        raise ApiProblem(422, "start is no RFC 3339 time", [_wrong("start", "is no RFC 3339 time")])
     if start > now + FUTURE_SECONDS * NANOSECONDS:
         detail = f"is more than {FUTURE_SECONDS // 60} minutes after {to_iso(now)}, the service's time"
-        raise Problem(422, f"start {detail}", [_wrong("start", detail)])
+        raise ApiProblem(422, f"start {detail}", [_wrong("start", detail)])
     return start
 
 

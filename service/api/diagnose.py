@@ -14,7 +14,7 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import OnceOf
-from sprung.service.api.problems import Problem, from_validation
+from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.recordings import job_dict
 from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import discard, receive
@@ -56,7 +56,7 @@ async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf)
         elif kind == "application/json":
             job = await _of_reference(request, core, actor)
         else:
-            raise Problem(415, "send multipart/form-data with a file, or application/json")
+            raise ApiProblem(415, "send multipart/form-data with a file, or application/json")
         await note(core, actor, "diagnose", job.id, {"vehicle": job.vehicle_id})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 
@@ -103,7 +103,7 @@ async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
         raise from_validation(error) from None
     if (body.recording is None) == (body.vehicle is None):
         detail = "give either recording or vehicle"
-        raise Problem(422, detail, [{"field": "recording", "detail": detail}])
+        raise ApiProblem(422, detail, [{"field": "recording", "detail": detail}])
     if body.recording is None:
         vehicle = str(body.vehicle)
         own_vehicle(actor, vehicle)

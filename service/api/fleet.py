@@ -51,7 +51,7 @@ async def vehicles(
     return json_response(await read(core, query))
 
 
-@router.get("/vehicles/{id}", summary="A vehicle as it stands", response_model=models.Vehicle)
+@router.get("/vehicles/{id}", summary="A vehicle as it stands", response_model=models.VehicleAnswer)
 async def vehicle(core: CoreOf, id_: Id) -> Response:
     """Tracked parameters, fit, active alarms and health in the terms of NAMUR NE 107."""
     return json_response(await read(core, lambda connection: vehicle_answer(core, connection, id_)))

@@ -17,7 +17,7 @@ from prometheus_client import Histogram
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sprung.service.api.problems import Problem, problem_response
+from sprung.service.api.problems import ApiProblem, problem_response
 from sprung.service.api.scopes import VEHICLE_PATH, Need, need_of, place_of
 from sprung.service.logs import request_id
 from sprung.service.settings import Settings
@@ -106,7 +106,7 @@ class Guard:
             self._limiter.take(actor.name if actor.name != "local" else _address(scope))
             self._check_browser(scope, headers, need, by_cookie)
             self._check_scope(actor, need, path)
-        except Problem as problem:
+        except ApiProblem as problem:
             response = problem_response(problem, path)
             if problem.status == 401 and _wants_page(headers) and scope["method"] == "GET":
                 response.status_code = 303
@@ -148,11 +148,11 @@ class Guard:
         host = host_of(headers.get("host", ""))
         allowed = self._settings.allowed_hosts
         if allowed and host not in allowed:
-            raise Problem(421, "this host name is not served here; allow it with SPRUNG_ALLOWED_HOSTS")
+            raise ApiProblem(421, "this host name is not served here; allow it with SPRUNG_ALLOWED_HOSTS")
         if allowed or "." not in host.rstrip(".") or host.endswith(".localhost") or _is_address(host):
             return
         if host != self._settings.host and not self.required:
-            raise Problem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
+            raise ApiProblem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
 
     def _check_browser(self, scope: Scope, headers: Headers, need: Need, by_cookie: bool) -> None:
         """Against pages of others that make a browser send: they cannot send a token, and they cannot hide."""
@@ -160,26 +160,28 @@ class Guard:
             return
         if by_cookie:
             if headers.get("sec-fetch-site", "none") not in ("same-origin", "none"):
-                raise Problem(403, "requests of other sites are not taken")
+                raise ApiProblem(403, "requests of other sites are not taken")
             origin = headers.get("origin")
             if origin is not None and urlsplit(origin).netloc.lower() != headers.get("host", "").lower():
-                raise Problem(403, "requests of other origins are not taken")
+                raise ApiProblem(403, "requests of other origins are not taken")
         kind = headers.get("content-type", "").split(";")[0].strip().lower()
         length = headers.get("content-length")
         sent = "transfer-encoding" in headers or (length is not None and length != "0")
         if not kind and "application/json" in need.body:
             return  # a browser that sends without a type tells its origin, which was looked at
         if sent and kind not in need.body:
-            raise Problem(415, f"send {' or '.join(need.body)}", headers={"Accept-Post": ", ".join(need.body)})
+            raise ApiProblem(415, f"send {' or '.join(need.body)}", headers={"Accept-Post": ", ".join(need.body)})
 
     def _check_scope(self, actor: Actor, need: Need, path: str) -> None:
         if need.scope and not actor.may(need.scope):
-            raise Problem(403, f"this needs the scope `{need.scope}`; the token has {', '.join(sorted(actor.scopes))}")
+            raise ApiProblem(
+                403, f"this needs the scope `{need.scope}`; the token has {', '.join(sorted(actor.scopes))}"
+            )
         if need.scope and actor.fleet and not need.by_fleet:
-            raise Problem(403, f"this shows all vehicles; the token is for those that begin with {actor.fleet!r}")
+            raise ApiProblem(403, f"this shows all vehicles; the token is for those that begin with {actor.fleet!r}")
         vehicle = VEHICLE_PATH.match(path)
         if vehicle is not None and not actor.sees(vehicle[1]):
-            raise Problem(404, f"nothing is known of vehicle {vehicle[1][:128]!r}")
+            raise ApiProblem(404, f"nothing is known of vehicle {vehicle[1][:128]!r}")
 
     def _complete(self, path: str, scope: Scope, headers: MutableHeaders) -> None:
         for name, value in HEADERS.items():
@@ -201,7 +203,7 @@ class Limiter:
         self._left: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, client: str) -> None:
-        """Raises a 429 Problem when a client asks too often."""
+        """Raises a 429 ApiProblem when a client asks too often."""
         now = time.monotonic()
         left, at = self._left.pop(client, (self._most, now))
         left = min(self._most, left + (now - at) * self._rate)
@@ -211,7 +213,7 @@ class Limiter:
             self._left.popitem(last=False)
         if refused:
             wait = str(math.ceil((1.0 - left) / self._rate))
-            raise Problem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})
+            raise ApiProblem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})
 
 
 def request_id_of(headers: Mapping[str, str]) -> str:
@@ -263,5 +265,5 @@ def _wants_page(headers: Headers) -> bool:
     return "text/html" in headers.get("accept", "")
 
 
-def _unauthorized(detail: str) -> Problem:
-    return Problem(401, detail, headers={"WWW-Authenticate": 'Bearer realm="sprung"'})
+def _unauthorized(detail: str) -> ApiProblem:
+    return ApiProblem(401, detail, headers={"WWW-Authenticate": 'Bearer realm="sprung"'})

@@ -11,7 +11,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 
 router = APIRouter(tags=["health"])
 
@@ -26,12 +26,12 @@ async def live() -> Response:
 async def ready(core: CoreOf) -> Response:
     """503 with the reason while the store cannot be written, a live feed does not work, or the service is stopping."""
     if core.stopping.is_set():
-        raise Problem(503, "the service is stopping", headers={"Retry-After": "5"})
+        raise ApiProblem(503, "the service is stopping", headers={"Retry-After": "5"})
     feeds = [feed.status() for feed in core.feeds]
     troubles = await run_in_threadpool(core.condition.troubles)
     troubles += [f"feed {feed.name} is {feed.state}: {feed.detail}" for feed in feeds if not feed.works]
     if troubles:
-        raise Problem(503, "; ".join(troubles)[:1000], headers={"Retry-After": "5"})
+        raise ApiProblem(503, "; ".join(troubles)[:1000], headers={"Retry-After": "5"})
     return json_response(
         {
             "status": "ok",

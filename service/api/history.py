@@ -36,7 +36,7 @@ Format = Literal["json", "columns", "csv", "parquet", "mcap"]
 @router.get(
     "/vehicles/{id}/history",
     summary="Parameters over time",
-    response_model=models.History | models.Histories | models.Columns,
+    response_model=models.History | models.Histories | models.ColumnsAnswer,
     responses={200: {"content": {media: {} for media in MEDIA_TYPES.values()}}},
 )
 async def history(

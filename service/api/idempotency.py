@@ -18,7 +18,7 @@ from fastapi.responses import Response
 from sqlalchemy import delete, select
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
 from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
@@ -44,7 +44,7 @@ class Once:
             return await act()
         with _lock:
             if self._key in _running:
-                raise Problem(
+                raise ApiProblem(
                     409, "a request with this Idempotency-Key is being worked on", headers={"Retry-After": "1"}
                 )
             _running.add(self._key)
@@ -68,7 +68,7 @@ class Once:
             return None
         if row.request != self._request:
             detail = "was used for another request"
-            raise Problem(422, f"Idempotency-Key {detail}", [{"field": "Idempotency-Key", "detail": detail}])
+            raise ApiProblem(422, f"Idempotency-Key {detail}", [{"field": "Idempotency-Key", "detail": detail}])
         headers = {"Idempotency-Replayed": "true"} | ({"Location": row.location} if row.location else {})
         return json_response(row.body, row.status, headers)
 

@@ -15,7 +15,7 @@ from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
 from sprung.service.api.bodies import WindowBody, read_window, start_of
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.engine import Engine
 from sprung.service.store.windows import Solved
 from sprung.service.times import NANOSECONDS, now_ns
@@ -32,7 +32,7 @@ BODY = {
 }
 
 
-@router.post("/identify", openapi_extra=BODY, summary="Identify one window", response_model=models.Identified)
+@router.post("/identify", openapi_extra=BODY, summary="Identify one window", response_model=models.IdentifyAnswer)
 async def identify(
     request: Request, core: CoreOf, actor: ActorOf, states: bool = False, track: bool = False
 ) -> Response:
@@ -46,7 +46,7 @@ async def identify(
     engine = core.engine
     if track and head.vehicle is None:
         detail = "is needed to track"
-        raise Problem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
+        raise ApiProblem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
     if track:
         own_vehicle(actor, head.vehicle)
     now = now_ns()
@@ -54,7 +54,7 @@ async def identify(
     try:
         estimate = await asyncio.wrap_future(core.batcher.submit(values, states, (start or now) if track else None))
     except UnusableWindow as error:
-        raise Problem(422, str(error)) from error
+        raise ApiProblem(422, str(error)) from error
     answer = _answer(engine, head.vehicle, estimate)
     if track and head.vehicle is not None:
         length = round(engine.system.window / engine.system.sample_rate * NANOSECONDS)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sprung.service.api.problems import Problem, problem_response
+from sprung.service.api.problems import ApiProblem, problem_response
 
 
 class BodyTooLarge(Exception):
@@ -54,5 +54,5 @@ class BodyLimit:
             await self._refuse(scope, receive, send, limit)
 
     async def _refuse(self, scope: Scope, receive: Receive, send: Send, limit: int) -> None:
-        problem = Problem(413, f"the body is longer than {limit} bytes", headers={"Connection": "close"})
+        problem = ApiProblem(413, f"the body is longer than {limit} bytes", headers={"Connection": "close"})
         await problem_response(problem, scope["path"])(scope, receive, send)

@@ -29,7 +29,7 @@ class ProblemAnswer(BaseModel):
     errors: list[ProblemField] = Field(default_factory=list, description="the fields that are wrong")
 
 
-class Fit(BaseModel):
+class FitAnswer(BaseModel):
     """How well a window fits: rms(error) / rms(measured)."""
 
     nrmse: float | None
@@ -50,19 +50,19 @@ class WindowParameter(BaseModel):
     identifiable: bool = True
 
 
-class Identified(BaseModel):
+class IdentifyAnswer(BaseModel):
     """Answer to `POST /identify`."""
 
     vehicle: str | None
     model: str
     parameters: list[WindowParameter]
-    fit: Fit
+    fit: FitAnswer
     states: dict[str, list[float]] | None = Field(default=None, description="simulated states, with ?states=true")
     tracked: bool | None = Field(default=None, description="the window fed the vehicle's tracker, with ?track=true")
     posterior: list[WindowParameter] | None = None
 
 
-class Parameter(BaseModel):
+class ParameterAnswer(BaseModel):
     """One parameter as tracked."""
 
     name: str
@@ -79,7 +79,7 @@ class Parameter(BaseModel):
     state: Literal["ok", "learning", "not_identifiable", "warning", "alarm"] | None = None
 
 
-class Alarm(BaseModel):
+class AlarmAnswer(BaseModel):
     """One alarm; active while `recovered` is null."""
 
     id: int | None = None
@@ -141,7 +141,7 @@ class Vehicles(BaseModel):
     counts: dict[str, int] = Field(default_factory=dict, description="vehicles by health, whatever health is asked for")
 
 
-class Vehicle(BaseModel):
+class VehicleAnswer(BaseModel):
     """Answer to `GET /vehicles/{id}`."""
 
     vehicle: str
@@ -152,14 +152,14 @@ class Vehicle(BaseModel):
     last_window: str | None
     received: str | None
     silent: bool
-    fit: Fit | None
-    parameters: list[Parameter]
-    alarms: list[Alarm]
+    fit: FitAnswer | None
+    parameters: list[ParameterAnswer]
+    alarms: list[AlarmAnswer]
     windows: WindowCounts
     reasons: list[WindowReason] = Field(description="why windows were dropped, repaired or did not fit")
 
 
-class Point(BaseModel):
+class PointAnswer(BaseModel):
     """A point of a history; of several windows where `windows` says so."""
 
     time: str
@@ -181,7 +181,7 @@ class History(BaseModel):
     unit: str
     nominal: float
     resolution: float = Field(description="seconds per point; 0: single windows")
-    points: list[Point]
+    points: list[PointAnswer]
 
 
 class Histories(BaseModel):
@@ -192,7 +192,7 @@ class Histories(BaseModel):
     histories: list[History]
 
 
-class Column(BaseModel):
+class ColumnAnswer(BaseModel):
     """One parameter as columns; null where it was not identifiable."""
 
     unit: str
@@ -202,27 +202,27 @@ class Column(BaseModel):
     std: list[float | None]
 
 
-class Columns(BaseModel):
+class ColumnsAnswer(BaseModel):
     """`format=columns`: small, for plots."""
 
     vehicle: str
     resolution: float
     time: list[int] = Field(description="ms since the epoch")
     windows: list[int]
-    parameters: dict[str, Column]
+    parameters: dict[str, ColumnAnswer]
 
 
 class Alarms(BaseModel):
     """A vehicle's alarms, newest first."""
 
     vehicle: str
-    alarms: list[Alarm]
+    alarms: list[AlarmAnswer]
 
 
 class AlarmPage(BaseModel):
     """Alarms of the fleet, newest first."""
 
-    alarms: list[Alarm]
+    alarms: list[AlarmAnswer]
     next: str | None
 
 
@@ -267,7 +267,7 @@ class ReportPage(BaseModel):
     next: str | None
 
 
-class Recording(BaseModel):
+class RecordingAnswer(BaseModel):
     """A file or stream that was read."""
 
     id: str
@@ -284,11 +284,11 @@ class Recording(BaseModel):
 class RecordingPage(BaseModel):
     """Recordings, newest first."""
 
-    recordings: list[Recording]
+    recordings: list[RecordingAnswer]
     next: str | None
 
 
-class Mark(BaseModel):
+class MarkAnswer(BaseModel):
     """A note or a maintenance on a vehicle's time line."""
 
     id: int
@@ -304,7 +304,7 @@ class Marks(BaseModel):
     """Marks of a vehicle, newest first."""
 
     vehicle: str
-    marks: list[Mark]
+    marks: list[MarkAnswer]
 
 
 class Delivery(BaseModel):

@@ -29,7 +29,7 @@ WAIT = {"Retry-After": "10"}
 log = logging.getLogger("sprung.api")
 
 
-class Problem(Exception):
+class ApiProblem(Exception):
     """An answer that is an error.  `errors` name the fields: `{"field": "channels.car_1l", "detail": "..."}`."""
 
     def __init__(
@@ -46,7 +46,7 @@ class Problem(Exception):
         self.headers = dict(headers or {})
 
 
-def problem_response(problem: Problem, instance: str) -> Response:
+def problem_response(problem: ApiProblem, instance: str) -> Response:
     """The answer on the wire."""
     body: dict[str, Any] = {
         "type": "about:blank",
@@ -61,7 +61,7 @@ def problem_response(problem: Problem, instance: str) -> Response:
     return Response(json.dumps(body), problem.status, headers, MEDIA_TYPE)
 
 
-def from_validation(error: ValidationError, prefix: str = "") -> Problem:
+def from_validation(error: ValidationError, prefix: str = "") -> ApiProblem:
     """422 that names the fields which are wrong; the values themselves are not repeated."""
     found = error.errors(include_url=False, include_input=False, include_context=False)
     errors = [
@@ -69,11 +69,11 @@ def from_validation(error: ValidationError, prefix: str = "") -> Problem:
     ]
     first = errors[0]
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    return Problem(422, f"{first['field']}: {first['detail']}{more}", errors)
+    return ApiProblem(422, f"{first['field']}: {first['detail']}{more}", errors)
 
 
 EXPECTED = (
-    Problem,
+    ApiProblem,
     ClientDisconnect,
     HTTPException,
     RequestValidationError,
@@ -99,48 +99,48 @@ def install(app: FastAPI) -> None:
         app.add_exception_handler(kind, on_problem)
 
 
-def _as_problem(error: Exception) -> Problem:
+def _as_problem(error: Exception) -> ApiProblem:
     match error:
-        case Problem():
+        case ApiProblem():
             return error
         case HTTPException():
-            return Problem(error.status_code, str(error.detail), headers=error.headers)
+            return ApiProblem(error.status_code, str(error.detail), headers=error.headers)
         case RequestValidationError():
             errors = [
                 {"field": ".".join(str(part) for part in e["loc"] if part != "body"), "detail": str(e["msg"])}
                 for e in error.errors()[:SHOWN_ERRORS]
             ]
-            return Problem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
+            return ApiProblem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
         case Busy():
-            return Problem(503, str(error), headers={"Retry-After": str(error.retry_after)})
+            return ApiProblem(503, str(error), headers={"Retry-After": str(error.retry_after)})
         case NotFound():
-            return Problem(404, str(error))
+            return ApiProblem(404, str(error))
         case UserError():
-            return Problem(422, str(error))
+            return ApiProblem(422, str(error))
         case NoSpace():
-            return Problem(507, str(error))
+            return ApiProblem(507, str(error))
         case SQLAlchemyError() | OSError() | MemoryError() if found := _resource_problem(error):
             log.error("%s: %s", found.detail, error)
             return found
         case _:
             log.error("unexpected error", exc_info=error)
-            return Problem(500, "an unexpected error; the service's log has the details")
+            return ApiProblem(500, "an unexpected error; the service's log has the details")
 
 
-def _resource_problem(error: BaseException) -> Problem | None:
+def _resource_problem(error: BaseException) -> ApiProblem | None:
     """What the machine lacks, as the client should know it; None for an error of another kind."""
     if isinstance(error, MemoryError):
-        return Problem(503, "the service is out of memory", headers=WAIT)
+        return ApiProblem(503, "the service is out of memory", headers=WAIT)
     if isinstance(error, OSError):
         if error.errno in NO_ROOM:
-            return Problem(507, "there is no room left on the service's disk", headers=WAIT)
+            return ApiProblem(507, "there is no room left on the service's disk", headers=WAIT)
         if error.errno in (errno.EMFILE, errno.ENFILE):
-            return Problem(503, "the service has too many files open", headers=WAIT)
+            return ApiProblem(503, "the service has too many files open", headers=WAIT)
         if error.errno in (errno.EROFS, errno.EIO, errno.EACCES, errno.EPERM):
-            return Problem(503, "the service cannot write to its disk", headers=WAIT)
+            return ApiProblem(503, "the service cannot write to its disk", headers=WAIT)
         return None
     if isinstance(error, OperationalError | InterfaceError | PoolTimeout):
         if "full" in str(error.orig if isinstance(error, DBAPIError) else error):
-            return Problem(507, "there is no room left for the store", headers=WAIT)
-        return Problem(503, "the store does not take anything at the moment", headers=WAIT)
+            return ApiProblem(507, "there is no room left for the store", headers=WAIT)
+        return ApiProblem(503, "the store does not take anything at the moment", headers=WAIT)
     return None

@@ -9,7 +9,7 @@ from typing import Annotated, Any, TypeVar
 from fastapi import Path, Query, Request
 from fastapi.routing import APIRoute
 
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.times import from_iso
 
 T = TypeVar("T")
@@ -33,7 +33,7 @@ def only_known_parameters(request: Request) -> None:
     if wrong:
         told = f"the route has {', '.join(sorted(known))}" if known else "the route has none"
         errors = [{"field": name[:100], "detail": f"is no query parameter here; {told}"} for name in wrong[:20]]
-        raise Problem(422, f"{errors[0]['field']} {errors[0]['detail']}", errors)
+        raise ApiProblem(422, f"{errors[0]['field']} {errors[0]['detail']}", errors)
 
 
 def time_of(name: str, text: str | None, default: int) -> int:
@@ -64,9 +64,9 @@ def resolution_of(text: str | None) -> float | None:
     return value
 
 
-def wrong_query(name: str, detail: str) -> Problem:
+def wrong_query(name: str, detail: str) -> ApiProblem:
     """422 that names a query parameter."""
-    return Problem(422, f"{name}: {detail}", [{"field": name, "detail": detail}])
+    return ApiProblem(422, f"{name}: {detail}", [{"field": name, "detail": detail}])
 
 
 def with_cursor(query: Callable[[], T]) -> T:

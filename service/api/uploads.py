@@ -16,7 +16,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from sprung.replay.recording import EXTENSIONS
 from sprung.service.api.bodies import VehicleId
-from sprung.service.api.problems import Problem, from_validation
+from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.condition import free_bytes
 from sprung.service.errors import NoSpace
 from sprung.service.settings import Settings
@@ -57,13 +57,13 @@ class Upload:
 async def receive(request: Request, settings: Settings, store: Store) -> Upload:
     """Take the form of a request.
 
-    Raises Problem: 415 for another type of body or of file, 413 and 507 when it is too large, 422 for a wrong form.
+    Raises ApiProblem: 415 for another type of body or of file, 413 and 507 when it is too large, 422 for a wrong form.
     Nothing stays on the disk then.
     """
     kind, options = parse_options_header(request.headers.get("content-type", ""))
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
-        raise Problem(415, "send multipart/form-data with a file")
+        raise ApiProblem(415, "send multipart/form-data with a file")
     stated = request.headers.get("content-length", "")
     room = await run_in_threadpool(room_for_uploads, settings, store)
     if room <= (int(stated) if stated.isdigit() else 0):
@@ -79,7 +79,7 @@ async def receive(request: Request, settings: Settings, store: Store) -> Upload:
         await run_in_threadpool(form.feed, bytes(held))
         return await run_in_threadpool(form.finish)
     except FormParserError as error:
-        raise Problem(422, f"the body is no multipart/form-data: {error}") from error
+        raise ApiProblem(422, f"the body is no multipart/form-data: {error}") from error
     finally:
         form.close()
 
@@ -133,7 +133,7 @@ class Form:
         )
 
     def feed(self, data: bytes) -> None:
-        """The next bytes.  Raises Problem or NoSpace as soon as they are wrong."""
+        """The next bytes.  Raises ApiProblem or NoSpace as soon as they are wrong."""
         if data:
             self._parser.write(data)
 
@@ -141,9 +141,9 @@ class Form:
         """The file in its place, on the disk for good."""
         self._parser.finalize()
         if self._target is None or self._label is None:
-            raise Problem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
+            raise ApiProblem(422, "file is missing", [{"field": "file", "detail": "is missing"}])
         if not self._ended:
-            raise Problem(422, "the body ends within the form")
+            raise ApiProblem(422, "the body ends within the form")
         vehicle = None
         if "vehicle" in self._values:
             try:
@@ -168,7 +168,7 @@ class Form:
     def _begin_part(self) -> None:
         self._parts += 1
         if self._parts > MOST_PARTS:
-            raise Problem(422, f"the form has more than {MOST_PARTS} parts")
+            raise ApiProblem(422, f"the form has more than {MOST_PARTS} parts")
         self._part = _Part()
 
     def _set_header(self, name: bytearray, value: bytearray) -> None:
@@ -185,7 +185,7 @@ class Form:
         if not self._part.is_file:
             return
         if self._part.name != "file" or self._target is not None:
-            raise Problem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
+            raise ApiProblem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
         name = options[b"filename"].decode("utf-8", "replace")
         self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
         extension = known_extension(self._label)
@@ -203,18 +203,18 @@ class Form:
         value = self._values.setdefault(self._part.name, bytearray())
         value += data[start:end]
         if len(value) > MOST_FIELD_BYTES:
-            raise Problem(422, f"the form's field {self._part.name[:40]!r} is too long")
+            raise ApiProblem(422, f"the form's field {self._part.name[:40]!r} is too long")
 
     def _end(self) -> None:
         self._ended = True
 
 
 def known_extension(label: str) -> str:
-    """The extension of a file's name; a 415 Problem where no reader knows it."""
+    """The extension of a file's name; a 415 ApiProblem where no reader knows it."""
     extension = Path(label).suffix.lower()
     if extension not in EXTENSIONS:
         detail = f"has no known extension; known are {' '.join(EXTENSIONS)}"
-        raise Problem(415, f"file {detail}", [{"field": "file", "detail": detail}], {"Connection": "close"})
+        raise ApiProblem(415, f"file {detail}", [{"field": "file", "detail": detail}], {"Connection": "close"})
     return extension
 
 

@@ -35,7 +35,7 @@ def errors() -> Console:
     return Console(stderr=True, highlight=False, soft_wrap=True)
 
 
-class Shown:
+class RecordingProgress:
     """Progress of one recording."""
 
     def __init__(self, name: str, seconds_per_window: float) -> None:
@@ -59,7 +59,7 @@ def progress(name: str, hop_seconds: float, quiet: bool = False) -> Iterator[OnB
     if quiet or not console.is_terminal:
         yield _silent if quiet else plain_progress(name, hop_seconds)
         return
-    shown = Shown(name, hop_seconds)
+    shown = RecordingProgress(name, hop_seconds)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"{name}: reading", total=None)
@@ -68,7 +68,7 @@ def progress(name: str, hop_seconds: float, quiet: bool = False) -> Iterator[OnB
 
 def plain_progress(name: str, hop_seconds: float) -> OnBatch:
     """A callback for batches that prints a line on stderr every few seconds."""
-    shown = Shown(name, hop_seconds)
+    shown = RecordingProgress(name, hop_seconds)
     last = time.monotonic()
 
     def on_batch(batch: Batch) -> None:

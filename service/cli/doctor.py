@@ -28,7 +28,7 @@ OLDEST = 1_767_225_600  # 2026-01-01: a clock before it has not been set
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class Check:
     """The outcome of one check."""
 
     state: Literal["ok", "warning", "failed"]
@@ -51,19 +51,19 @@ def run(system: Path | None, weights: Path | None, store: str | None, data_dir: 
     return int(failed)
 
 
-def _guarded(check: Callable[[Settings], Iterator[Finding]], settings: Settings) -> Iterator[Finding]:
+def _guarded(check: Callable[[Settings], Iterator[Check]], settings: Settings) -> Iterator[Check]:
     try:
         yield from check(settings)
     except (ValueError, OSError) as error:
-        yield Finding("failed", check.__name__.strip("_"), " ".join(str(error).split()))
+        yield Check("failed", check.__name__.strip("_"), " ".join(str(error).split()))
 
 
-def _installation(_settings: Settings) -> Iterator[Finding]:
-    yield Finding("ok", "installation", f"sprung {__version__}, Python {sys.version.split()[0]}")
+def _installation(_settings: Settings) -> Iterator[Check]:
+    yield Check("ok", "installation", f"sprung {__version__}, Python {sys.version.split()[0]}")
     try:
         needed = [Requirement(line) for line in requires("sprung") or []]
     except PackageNotFoundError:
-        yield Finding("warning", "packages", "sprung runs from a source tree; its packages are not checked")
+        yield Check("warning", "packages", "sprung runs from a source tree; its packages are not checked")
         return
     wrong = []
     for need in needed:
@@ -77,23 +77,23 @@ def _installation(_settings: Settings) -> Iterator[Finding]:
         if not need.specifier.contains(found, prereleases=True):
             wrong.append(f"{need.name} {found} is not {need.specifier}")
     if wrong:
-        yield Finding("failed", "packages", "; ".join(wrong) + "; install sprung anew")
+        yield Check("failed", "packages", "; ".join(wrong) + "; install sprung anew")
     else:
-        yield Finding("ok", "packages", "as required")
+        yield Check("ok", "packages", "as required")
 
 
-def _model(settings: Settings) -> Iterator[Finding]:
+def _model(settings: Settings) -> Iterator[Check]:
     system = load_system(settings.system) if settings.system is not None else load_system()
     identifier = load_identifier(system, settings.weights)
     parameters = f"{len(system.parameters)} parameters"
     if getattr(identifier, "estimator", None) is None:
         text = f"{system.name}, {parameters}; no trained estimator: identified from the nominal values, which is slower"
-        yield Finding("warning", "model", text)
+        yield Check("warning", "model", text)
     else:
-        yield Finding("ok", "model", f"{system.name}, {parameters}, with a trained estimator")
+        yield Check("ok", "model", f"{system.name}, {parameters}, with a trained estimator")
 
 
-def _store(settings: Settings) -> Iterator[Finding]:
+def _store(settings: Settings) -> Iterator[Check]:
     store = open_store(settings.store_url)
     try:
         with store.read() as connection:
@@ -101,28 +101,28 @@ def _store(settings: Settings) -> Iterator[Finding]:
             if connection.dialect.name == "sqlite":
                 said = connection.exec_driver_sql("PRAGMA quick_check(1)").scalar_one()
                 if said != "ok":
-                    yield Finding("failed", "store", f"{settings.store_url} is damaged: {said}; restore a back-up")
+                    yield Check("failed", "store", f"{settings.store_url} is damaged: {said}; restore a back-up")
                     return
         with store.write():
             pass
     finally:
         store.close()
-    yield Finding("ok", "store", f"{settings.store_url}, {vehicles} vehicles, can be written")
+    yield Check("ok", "store", f"{settings.store_url}, {vehicles} vehicles, can be written")
 
 
-def _disk(settings: Settings) -> Iterator[Finding]:
+def _disk(settings: Settings) -> Iterator[Check]:
     folder = settings.data_dir
     while not folder.exists():
         folder = folder.parent
     free = shutil.disk_usage(folder).free
     state: Literal["ok", "warning"] = "ok" if free > LOW_BYTES else "warning"
-    yield Finding(state, "disk", f"{free / 1e9:.1f} GB free at {folder}")
+    yield Check(state, "disk", f"{free / 1e9:.1f} GB free at {folder}")
 
 
-def _clock(_settings: Settings) -> Iterator[Finding]:
+def _clock(_settings: Settings) -> Iterator[Check]:
     now = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
     if time.time() < OLDEST:
-        yield Finding("failed", "clock", f"it is {now} by this machine: set its clock")
+        yield Check("failed", "clock", f"it is {now} by this machine: set its clock")
         return
     tool = shutil.which("timedatectl")
     said = ""
@@ -130,18 +130,18 @@ def _clock(_settings: Settings) -> Iterator[Finding]:
         command = [tool, "show", "--property=NTPSynchronized", "--value"]
         said = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5).stdout.strip()
     if said == "yes":
-        yield Finding("ok", "clock", f"{now}, synchronised")
+        yield Check("ok", "clock", f"{now}, synchronised")
     elif said == "no":
-        yield Finding("warning", "clock", f"{now}, not synchronised: windows of live buses carry this machine's time")
+        yield Check("warning", "clock", f"{now}, not synchronised: windows of live buses carry this machine's time")
     else:
-        yield Finding("ok", "clock", f"{now}; whether it is synchronised cannot be told here")
+        yield Check("ok", "clock", f"{now}; whether it is synchronised cannot be told here")
 
 
-def _bus(name: str) -> Finding:
+def _bus(name: str) -> Check:
     """Open a bus as the service would, and listen for a moment."""
     interface, separator, channel = name.split(",", maxsplit=1)[0].partition(":")
     if not separator:
-        return Finding("failed", f"bus {name}", "give INTERFACE:CHANNEL, as in socketcan:can0")
+        return Check("failed", f"bus {name}", "give INTERFACE:CHANNEL, as in socketcan:can0")
     try:
         with can.Bus(channel, interface) as bus:
             end = time.monotonic() + BUS_SECONDS
@@ -149,7 +149,7 @@ def _bus(name: str) -> Finding:
             while time.monotonic() < end:
                 count += bus.recv(0.1) is not None
     except Exception as error:  # every driver raises its own
-        return Finding("failed", f"bus {name}", " ".join(str(error).split()) or type(error).__name__)
+        return Check("failed", f"bus {name}", " ".join(str(error).split()) or type(error).__name__)
     if not count:
-        return Finding("warning", f"bus {name}", f"open, but silent for {BUS_SECONDS:g} s; check cable and bit rate")
-    return Finding("ok", f"bus {name}", f"{count / BUS_SECONDS:.0f} frames a second")
+        return Check("warning", f"bus {name}", f"open, but silent for {BUS_SECONDS:g} s; check cable and bit rate")
+    return Check("ok", f"bus {name}", f"{count / BUS_SECONDS:.0f} frames a second")

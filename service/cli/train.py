@@ -31,7 +31,7 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     windows = whole_windows(system, recordings, database) if recordings else None
     given = {name: value for name, value in changes.items() if value is not None}
     settings = replace(TrainingSettings(), **given)
-    with Shown() as shown:
+    with TrainingProgress() as shown:
         train(system, out, recordings=windows, settings=settings, progress=shown.show)
     print(json.dumps({"out": str(out), "system": system.digest, "settings": given}))
     return 0
@@ -51,7 +51,7 @@ def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatA
     return np.stack(found)
 
 
-class Shown:
+class TrainingProgress:
     """Progress by stage: bars on a terminal, else a line for every tenth of a stage."""
 
     def __init__(self) -> None:
@@ -63,7 +63,7 @@ class Shown:
         self._tasks: dict[str, TaskID] = {}
         self._tenth: tuple[str, int] = ("", -1)
 
-    def __enter__(self) -> Shown:
+    def __enter__(self) -> TrainingProgress:
         if self._bars is not None:
             self._bars.start()
         return self

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.service.engine import Engine
-from sprung.service.export.messages import COMPARED, ESTIMATE, FIT, SIGNAL, McapFile
+from sprung.service.export.messages import COMPARED, ESTIMATE, FIT, SIGNAL, McapSink
 from sprung.service.export.tables import estimate, values_of
 from sprung.service.ring import Excerpt
 from sprung.service.simulated import Compared
@@ -36,7 +36,7 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
     """The file.  Topics: /signals/CHANNEL, /compared/SENSOR, /fit, /estimate/ELEMENT/QUANTITY, /events."""
     sink = io.BytesIO()
     about = {"vehicle": found.vehicle, "model": engine.digest, "system": engine.system.name}
-    with McapFile(sink, about) as file:
+    with McapSink(sink, about) as file:
         if excerpt is not None:
             _signals(file, engine, excerpt)
         for window in windows:
@@ -53,14 +53,14 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
     return sink.getvalue()
 
 
-def _signals(file: McapFile, engine: Engine, excerpt: Excerpt) -> None:
+def _signals(file: McapSink, engine: Engine, excerpt: Excerpt) -> None:
     for column, channel in enumerate(engine.system.channels):
         for row in np.flatnonzero(np.isfinite(excerpt.values[:, column])).tolist():
             time = excerpt.start + round(row * NANOSECONDS / excerpt.sample_rate)
             file.write(f"/signals/{channel.name}", SIGNAL, time, {"value": float(excerpt.values[row, column])})
 
 
-def _compared(file: McapFile, engine: Engine, window: Compared) -> None:
+def _compared(file: McapSink, engine: Engine, window: Compared) -> None:
     step = NANOSECONDS / window.sample_rate
     for i, name in enumerate(engine.system.sensors):
         for row in range(len(window.simulated)):
@@ -74,7 +74,7 @@ def _compared(file: McapFile, engine: Engine, window: Compared) -> None:
         file.write("/fit", FIT, window.start, message)
 
 
-def _alarm(file: McapFile, alarm: AlarmRow) -> None:
+def _alarm(file: McapSink, alarm: AlarmRow) -> None:
     level = ERROR if alarm.severity == "alarm" else WARNING
     what = alarm.parameter or "windows no longer fit the model"
     change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"

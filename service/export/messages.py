@@ -48,7 +48,7 @@ EVENT = Schema(  # foxglove.Log, so that viewers list it: level 2 info, 3 warnin
 )
 
 
-class McapFile:
+class McapSink:
     """Writes messages; one topic has one schema."""
 
     def __init__(self, sink: BinaryIO, about: Mapping[str, str]) -> None:
@@ -58,7 +58,7 @@ class McapFile:
         self._channels: dict[str, int] = {}
         self._sequence = 0
 
-    def __enter__(self) -> McapFile:
+    def __enter__(self) -> McapSink:
         self._writer.start("", "sprung")
         self._writer.add_metadata("recording", self._about)
         return self

@@ -11,7 +11,7 @@ import numpy as np
 from sprung.model.signals import FloatArray
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
-from sprung.service.export.messages import ESTIMATE, McapFile
+from sprung.service.export.messages import ESTIMATE, McapSink
 from sprung.service.store.history import Series
 from sprung.service.times import to_iso
 from sprung.service.views import known_limit
@@ -84,7 +84,7 @@ def _parquet(engine: Engine, vehicle: str, names: Sequence[str], found: Series) 
 def _mcap(engine: Engine, vehicle: str, names: Sequence[str], found: Series) -> bytes:
     """One topic a parameter: /estimate/ELEMENT/QUANTITY."""
     sink = io.BytesIO()
-    with McapFile(sink, {"vehicle": vehicle, "model": engine.digest, "system": engine.system.name}) as file:
+    with McapSink(sink, {"vehicle": vehicle, "model": engine.digest, "system": engine.system.name}) as file:
         for name in names:
             element, _, quantity = name.rpartition(".")
             parameter = next(p for p in engine.system.tracked if p.name == name)

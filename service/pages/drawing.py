@@ -44,7 +44,7 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
-class Columns:
+class DrawingColumns:
     """Where places stand across the drawing."""
 
     layout: Layout
@@ -59,7 +59,7 @@ class Columns:
         return float(np.interp(x, [p[0] for p in places], [p[1] for p in places]))
 
 
-def columns(system: System) -> Columns:
+def columns(system: System) -> DrawingColumns:
     """Columns of a system's elements, rearmost first; the right side before the left at the same place."""
     layout = lay_out(system)
     places = sorted({layout.element_position(name) for name in system.elements})
@@ -73,7 +73,7 @@ def columns(system: System) -> Columns:
         at[x, y] = across
         across += COLUMN
         before = x
-    return Columns(layout, at, across - COLUMN / 2 + MARGIN)
+    return DrawingColumns(layout, at, across - COLUMN / 2 + MARGIN)
 
 
 def short_names(names: Iterable[str]) -> dict[str, str]:
@@ -148,7 +148,7 @@ def plan_view(system: System, parameters: Mapping[str, Mark]) -> str:
     return "".join([*parts, "</svg>"])
 
 
-def small_view(system: System, found: Columns, letters: str) -> str:
+def small_view(system: System, found: DrawingColumns, letters: str) -> str:
     """The plan for a line of the fleet: a dot an element by the letters of `views.LETTERS`."""
     sides = sorted({y for _, y in found.at}, reverse=True)
     names = {".": "learning", "?": "not_identifiable", "o": "ok", "w": "warning", "a": "alarm"}
@@ -177,7 +177,7 @@ def _open(width: float, height: float, label: str) -> str:
     )
 
 
-def _body(found: Columns, name: str, top: float) -> str:
+def _body(found: DrawingColumns, name: str, top: float) -> str:
     layout = found.layout
     own = [
         found.across(*layout.element_position(element))
@@ -232,7 +232,7 @@ def _sensor(name: str, short: str, across: float, top: float, sensors: Mapping[s
     )
 
 
-def _ground(found: Columns, foot: float) -> list[str]:
+def _ground(found: DrawingColumns, foot: float) -> list[str]:
     layout, parts = found.layout, []
     supports = {name for name, source in layout.system.file.inputs.items() if not isinstance(source, ForceInput)}
     for name, item in layout.system.file.elements.items():
@@ -250,7 +250,7 @@ def _ground(found: Columns, foot: float) -> list[str]:
     return [*parts, f'<line class="rail" x1="8" x2="{found.width - 8:.1f}" y1="{floor:.1f}" y2="{floor:.1f}"/>']
 
 
-def _captions(system: System, found: Columns, foot: float, tops: Mapping[str, float]) -> list[str]:
+def _captions(system: System, found: DrawingColumns, foot: float, tops: Mapping[str, float]) -> list[str]:
     """What the names of a storey have in common, at its left edge."""
     heads: dict[str, float] = {}
     for name in system.elements:

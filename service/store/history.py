@@ -20,7 +20,7 @@ NICE = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 900.0, 3600.0, 6 * 3600.0, 86400
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class HistoryPoint:
     """Posterior log-ratios of all parameters at one time, or over one bucket that starts then."""
 
     time: int  # ns since epoch
@@ -30,11 +30,11 @@ class Point:
     low: FloatArray  # shape (P,)
     high: FloatArray  # shape (P,)
 
-    def merged(self, other: Point) -> Point:
+    def merged(self, other: HistoryPoint) -> HistoryPoint:
         """Both as one bucket, at this one's time."""
         count = self.windows + other.windows
         share = other.windows / count
-        return Point(
+        return HistoryPoint(
             self.time,
             count,
             self.mean + share * (other.mean - self.mean),
@@ -49,7 +49,7 @@ def add_to_rollups(
 ) -> None:
     """Merge windows that were stored for the first time into their buckets."""
     points = [
-        Point(r.start, 1, r.posterior.log_ratio, r.posterior.std, r.posterior.log_ratio, r.posterior.log_ratio)
+        HistoryPoint(r.start, 1, r.posterior.log_ratio, r.posterior.std, r.posterior.log_ratio, r.posterior.log_ratio)
         for r in records
         if r.posterior is not None
     ]
@@ -95,10 +95,12 @@ def history(
     until: int,
     resolution: float,
     limit: int,
-) -> list[Point]:
+) -> list[HistoryPoint]:
     """`series` as points."""
     found = series(connection, vehicle, model_id, since, until, resolution, limit)
-    return [Point(*row) for row in zip(found.time.tolist(), found.windows.tolist(), *_arrays(found), strict=True)]
+    return [
+        HistoryPoint(*row) for row in zip(found.time.tolist(), found.windows.tolist(), *_arrays(found), strict=True)
+    ]
 
 
 def series(
@@ -177,13 +179,13 @@ def _merged(found: Series, width: int) -> Series:
     )
 
 
-def bucketed(points: Iterable[Point], resolution: float) -> Iterator[Point]:
+def bucketed(points: Iterable[HistoryPoint], resolution: float) -> Iterator[HistoryPoint]:
     """Merge points in order of time, either way, that fall into the same bucket of `resolution` seconds."""
     width = round(resolution * NANOSECONDS)
-    current: Point | None = None
+    current: HistoryPoint | None = None
     for point in points:
         bucket = point.time // width * width
-        placed = Point(bucket, point.windows, point.mean, point.std, point.low, point.high)
+        placed = HistoryPoint(bucket, point.windows, point.mean, point.std, point.low, point.high)
         if current is None:
             current = placed
         elif current.time == bucket:
@@ -195,14 +197,14 @@ def bucketed(points: Iterable[Point], resolution: float) -> Iterator[Point]:
         yield current
 
 
-def _stored(connection: Connection, vehicle: str, model_id: int, level: int, buckets: list[int]) -> list[Point]:
+def _stored(connection: Connection, vehicle: str, model_id: int, level: int, buckets: list[int]) -> list[HistoryPoint]:
     table = rollups
     query = (
         select(table.c.bucket_ns, table.c.windows, table.c.mean, table.c.std, table.c.low, table.c.high)
         .where(table.c.vehicle_id == vehicle, table.c.model_id == model_id, table.c.resolution_s == level)
         .where(table.c.bucket_ns.in_(buckets))
     )
-    return [Point(row[0], row[1], *map(unpack, row[2:])) for row in connection.execute(query)]
+    return [HistoryPoint(row[0], row[1], *map(unpack, row[2:])) for row in connection.execute(query)]
 
 
 def fitting_resolution(

@@ -20,7 +20,7 @@ AT_ONCE = 5000  # windows that are deleted together when there are too many
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class RetentionLimits:
     """What is kept: times before which things are old, ns since epoch, and bytes."""
 
     windows_before: int
@@ -40,7 +40,7 @@ class Forgotten:
     windows_for_room: int = 0  # of the windows, those that were not old
 
 
-def forget(connection: Connection, limits: Limits) -> Forgotten:
+def forget(connection: Connection, limits: RetentionLimits) -> Forgotten:
     """Delete what is past the limits.  One-hour roll-ups and alarms stay."""
     old = delete(windows).where(  # posteriors go with their windows
         windows.c.stored_ns < limits.windows_before,

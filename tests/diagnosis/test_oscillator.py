@@ -16,7 +16,7 @@ from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.system import parse_system
-from tests.diagnosis_cases import Recorded
+from tests.diagnosis_cases import MadeRecord
 
 SYSTEM = """
 name: oscillator
@@ -41,7 +41,7 @@ def simulate(
     seconds: float = 20.0,
     level: float = 20.0,
     start: float = 0.0,
-) -> Recorded:
+) -> MadeRecord:
     """Columns force and position; `law(d, v, z)` adds a force to the spring, `memory(d, v, z)` is the rate of its z.
 
     Random phases up to 60 Hz, Runge-Kutta.
@@ -70,10 +70,10 @@ def simulate(
         v += step / 6 * (a[1] + 2 * b[1] + 2 * c[1] + d[1])
         z += step / 6 * (a[2] + 2 * b[2] + 2 * c[2] + d[2])
     noise = np.array([1e-3 * max(level, 1.0), 1e-6])
-    return Recorded(values=rows + noise * rng.standard_normal(rows.shape), sample_rate=float(RATE))
+    return MadeRecord(values=rows + noise * rng.standard_normal(rows.shape), sample_rate=float(RATE))
 
 
-def signals_of(record: Recorded) -> Signals:
+def signals_of(record: MadeRecord) -> Signals:
     return Signals(
         sample_rate=record.sample_rate,
         displacement=np.zeros((len(record.values), 0)),
@@ -89,7 +89,7 @@ def signals_of(record: Recorded) -> Signals:
 
 
 @pytest.fixture(scope="module")
-def linear() -> Recorded:
+def linear() -> MadeRecord:
     return simulate(lambda d, v, z: 0.0, seconds=12.0)
 
 

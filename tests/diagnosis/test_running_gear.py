@@ -13,7 +13,7 @@ SYSTEM = load_system(MANCHESTER)
 RATE = SYSTEM.sample_rate
 
 
-class Recorded:
+class HealthyRecord:
     """A healthy vehicle's channels, in the order of the system's."""
 
     sample_rate, lost = RATE, 0
@@ -41,7 +41,7 @@ class Recorded:
 
 
 def test_a_flat_on_one_wheel_is_found_named_and_sized():
-    record = Recorded(31)
+    record = HealthyRecord(31)
     record.hide_dip("wheel_flat", "wheel_12r", 1e-4, 9.37, 0.3)
     report = diagnose(SYSTEM, record)
     assert [(f.location, f.effect) for f in report.findings] == [("wheel_12r", "wheel_flat")]
@@ -52,7 +52,7 @@ def test_a_flat_on_one_wheel_is_found_named_and_sized():
 
 
 def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
-    record = Recorded(32)
+    record = HealthyRecord(32)
     for wheel in ("wheel_21l", "wheel_21r"):
         record.hide_dip("rail_joints", wheel, 3e-4, 1.7, 0.6)
     report = diagnose(SYSTEM, record)
@@ -62,7 +62,7 @@ def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
 
 
 def test_a_late_axle_is_a_fault_of_the_measurement():
-    record = Recorded(33)
+    record = HealthyRecord(33)
     for wheel in ("wheel_21l", "wheel_21r"):
         for quantity in ("displacement", "velocity"):
             i = record.column(f"{wheel}.{quantity}")

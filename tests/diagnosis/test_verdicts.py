@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from diagnosis_cases import DAMPING, STIFFNESS, Recorded, quarter_car, simulate
+from diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car, simulate
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 
 
-def _diagnose(record: Recorded, **options):
+def _diagnose(record: MadeRecord, **options):
     return diagnose(quarter_car(), record, Options(**options))
 
 
@@ -120,7 +120,7 @@ def test_missing_input_is_refused_by_name():
 def test_short_recording_is_refused_with_what_is_needed():
     record = simulate(seed=28, seconds=10)
     with pytest.raises(TooLittleError, match="200"):
-        _diagnose(Recorded(record.values[:90]))
+        _diagnose(MadeRecord(record.values[:90]))
 
 
 def test_still_recording_is_refused_with_what_is_needed():

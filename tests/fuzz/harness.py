@@ -36,7 +36,7 @@ NEAR = 2_000  # ns; CAN files hold float seconds
 
 
 @dataclass
-class Outcome:
+class MutantOutcome:
     """What became of the mutants of one format."""
 
     name: str
@@ -73,9 +73,9 @@ def mutants(name: str, count: int, seed: int, folder: Path) -> Iterator[tuple[Pa
         yield path, name in CHECKED and not inside
 
 
-def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> Outcome:
+def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> MutantOutcome:
     """Read the mutants of one format here; those that show a fault are kept in the folder `keep`."""
-    outcome = Outcome(name)
+    outcome = MutantOutcome(name)
     found = 0
     dbc = database()
     before = _peak()
@@ -94,7 +94,7 @@ def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> Outco
     return outcome
 
 
-def _one(path: Path, dbc: Any, honest: bool, outcome: Outcome) -> None:
+def _one(path: Path, dbc: Any, honest: bool, outcome: MutantOutcome) -> None:
     previous = signal.signal(signal.SIGPROF, _hang)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:

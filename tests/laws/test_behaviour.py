@@ -5,7 +5,7 @@ import pytest
 
 from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, find_law
 from sprung.model.laws.along import force_along
-from sprung.model.laws.base import RARE, Reading
+from sprung.model.laws.base import RARE, FittedElement
 from sprung.model.laws.trajectory import along
 
 TIME = np.arange(4000) / 1000
@@ -33,7 +33,7 @@ def test_a_path_is_the_law_that_its_memory_integrates(law):
 
 
 def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike():
-    read = Reading(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0)
+    read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0)
     (restart,) = find_law("series_stiffness").restarts(read)
     c, (ks,) = restart.damping * read.damping, restart.parameters
     r = read.frequency * c / ks

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from sprung.model.laws import ElementLaw, find_law
 from sprung.model.laws.spline import Axis, Surface, estimate_force
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.nonlinear import Model, NonlinearSimulator, Placement
+from sprung.model.simulate.nonlinear import DiscreteSystem, NonlinearSimulator, Placement
 from sprung.model.simulate.stepping import cubic_chain, exact_steps
 from sprung.model.system import parse_system
 
@@ -56,7 +56,7 @@ def road(seed: int) -> FloatArray:
     return np.stack([(size * np.sin(angle)).sum(1), (size * 2 * np.pi * f * np.cos(angle)).sum(1)], axis=1)
 
 
-def respond_of(model: Model):
+def respond_of(model: DiscreteSystem):
     """Whitened answers of the sensors to forces (T, m) along the strut."""
     n = model.mechanics.n
     pull = np.concatenate([np.zeros(n), -model.mechanics.H[1] / model.mechanics.mass])[:, None]

@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from sprung.model.system import System
 from sprung.service.api.app import create_app
 from sprung.service.api.guard import COOKIE, Limiter, is_loopback
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
@@ -274,7 +274,7 @@ def test_clients_that_ask_too_often_are_told_when_to_come_back() -> None:
     limiter = Limiter(5.0)
     for _ in range(10):
         limiter.take("a")
-    with pytest.raises(Problem) as caught:
+    with pytest.raises(ApiProblem) as caught:
         limiter.take("a")
     assert caught.value.status == 429 and int(caught.value.headers["Retry-After"]) >= 1
     limiter.take("b")

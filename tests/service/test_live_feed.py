@@ -37,7 +37,7 @@ def eventually(check: Callable[[], Any], seconds: float = 20.0) -> Any:
     return found
 
 
-class Source:
+class RowSource:
     """Rows of all channels, a hundred a recorded second, as quickly as `pace` allows; does what `trouble` says."""
 
     def __init__(self, channels: int, pace: float = 0.0) -> None:
@@ -69,12 +69,12 @@ def core(engine: Engine, tmp_path: Path) -> Iterator[Core]:
 
 
 @pytest.fixture
-def source(engine: Engine) -> Source:
-    return Source(len(engine.system.channels), pace=0.005)
+def source(engine: Engine) -> RowSource:
+    return RowSource(len(engine.system.channels), pace=0.005)
 
 
 @pytest.fixture
-def feed(core: Core, source: Source, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveFeed]:
+def feed(core: Core, source: RowSource, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveFeed]:
     monkeypatch.setattr("sprung.service.live.FIRST_RETRY", 0.05)
     monkeypatch.setattr("sprung.service.live.WATCH_SECONDS", 0.05)
     feed = LiveFeed(core.pipeline, source, "live", core.stopping, core.tally_counter(source.name))
@@ -123,7 +123,7 @@ def test_a_locked_store_loses_no_window_and_shows_meanwhile(
     assert feed.status().dropped_windows == 0
 
 
-def test_readiness_tells_of_a_feed_that_does_not_work(core: Core, feed: LiveFeed, source: Source) -> None:
+def test_readiness_tells_of_a_feed_that_does_not_work(core: Core, feed: LiveFeed, source: RowSource) -> None:
     def broken() -> None:
         raise RuntimeError("the decoder stumbled")
 
@@ -159,7 +159,7 @@ def test_a_window_that_the_numerics_cannot_take_costs_itself_only(
 
 
 def test_a_reader_that_hangs_is_replaced(
-    core: Core, feed: LiveFeed, source: Source, monkeypatch: pytest.MonkeyPatch
+    core: Core, feed: LiveFeed, source: RowSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("sprung.service.live.HUNG_SECONDS", 0.2)
     release, hung = threading.Event(), threading.Event()

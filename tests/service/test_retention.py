@@ -113,7 +113,7 @@ def test_a_store_that_is_too_large_loses_its_oldest_windows(
         used = retention.used_bytes(connection)
     assert used is not None
     with store.write() as connection:
-        found = retention.forget(connection, retention.Limits(0, 0, 0, store_bytes=used - 50_000))
+        found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, store_bytes=used - 50_000))
         left = connection.execute(select(func.min(windows.c.start_ns))).scalar_one()
     assert 0 < found.windows == found.windows_for_room < 200
     assert left == START + found.windows * 500_000_000  # the oldest went
@@ -124,5 +124,5 @@ def test_uploads_make_room_oldest_first(store: Store) -> None:
         for number in range(5):
             row = work.RecordingRow(f"r{number}", None, "n", "upload", f"{number}.csv", 100, None, START + number, None)
             work.add_recording(connection, row)
-        found = retention.forget(connection, retention.Limits(0, 0, 0, upload_bytes=250))
+        found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, upload_bytes=250))
     assert found.upload_files == ("0.csv", "1.csv", "2.csv")

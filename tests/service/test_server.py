@@ -19,7 +19,7 @@ from fastapi.testclient import TestClient
 from sprung.model.system import System
 from sprung.service.api.app import create_app
 from sprung.service.api.bodies import read_window
-from sprung.service.api.problems import Problem
+from sprung.service.api.problems import ApiProblem
 from sprung.service.api.server import make_server
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
@@ -157,14 +157,14 @@ def test_wrong_bodies_cost_milliseconds(engine: Engine, system: System) -> None:
     ):
         body = json.dumps({"sample_rate": 100.0, "channels": channels}).encode()
         begun = time.process_time()
-        with pytest.raises(Problem) as caught:
+        with pytest.raises(ApiProblem) as caught:
             read_window(body, engine)
         assert time.process_time() - begun < 0.2, len(body)
         assert 1 <= len(caught.value.errors) <= 20 and caught.value.status == 422
 
 
 def test_a_key_flood_is_not_looked_at(engine: Engine) -> None:
-    with pytest.raises(Problem, match="too many strings"):
+    with pytest.raises(ApiProblem, match="too many strings"):
         read_window(json.dumps({str(i): i for i in range(100_000)}).encode(), engine)
 
 

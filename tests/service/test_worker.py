@@ -15,11 +15,11 @@ import pytest
 
 from sprung.model.system import load_system
 from sprung.service.errors import UserError
-from sprung.service.worker import Limits, Worker, WorkerFailed
+from sprung.service.worker import ProcessLimits, Worker, WorkerFailed
 from tests import service_tasks
 from tests.service_tasks import count, misbehave
 
-EASY = Limits(silence_seconds=60, seconds=60)
+EASY = ProcessLimits(silence_seconds=60, seconds=60)
 
 
 def alive(pid: int) -> bool:
@@ -62,7 +62,9 @@ def test_every_end_is_told_for_what_it_was(how: str, error: type[Exception], tol
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the bound is one of Linux")
 def test_memory_is_bounded() -> None:
-    worker: Worker[int, str] = Worker(misbehave, "devour", Limits(60, 60, memory_bytes=1_000_000_000), "the work")
+    worker: Worker[int, str] = Worker(
+        misbehave, "devour", ProcessLimits(60, 60, memory_bytes=1_000_000_000), "the work"
+    )
     with pytest.raises(UserError, match=r"more memory than the 1\.0 GB"):
         list(worker.messages())
 
@@ -70,11 +72,11 @@ def test_memory_is_bounded() -> None:
 @pytest.mark.parametrize(
     ("how", "limits", "told"),
     [
-        ("hang", Limits(silence_seconds=0.3, seconds=60), "made no progress for 0 s"),
-        ("spin", Limits(silence_seconds=60, seconds=4), "took longer than 4 s"),
+        ("hang", ProcessLimits(silence_seconds=0.3, seconds=60), "made no progress for 0 s"),
+        ("spin", ProcessLimits(silence_seconds=60, seconds=4), "took longer than 4 s"),
     ],
 )
-def test_time_is_bounded(how: str, limits: Limits, told: str) -> None:
+def test_time_is_bounded(how: str, limits: ProcessLimits, told: str) -> None:
     begun = time.monotonic()
     worker: Worker[int, str] = Worker(misbehave, how, limits, "the work")
     with pytest.raises(UserError, match=told):

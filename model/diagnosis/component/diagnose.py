@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, covariance, fitted, spread
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, ComponentTask, covariance, fitted, spread
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.pieces import SURFACE
 from sprung.model.diagnosis.component.search import (
@@ -22,14 +22,14 @@ from sprung.model.diagnosis.component.search import (
 )
 from sprung.model.diagnosis.component.words import finding_of, leftover_words, preload_finding, reversed_finding
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
-from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, Errors, verdict_of
+from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, HeldOutErrors, verdict_of
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
     FitFigures,
-    ParameterValue,
     RecordingFacts,
     Report,
+    ReportedParameter,
     Unexplained,
 )
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
@@ -59,9 +59,9 @@ class Judged:
         return float(np.std(self.record.task.force[self.record.task.split :])) or 1.0
 
     @property
-    def errors(self) -> Errors:
+    def errors(self) -> HeldOutErrors:
         held = [np.sqrt(fit.held_out) / self.size for fit in (self.base, self.final)]
-        return Errors(np.array(held[:1]), np.array(held[1:]), np.array([self.floor / self.size]))
+        return HeldOutErrors(np.array(held[:1]), np.array(held[1:]), np.array([self.floor / self.size]))
 
 
 def diagnose_components(system: System, record: Recorded, options: Options, tell: Progress) -> Report:
@@ -99,7 +99,7 @@ def _judge(one: ComponentRecord, rules: ComponentRules, tell: Told) -> Judged:
     return judged
 
 
-def _turned(task: Task) -> bool:
+def _turned(task: ComponentTask) -> bool:
     """Whether the component would feed energy into the rig, or push away from where it is: a wrong sign.
 
     Springs and dampers take the other sign with the force; a nominal value that the file fixes says nothing here.
@@ -139,7 +139,9 @@ def _with_surface(judged: Judged) -> Judged:
 
 
 def _report(system: System, record: Recorded, options: Options, judged: list[Judged]) -> Report:
-    errors = Errors(*(np.concatenate([getattr(j.errors, key) for j in judged]) for key in ("before", "after", "floor")))
+    errors = HeldOutErrors(
+        *(np.concatenate([getattr(j.errors, key) for j in judged]) for key in ("before", "after", "floor"))
+    )
     findings: list[Finding] = []
     for one in judged:
         findings += _findings(one)
@@ -209,7 +211,7 @@ def _findings(one: Judged) -> list[Finding]:
     return findings
 
 
-def _parameters(system: System, element: str, fit: ComponentFit) -> list[ParameterValue]:
+def _parameters(system: System, element: str, fit: ComponentFit) -> list[ReportedParameter]:
     full, names = covariance(fit)
     sigma = dict(zip(names, np.sqrt(np.maximum(np.diag(full), 0.0)).tolist(), strict=False))
     values = []
@@ -217,8 +219,8 @@ def _parameters(system: System, element: str, fit: ComponentFit) -> list[Paramet
         if parameter.element == element:
             value = float(getattr(fit.element, parameter.quantity))
             deviation = sigma.get(parameter.quantity, 0.0)
-            values.append(ParameterValue(parameter.name, value, deviation, parameter.nominal, parameter.unit))
-    values.append(ParameterValue(f"{element}.preload", fit.preload, sigma["preload"], 0.0, "N"))
+            values.append(ReportedParameter(parameter.name, value, deviation, parameter.nominal, parameter.unit))
+    values.append(ReportedParameter(f"{element}.preload", fit.preload, sigma["preload"], 0.0, "N"))
     return values
 
 

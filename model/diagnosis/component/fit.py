@@ -26,7 +26,7 @@ _RELATIVE = 1e-4  # steps of finite differences
 
 
 @dataclass(frozen=True)
-class Nominal:
+class NominalValues:
     """Spring and damper as the system file has them; None: free."""
 
     stiffness: float | None  # N/m, if it is fixed
@@ -34,19 +34,19 @@ class Nominal:
 
 
 @dataclass(frozen=True)
-class Task:
+class ComponentTask:
     """A record of one component, of which the first `split` samples are fitted."""
 
     motion: ElementMotion
     force: FloatArray  # N, (T,)
     split: int
-    nominal: Nominal = Nominal(None, None)
+    nominal: NominalValues = NominalValues(None, None)
 
     @cached_property
     def seen(self) -> Seen:
         return Seen.of(self.motion)
 
-    def every(self, stride: int) -> Task:
+    def every(self, stride: int) -> ComponentTask:
         """The same thinned out."""
         return replace(
             self, motion=self.motion.every(stride), force=self.force[::stride], split=-(-self.split // stride)
@@ -75,7 +75,7 @@ class ComponentModel:
         keep = [i for i in range(len(self.pieces)) if i != index]
         return ComponentModel(tuple(self.pieces[i] for i in keep), tuple(self.shapes[i] for i in keep))
 
-    def columns(self, task: Task) -> FloatArray:
+    def columns(self, task: ComponentTask) -> FloatArray:
         """(T, m) of all pieces."""
         found = [p.columns(task.motion, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
         return np.column_stack(found) if found else np.zeros((len(task.force), 0))
@@ -94,7 +94,7 @@ class ComponentModel:
 class ComponentFit:
     """A fitted model."""
 
-    task: Task
+    task: ComponentTask
     model: ComponentModel
     preload: float  # N, force at zero deflection
     element: SpringDamper
@@ -149,7 +149,7 @@ def bounded_solution(columns: FloatArray, target: FloatArray, signs: tuple[int, 
     return solved / scale, max(rest + float(left @ left), 0.0)
 
 
-def fitted(task: Task, model: ComponentModel) -> ComponentFit:
+def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     """Strengths, preload, spring and damper for given shapes."""
     base, free, force = task.linear
     columns = np.column_stack([base, model.columns(task)])
@@ -163,7 +163,7 @@ def fitted(task: Task, model: ComponentModel) -> ComponentFit:
     return ComponentFit(task, model, float(values[0]), element, solved[int(free.sum()) :], residual)
 
 
-def refined(task: Task, model: ComponentModel) -> ComponentFit:
+def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     """The best shapes near a model's, all pieces together."""
     start = np.array([value for shape in model.shapes for value in shape])
     if not len(start):

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import Nominal, Task
+from sprung.model.diagnosis.component.fit import ComponentTask, NominalValues
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES, DiagnosisError, TooLittleError
 from sprung.model.schema import ElementSensor, SupportInput
@@ -28,7 +28,7 @@ class ComponentRecord:
 
     element: str
     sensor: str
-    task: Task
+    task: ComponentTask
     declared: float  # N, noise of the force as the system file states it; 0: it states none
     rest: float | None  # N, noise of the force at standstill
     white: float  # N, noise of the force at the highest frequencies
@@ -161,8 +161,8 @@ def _record(
         )
     run = slice(start, stop)
     motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
-    nominal = Nominal(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
-    task = Task(motion, f[run], int(share * (stop - start)), nominal)
+    nominal = NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
+    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal)
     declared = system.file.sensors[sensor].noise
     return ComponentRecord(element, sensor, task, declared, rest, white_noise(f[run]), tuple(notes))
 

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, Task, bounded_solution, fitted, refined
+from sprung.model.diagnosis.component.fit import (
+    ComponentFit,
+    ComponentModel,
+    ComponentTask,
+    bounded_solution,
+    fitted,
+    refined,
+)
 from sprung.model.diagnosis.component.paths import stop_path
 from sprung.model.diagnosis.component.pieces import PIECES, Piece
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
@@ -78,7 +85,10 @@ class Search:
 
 
 def search(
-    task: Task, pieces: tuple[Piece, ...] = PIECES, rules: ComponentRules = RULES, tell: Progress = lambda text: None
+    task: ComponentTask,
+    pieces: tuple[Piece, ...] = PIECES,
+    rules: ComponentRules = RULES,
+    tell: Progress = lambda text: None,
 ) -> Search:
     """Grow a model of the component until the rest is noise, or nothing explains enough of it."""
     quick = task.every(max(1, len(task.force) // rules.search))

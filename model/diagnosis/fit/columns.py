@@ -11,7 +11,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.signals import FloatArray
 
 
-class Columns:
+class JacobianColumns:
     """The jacobian, column by column in whitened real numbers, stored so that every column is contiguous."""
 
     def __init__(self, forward: Forward, whitener: Whitener, count: int) -> None:

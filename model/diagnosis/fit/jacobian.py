@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.columns import Columns
+from sprung.model.diagnosis.fit.columns import JacobianColumns
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.tangent import SmootherCorrection, law_change, port_motions, step_of, tangent
@@ -47,7 +47,7 @@ class Linearised:
 class _Sensitivities:
     """Sensitivities to theta and the terms' parameters, column by column, while they are put together."""
 
-    packed: Columns
+    packed: JacobianColumns
     theta_forces: ComplexArray  # along the parameters' elements, (F, P)
     loads: dict[int, ComplexArray]  # on the degrees of freedom, (F, n), of the columns that push bodies
     law_forces: ComplexArray  # of the laws by their own parameters, (F, p, m)
@@ -79,7 +79,7 @@ def _of_theta(
     """Room for all columns, those of theta filled in."""
     P, p = len(point.theta), sum(len(t.parameters) for t in point.terms)
     theta_forces, loads = _theta_forces(forward, motions)
-    packed = Columns(forward, whitener, P + p + len(point.state))
+    packed = JacobianColumns(forward, whitener, P + p + len(point.state))
     for i, parameter in enumerate(problem.system.parameters):
         if parameter.quantity == "mass":
             packed.add_load(i, loads[i])

@@ -9,7 +9,7 @@ from typing import Protocol
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.setup import SetupFault
-from sprung.model.diagnosis.investigation.verdict import Errors, Verdict
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
@@ -126,7 +126,7 @@ class Investigation:
 class Judgement:
     """What an investigation comes to."""
 
-    errors: Errors  # of the held-out part, per sensor
+    errors: HeldOutErrors  # of the held-out part, per sensor
     verdict: Verdict
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
     strange: float | None  # error over the signal of a model that does not describe the recording

@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
-from sprung.model.diagnosis.investigation.verdict import RULES, Errors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import RULES, HeldOutErrors, bounded_noise, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
@@ -29,12 +29,12 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     floor = state.held.noise_rms(state.fit, noise)
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     expected = floor / np.where(size > 0, size, 1.0)
-    errors = Errors(before.per_sensor, after.per_sensor, realised_floor(expected, after))
+    errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after))
     lost = state.problem.process_noise and after.nrmse > RULES.strange
     deciding = errors
     if lost:
         shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]
-        deciding = Errors(*(np.array([share]) for share in shares))
+        deciding = HeldOutErrors(*(np.array([share]) for share in shares))
     if state.setup_faults and not lost:  # they were undone before anything was fitted
         worst = np.sqrt(state.setup_faults[0].before / len(size))
         deciding = replace(errors, before=np.maximum(errors.before, worst))
@@ -98,7 +98,7 @@ def _place(state: Investigation) -> str:
     return max(here, key=lambda hit: hit.score).location if here else next(iter(state.system.elements), "")
 
 
-def _words(state: Investigation, errors: Errors, after: FreeRun) -> str:
+def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
     """Place, size and frequencies of what is left, empty where nothing is."""
     left = errors.unexplained()
     if not np.any(left > 0):

@@ -123,8 +123,10 @@ def _best(
     present: FloatArray,
 ) -> _Accepted | None:
     """The hypothesis that explains most, fitted, if one explains enough."""
-    shown = [Shown.of(problem, fit.forward)]
-    shown.append(Shown.of(problem, Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta)))))
+    shown = [ModelResponse.of(problem, fit.forward)]
+    shown.append(
+        ModelResponse.of(problem, Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta))))
+    )
     promising: dict[tuple[str, str], Hypothesis] = {}
     for one in shown:
         for hypothesis in one.hypotheses(system, signals):
@@ -165,7 +167,7 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
     at = [signals.sensor_names.index(name) for name in names]
     value = fault.value
     for _ in range(RULES.rounds):
-        shown = Shown.of(problem, fit.forward)
+        shown = ModelResponse.of(problem, fit.forward)
         if fault.effect == "node_delay":
             change = shown.late(at, 0.0)
             value += change
@@ -194,7 +196,7 @@ def _deviation(hypothesis: Hypothesis, left: float) -> float:
 
 
 @dataclass(frozen=True)
-class Shown:
+class ModelResponse:
     """What a model makes the sensors show of every input, and what they measured."""
 
     forward: Forward
@@ -207,7 +209,7 @@ class Shown:
     samples: int
 
     @classmethod
-    def of(cls, problem: Problem, forward: Forward) -> Shown:
+    def of(cls, problem: Problem, forward: Forward) -> ModelResponse:
         part, plant = forward.part, forward.plant
         band = slice(1, part.grid.band.stop)
         of_support = plant.sensor_of_support[band] * part.support[band][:, None, :]

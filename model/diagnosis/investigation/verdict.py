@@ -43,7 +43,7 @@ RULES = VerdictRules()
 
 
 @dataclass(frozen=True)
-class Errors:
+class HeldOutErrors:
     """Held-out errors over the measured signal, rms over rms, per sensor (S,)."""
 
     before: FloatArray  # of the nominal structure identified again
@@ -69,7 +69,7 @@ class Errors:
         return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
 
 
-def verdict_of(effects: Sequence[str], errors: Errors, rules: VerdictRules = RULES) -> Verdict:
+def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRules = RULES) -> Verdict:
     """The verdict for findings of the given effects, best first, and the errors that they leave."""
     left = bool(np.any(errors.unexplained(rules) > 0))
     named = [effect for effect in effects if effect not in NO_FAULTS]

@@ -23,9 +23,9 @@ from sprung.model.diagnosis.report.report import (
     FitFigures,
     IdentifiedLaw,
     LawParameter,
-    ParameterValue,
     RecordingFacts,
     Report,
+    ReportedParameter,
     Unexplained,
 )
 from sprung.model.diagnosis.response.terms import Term
@@ -220,12 +220,14 @@ def _deviations(system: System, fit: Fit) -> FloatArray:
     return sigma
 
 
-def _parameters(system: System, fit: Fit) -> tuple[ParameterValue, ...]:
+def _parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ...]:
     sigma = _deviations(system, fit)
     values = []
     for i, parameter in enumerate(system.parameters):
         value = parameter.nominal * float(np.exp(fit.point.theta[i]))
-        values.append(ParameterValue(parameter.name, value, value * float(sigma[i]), parameter.nominal, parameter.unit))
+        values.append(
+            ReportedParameter(parameter.name, value, value * float(sigma[i]), parameter.nominal, parameter.unit)
+        )
     return tuple(values)
 
 

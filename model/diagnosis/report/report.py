@@ -25,7 +25,7 @@ from sprung.model.diagnosis.investigation.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True)
-class ParameterValue:
+class ReportedParameter:
     """One identified number of the nominal structure."""
 
     name: str  # "primary_11l.stiffness"
@@ -191,10 +191,10 @@ class Report:
     system: str
     recording: RecordingFacts
     verdict: Verdict
-    baseline: tuple[ParameterValue, ...]
+    baseline: tuple[ReportedParameter, ...]
     baseline_validation: FitFigures
     findings: tuple[Finding, ...]
-    augmented: tuple[ParameterValue, ...]
+    augmented: tuple[ReportedParameter, ...]
     augmented_validation: FitFigures
     noise_floor: FitFigures
     localization: Mapping[str, float]  # location -> best score

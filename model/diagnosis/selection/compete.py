@@ -29,7 +29,7 @@ from sprung.model.diagnosis.selection.evidence import (
     unusual_cost,
 )
 from sprung.model.laws import BodyLaw, ElementLaw
-from sprung.model.laws.base import Reading, Restart
+from sprung.model.laws.base import FittedElement, Restart
 
 _UNNAMED_RATIO = 1.3  # and explain this many times as much
 _CLOSE = 0.25  # share of the best score from which a candidate is fitted
@@ -240,12 +240,12 @@ def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
     return points
 
 
-def _reading(problem: Problem, base: Fit, location: str) -> Reading:
+def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
     """An element as the present model has it; its damping is estimated."""
     element, read = problem.system.elements.index(location), base.forward.element_at(location)
     nominal = next(p.nominal for p in problem.system.parameters if p.name == f"{location}.damping")
     deflection, rate = (motion[:, element] for motion in base.element_motion)
-    return Reading(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
+    return FittedElement(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
 
 
 def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:

@@ -42,7 +42,7 @@ class FreeRun:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class HeldOutComparison:
     """What the held-out part says of one fit against another."""
 
     gain: float  # by how much the second says more, as twice the log-likelihood ratio or alike
@@ -138,7 +138,7 @@ class HeldOut:
         simulated = particular + propagate(A, rows, state, part.grid.step, self.signals.samples)
         return simulated[self.split :], replace(point, state=state, warm_start=near)
 
-    def compare(self, before: Fit, after: Fit) -> Comparison:
+    def compare(self, before: Fit, after: Fit) -> HeldOutComparison:
         """Two fits on the held-out part.
 
         Where laws follow the sensors' motion, along that motion: unmeasured forces take a free run astray, however
@@ -151,7 +151,7 @@ class HeldOut:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
             gain = profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0)
             gain += first_log_det - second_log_det
-        return Comparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
+        return HeldOutComparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""

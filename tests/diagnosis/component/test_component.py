@@ -18,7 +18,7 @@ K, C = 4.0e4, 1.5e3
 
 
 @dataclass
-class Recording:
+class RigRecording:
     values: np.ndarray
     sample_rate: float = RATE
     lost: int = 0
@@ -55,7 +55,7 @@ def report(force: np.ndarray, d: np.ndarray, noise: float = 1.0, declared: float
     random = np.random.default_rng(seed)
     measured = force + noise * random.standard_normal(len(force))
     shown = d + 1e-6 * random.standard_normal(len(d))
-    return diagnose(system(declared), Recording(np.column_stack([shown, measured])))
+    return diagnose(system(declared), RigRecording(np.column_stack([shown, measured])))
 
 
 def laws(found: Report) -> list[str]:
@@ -169,7 +169,7 @@ def test_a_rod_that_does_not_move_is_too_still_to_decide() -> None:
     random = np.random.default_rng(1)
     values = np.column_stack([1e-6 * random.standard_normal(2000), random.standard_normal(2000)])
     with pytest.raises(TooLittleError, match="damper is not moved"):
-        diagnose(system(), Recording(values))
+        diagnose(system(), RigRecording(values))
 
 
 def test_a_foundation_that_hardly_moves_is_taken_for_ground() -> None:
@@ -193,7 +193,7 @@ elements:
 sensors:
   cell: {{kind: force, element: damper, csv: F, noise: 1.0}}
 """)
-    found = diagnose(framed, Recording(np.column_stack([d, force])))
+    found = diagnose(framed, RigRecording(np.column_stack([d, force])))
     assert found.verdict == "missing_physics"
     assert any("taken for ground" in note for note in found.advice)
 

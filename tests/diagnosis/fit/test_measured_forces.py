@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from diagnosis_cases import Recorded
+from diagnosis_cases import MadeRecord
 from scipy.signal import resample
 
 from sprung.model.diagnosis.fit.baseline import baseline, refreshed
@@ -34,7 +34,7 @@ MASS, DAMPING, FRICTION, OFFSET = 50.0, 120.0, 15.0, -4.0
 FORCE_NOISE = 3.0  # N, of one sample
 
 
-def positioning_axis(seconds: float = 20.0, seed: int = 0) -> Recorded:
+def positioning_axis(seconds: float = 20.0, seed: int = 0) -> MadeRecord:
     """Columns force and position of a slide that follows a course in closed loop, with friction and disturbances.
 
     The loop feeds the disturbance back into the force, as a drive's controller does.
@@ -54,7 +54,7 @@ def positioning_axis(seconds: float = 20.0, seed: int = 0) -> Recorded:
         v += step * (force - pushed - DAMPING * v - FRICTION * np.tanh(v / 1e-3)) / MASS
         x += step * v
     rows[:, 1] += 1e-6 * rng.standard_normal(len(rows))
-    return Recorded(rows, 200.0)
+    return MadeRecord(rows, 200.0)
 
 
 @pytest.fixture(scope="module")

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.investigation.verdict import Errors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise, verdict_of
 
 
-def errors(before: float, after: float, floor: float) -> Errors:
-    return Errors(np.array([before]), np.array([after]), np.array([floor]))
+def errors(before: float, after: float, floor: float) -> HeldOutErrors:
+    return HeldOutErrors(np.array([before]), np.array([after]), np.array([floor]))
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_no_all_clear_above_twice_the_floor() -> None:
 
 
 def test_one_sensor_far_above_its_floor_is_enough() -> None:
-    many = Errors(np.array([0.02, 0.02, 0.02, 0.1]), np.array([0.02, 0.02, 0.02, 0.1]), np.full(4, 0.02))
+    many = HeldOutErrors(np.array([0.02, 0.02, 0.02, 0.1]), np.array([0.02, 0.02, 0.02, 0.1]), np.full(4, 0.02))
     assert verdict_of([], many) == "unknown_physics"
     assert np.count_nonzero(many.unexplained()) >= 1
 
