@@ -6,7 +6,7 @@
    failing damper and spring, a 5 % step in each parameter.
 3. The change tests alone, thousands of vehicles at once with errors of the measured statistics: delay of a 5 % step
    in each parameter, and false alarms over vehicle-months.  `Fleet` is the tracker's test, batched; a test in
-   tests/test_tracker_pieces.py asserts that it alarms when the tracker does.
+   tests/tracking/test_tracker_pieces.py asserts that it alarms when the tracker does.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Fixed-step solutions on the sample grid for the two non-linear systems of the paper.
 
 The classical Runge-Kutta step of order four at one step per sample: its error stays below 1e-4 of the states here
-(asserted in `tests/test_alps_tasks.py`), and unlike an adaptive solver it costs the same for every batch, which is
+(asserted in `tests/alps/test_tasks.py`), and unlike an adaptive solver it costs the same for every batch, which is
 what a training loop wants.  Linear systems with held inputs use their exact solution.
 """
 

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
-from diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car, simulate
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
+from tests.diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car, simulate
 
 
 def _diagnose(record: MadeRecord, **options):

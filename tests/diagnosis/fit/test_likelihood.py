@@ -1,7 +1,6 @@
 """Maximum likelihood: recovery, uncertainty, sensitivities against finite differences."""
 
 import numpy as np
-from diagnosis_cases import problem_of, simulate, true_log_ratios
 
 from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import optimise
@@ -9,6 +8,7 @@ from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
+from tests.diagnosis_cases import problem_of, simulate, true_log_ratios
 
 
 def test_parameters_come_back_within_their_uncertainty():

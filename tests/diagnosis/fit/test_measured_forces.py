@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from diagnosis_cases import MadeRecord
 from scipy.signal import resample
 
 from sprung.model.diagnosis.fit.baseline import baseline, refreshed
@@ -15,6 +14,7 @@ from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
 from sprung.model.system import System, load_system, parse_system
+from tests.diagnosis_cases import MadeRecord
 
 SLIDE = """
 name: slide

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from diagnosis_cases import problem_of, simulate
 
 from sprung.model.diagnosis.fit.noise import input_noise
+from tests.diagnosis_cases import problem_of, simulate
 
 
 def test_input_noise_is_told_by_the_second_measurement():

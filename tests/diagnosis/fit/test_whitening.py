@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from diagnosis_cases import problem_of, simulate
 
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.response.point import Point
+from tests.diagnosis_cases import problem_of, simulate
 
 
 @pytest.fixture(scope="module")

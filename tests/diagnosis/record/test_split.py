@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_cases import quarter_car, simulate
 
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.split import cut
+from tests.diagnosis_cases import quarter_car, simulate
 
 
 def prime_factors(number: int) -> set[int]:

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_cases import quarter_car
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.structure import Branch, Structure
 from sprung.model.system import load_system
+from tests.diagnosis_cases import quarter_car
 
 
 def test_plant_agrees_with_the_state_equations():

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from diagnosis_cases import problem_of, quarter_car, simulate, true_log_ratios
 
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.response.time_stepping import march_forces
 from sprung.model.laws import find_law
+from tests.diagnosis_cases import problem_of, quarter_car, simulate, true_log_ratios
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Candidates of different families beside each other, and where laws may be."""
 
 import pytest
-from diagnosis_cases import quarter_car
 
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import ELEMENT, FAMILIES, FORCE, HARMONIC, INPUT, LINE, SENSOR, UNNAMED
@@ -9,6 +8,7 @@ from sprung.model.diagnosis.screening.places import level_pairs, places, wheelse
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.laws import find_law
 from sprung.model.system import load_system
+from tests.diagnosis_cases import quarter_car
 
 
 def candidate(score, family, law="cubic_stiffness", count=1):

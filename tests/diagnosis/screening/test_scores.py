@@ -1,13 +1,13 @@
 """Score tests on recordings where nothing is missing."""
 
 import numpy as np
-from diagnosis_cases import problem_of, simulate
 
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import find_law
+from tests.diagnosis_cases import problem_of, simulate
 
 
 def test_scores_on_a_clean_recording_are_chi_square():

@@ -31,7 +31,7 @@ from sprung.service.live import FeedStatus
 from sprung.service.settings import Settings
 from tests.service_fakes import make_window
 
-DEPLOY = Path(__file__).parent.parent / "deploy"
+DEPLOY = Path(__file__).parents[2] / "deploy"
 RULES = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.yml").read_text())["groups"][0]["rules"]
 MAY_BE_EMPTY = {"Alarms"}  # an annotation: alarms that opened within the last minute
 

@@ -147,7 +147,7 @@ def test_what_is_written_is_read_again(suffix: str, tmp_path: Path) -> None:
     vehicle = load_system() if suffix != ".csv" else system()
     values = np.random.default_rng(2).normal(0, 2e-4, (400, len(vehicle.channels))).cumsum(axis=0)
     path, start = tmp_path / f"ride{suffix}", 1_790_000_000_000_000_000
-    database = Path(__file__).parents[1] / "model/systems/bogie.dbc"
+    database = Path(__file__).parents[2] / "model/systems/bogie.dbc"
     write_recording(path, vehicle.channels, values, vehicle.sample_rate, start, dbc=database)
     record = load_record(path, vehicle.channels, vehicle.sample_rate, dbc=database)
     assert abs(record.start - start) < 1_000_000 and len(record.values) == 400

@@ -6,7 +6,16 @@ import json
 
 import numpy as np
 import pytest
-from tracker_windows import (
+
+from sprung.model.signals import FloatArray
+from sprung.model.tracking.tracker import (
+    Tracker,
+    TrackerSettings,
+    TrackerSettingsError,
+    TrackerState,
+    TrackerStateError,
+)
+from tests.tracker_windows import (
     EPOCH,
     WINDOW_STD,
     TrackedParameter,
@@ -16,15 +25,6 @@ from tracker_windows import (
     make_tracker,
     step,
     windows,
-)
-
-from sprung.model.signals import FloatArray
-from sprung.model.tracking.tracker import (
-    Tracker,
-    TrackerSettings,
-    TrackerSettingsError,
-    TrackerState,
-    TrackerStateError,
 )
 
 

@@ -18,7 +18,7 @@ from tests.fuzz.hostile import ROWS
 from tests.fuzz.seeds import NEEDS, SEEDS, TABLE
 from tests.replay_files import database
 
-HOSTILE = sorted((Path(__file__).parent / "data" / "hostile").iterdir())
+HOSTILE = sorted((Path(__file__).parents[1] / "data" / "hostile").iterdir())
 NOTHING = {"bomb-zstd.mcap", "bomb-lz4.mcap", "bomb-stated.mcap", "bomb-many.mcap", "bomb.blf", "signatures.blf"}
 NOTHING |= {"short-objects.blf", "no-clock.mcap", "columns.csv"}
 NO_WINDOW = {"same-time.mcap", "apart.mcap"}

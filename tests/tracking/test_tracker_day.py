@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from tracker_windows import EPOCH, constant, correlated, estimate, make_tracker, windows
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
@@ -10,6 +9,7 @@ from sprung.model.system import load_system
 from sprung.model.tracking import scatter
 from sprung.model.tracking.misfit import FLOOR_WINDOWS
 from sprung.model.tracking.tracker import Tracker, TrackerState
+from tests.tracker_windows import EPOCH, constant, correlated, estimate, make_tracker, windows
 
 SECOND = 1_000_000_000
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnosis_cases import SYSTEM, simulate
 
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
@@ -23,6 +22,7 @@ from sprung.service.cli.bench import parse
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
+from tests.diagnosis_cases import SYSTEM, simulate
 from tests.service_fakes import START, FakeIdentifier
 
 SECONDS = 40
@@ -185,7 +185,7 @@ def test_what_cannot_be_done_is_one_line_and_exit_status_two(
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    monkeypatch.chdir(Path(__file__).parent.parent)
+    monkeypatch.chdir(Path(__file__).parents[3])
     monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path))
     assert main(arguments) == 2
     captured = capsys.readouterr()
@@ -254,7 +254,7 @@ def sprung(*arguments: str, **options: Any) -> subprocess.Popen[str]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        cwd=Path(__file__).parent.parent,
+        cwd=Path(__file__).parents[3],
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL) and None,  # noqa: PLW1509
         **options,
     )

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
-from tracker_windows import TrackedParameter, correlated, estimate
 
 from sprung.benchmarks.drift import CorrelatedErrors, Fleet, step_delays
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
 from sprung.model.tracking.tracker import Tracker, TrackerSettings
+from tests.tracker_windows import TrackedParameter, correlated, estimate
 
 
 def test_prediction_is_the_exact_integral_of_the_process() -> None:

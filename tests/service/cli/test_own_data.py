@@ -12,7 +12,7 @@ from sprung.replay.record import load_record
 from sprung.service.cli import main
 from tests.test_system import QUARTER_CAR
 
-DOCS = Path(__file__).parent.parent / "docs"
+DOCS = Path(__file__).parents[3] / "docs"
 TRUTH = {"tyre.stiffness": 1.9e5, "strut.stiffness": 1.85e4, "strut.damping": 1190.0}
 RATE, SECONDS = 1000.0, 20.0
 

@@ -11,7 +11,7 @@ from sprung.model.signals import Channel, TimeColumn
 from sprung.replay import UnreadableRecording, open_recording, series
 from sprung.replay.extras import needed
 from sprung.replay.record import load_record
-from tests.test_replay_tables import SECONDS, START, VALUES, F, X, check, read
+from tests.replay.test_tables import SECONDS, START, VALUES, F, X, check, read
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")

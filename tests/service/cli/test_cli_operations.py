@@ -19,7 +19,7 @@ from sprung.service.cli.console import parameter_table
 from sprung.service.engine import Engine
 from sprung.service.views import vehicle_view
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[3]
 RIDE = ROOT / "tests" / "data" / "drift-600s.blf"
 HEAD_ONLY = "set -o pipefail; {python} -m sprung replay {ride} --json | head -n 1"
 

@@ -9,7 +9,7 @@ from sprung.replay.account import Account
 from sprung.replay.record import load_record
 from sprung.replay.sampling import at_rate, low_pass, pace
 from sprung.replay.windowing import Windower
-from tests.test_replay_record import CSV_CHANNELS, write_table
+from tests.replay.test_record import CSV_CHANNELS, write_table
 
 CHANNELS = [Channel("fast", "m", 1e-6), Channel("slow", "m", 1e-6)]
 GRID = 100.0

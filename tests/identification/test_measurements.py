@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.interpolate import make_interp_spline
-from tracker_windows import EPOCH
 
 from sprung.model.identification.deviations import clock_groups, deviations
 from sprung.model.identification.excitation import simulate_runs
@@ -13,6 +12,7 @@ from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.system import MANCHESTER, load_system, parse_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
+from tests.tracker_windows import EPOCH
 
 HOP = 500_000_000
 BOGIE = [20, 21, 22, 23]  # columns of the accelerometers of bogie 1

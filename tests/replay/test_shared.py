@@ -15,10 +15,10 @@ from sprung.replay import open_recording
 from sprung.replay.record import load_record
 from sprung.replay.windowing import Windower
 
-SHARED = Path(__file__).parents[2] / "shared"
+SHARED = Path(__file__).parents[3] / "shared"
 RECORDINGS = SHARED / "recordings"
-DBC = Path(__file__).parents[1] / "model" / "systems" / "bogie.dbc"
-SYSTEM = Path(__file__).parents[1] / "model" / "systems" / "manchester.yaml"
+DBC = Path(__file__).parents[2] / "model" / "systems" / "bogie.dbc"
+SYSTEM = Path(__file__).parents[2] / "model" / "systems" / "manchester.yaml"
 pytestmark = pytest.mark.skipif(not RECORDINGS.is_dir(), reason="no recordings beside the repository")
 
 
