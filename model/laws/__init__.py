@@ -15,6 +15,7 @@ from sprung.model.laws.base import (
     SupportLaw,
     grid,
     observe,
+    reversal_step,
 )
 from sprung.model.laws.bodies import EXTERNAL_FORCE, FLEXIBLE_MODE, MASS_CHANGE
 from sprung.model.laws.channel import SensorResponse
@@ -93,4 +94,5 @@ __all__ = [
     "grid",
     "load_laws",
     "observe",
+    "reversal_step",
 ]

@@ -26,6 +26,7 @@ Where = Literal["element", "pair", "body", "sensor", "support", "axle"]  # "axle
 Channels = Literal["sensor", "support", "force"]
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
+_AT_REST = 0.01  # of the largest step of the rate at a reversal: less is no motion
 CLOCK_LEAD = 5.0  # s; the clock of the laws starts this long before the first sample of a recording
 
 
@@ -64,6 +65,16 @@ class Observed:
         return np.interp(shares, np.linspace(0, 1, 101), self.rate)
 
 
+def reversal_step(rate: FloatArray) -> float:
+    """The rate that one sample passes at a reversal of a motion (T,), m/s, median; 0 where there is none.
+
+    A force that turns within less of it is seen as a jump: its corner has no size that the record tells.  What still
+    trembles where the motion has come to rest does not count.
+    """
+    passed = np.abs(np.diff(rate))[rate[1:] * rate[:-1] < 0]
+    return float(np.median(passed[passed >= _AT_REST * passed.max()])) if len(passed) else 0.0
+
+
 def observe(
     deflection: FloatArray,
     rate: FloatArray,
@@ -96,6 +107,7 @@ class ParameterSpec:
     typical: Callable[[Observed], float]  # size at which the law would matter, for scaling a fit
     log: bool = False  # positive by nature and of unknown order: fitted as a logarithm
     usual: tuple[float, float] = (0.0, float("inf"))  # range in multiples of `typical`, beyond which it is rare
+    plausible: tuple[float, float] = (-float("inf"), float("inf"))  # beyond it the value stands for something else
 
     def admits(self, value: float) -> bool:
         return bool(self.low <= value <= self.high)
@@ -186,6 +198,7 @@ class ElementLaw(Parametrised):
     prior_cost: float = 0.0
     named: bool = True
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
+    knees: tuple[int, ...] = ()  # parameters that are rates at which the slope changes, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise

@@ -170,7 +170,11 @@ def _heavier(mechanics: Mechanics, body: int, p: Values, variant: str) -> Mechan
 MASS_CHANGE = BodyLaw(
     name="mass_change",
     title="another mass",
-    parameters=(ParameterSpec("ratio", "1", 0.05, 20.0, "mass and inertias over nominal", lambda s: 1.1, log=True),),
+    parameters=(
+        ParameterSpec(
+            "ratio", "1", 0.05, 20.0, "mass and inertias over nominal", lambda s: 1.1, log=True, plausible=(0.4, 2.5)
+        ),
+    ),
     variants=lambda mechanics, body: ("",),
     modify=_heavier,
     shapes=lambda lines: grid([1.1]),

@@ -77,6 +77,7 @@ DAMPER_BLOWOFF = ElementLaw(
     confused_with=("coulomb_friction", "quadratic_damping", "series_stiffness"),
     sentence="the damper blows off beyond {knee}; its slope falls to {ratio} of the nominal one",
     strength=1,
+    knees=(0,),
 )
 
 

@@ -59,7 +59,8 @@ def _behind_a_spring(read: FittedElement) -> tuple[Restart, ...]:
     """
     assumed = max(_STRONGER * read.damping, read.nominal_damping)
     ratio = float(np.sqrt(assumed / read.damping - 1))
-    softer = max(1 - read.frequency * read.damping * ratio / read.stiffness, 0.5)
+    read_as_spring = read.frequency * read.damping * ratio
+    softer = max(1 - read_as_spring / read.stiffness, 0.5) if read.stiffness > 0 else 1.0
     return (Restart(softer, assumed / read.damping, (read.frequency * assumed / ratio,)),)
 
 

@@ -17,7 +17,7 @@ def _tenth_of_a_sample(step: float, amplitude: float) -> float:
 SENSOR_GAIN = SensorLaw(
     name="sensor_gain",
     title="wrong gain",
-    parameters=(ParameterSpec("gain", "1", -10.0, 10.0, "shown over true", lambda seen: 0.9),),
+    parameters=(ParameterSpec("gain", "1", -10.0, 10.0, "shown over true", lambda seen: 0.9, plausible=(0.2, 5.0)),),
     absent=(1.0,),
     looks_like="the residual of one channel is a copy of its signal; other sensors of the body contradict it",
     confused_with=("sensor_lag", "mass_change"),

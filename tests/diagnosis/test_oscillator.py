@@ -136,9 +136,6 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
     assert values["spring.damping"] == pytest.approx(DAMPING, rel=0.05)
 
 
-@pytest.mark.xfail(
-    reason="found in its place, but read as a damper that saturates (blow-off to 0.02): friction's own fit stops short"
-)
 def test_friction_shows_in_a_free_decay_without_any_input():
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
     record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=6.0, level=0.0, start=0.01)

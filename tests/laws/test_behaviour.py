@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, find_law
+from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, find_law, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.base import RARE, FittedElement
 from sprung.model.laws.trajectory import along
@@ -40,6 +40,19 @@ def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alik
     assert c / (1 + r**2) == pytest.approx(read.damping)
     softer = 1 - read.frequency * c * r / (1 + r**2) / read.stiffness
     assert restart.stiffness == pytest.approx(max(softer, 0.5))
+
+
+def test_a_damper_without_a_spring_beside_it_has_other_starts_too():
+    """A slide on a guide: what is read has no stiffness."""
+    (restart,) = find_law("series_stiffness").restarts(Reading(0.0, 200.0, 400.0, 12.0))
+    assert restart.stiffness == 1.0 and np.all(np.isfinite(restart.parameters))
+
+
+def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest():
+    t = np.arange(4000) / 400
+    rate = np.where(t < 2, np.cos(2 * np.pi * 20 * t + 0.1), 1e-9 * np.cos(2 * np.pi * 90 * t))
+    assert reversal_step(rate) == pytest.approx(2 * np.pi * 20 / 400, rel=0.05)
+    assert reversal_step(np.ones(10)) == 0.0
 
 
 def test_laws_that_contain_commoner_ones_must_beat_them():

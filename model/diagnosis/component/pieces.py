@@ -16,7 +16,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
 from sprung.model.diagnosis.component.paths import bouc_wen_path, maxwell_path, presliding_path, stop_path
-from sprung.model.laws import SpringDamper, grid
+from sprung.model.laws import SpringDamper, grid, reversal_step
 from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
@@ -44,8 +44,7 @@ class Seen:
 
     def slowest_corner(self, motion: ElementMotion) -> float:
         """The rate that one sample passes at a reversal, m/s: a knee below it is not resolved."""
-        crossing = motion.rate[1:] * motion.rate[:-1] < 0
-        return float(np.median(np.abs(np.diff(motion.rate))[crossing])) if crossing.any() else 0.0
+        return reversal_step(motion.rate)
 
 
 @dataclass(frozen=True)

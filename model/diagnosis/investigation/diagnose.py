@@ -32,6 +32,7 @@ from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.holdout import HeldOut
+from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
 from sprung.model.laws import ElementLaw
 from sprung.model.system import System
 
@@ -52,10 +53,10 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     # what a delay, scale or position leaves, estimated as it is, is no physics
     uncertain = any(fault.value is not None for fault in state.setup_faults)
     for number in range(0 if uncertain else options.most_findings):
-        following = _next_finding(state, number, tell)
-        if following is None:
+        count = len(state.found)
+        state = _next_finding(state, number, tell)
+        if len(state.found) == count:
             break
-        state = following
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
     before, after = state.held.runs(state.base.point, state.fit.point)
@@ -78,8 +79,9 @@ def _begun(system: System, record: Recorded, options: Options, tell: Progress) -
         start = nominal(system, signals, declared, split, options.catalogue, options.project)
     tell(0.2, "input channels")
     faults: tuple[InputFault, ...] = ()
+    doubts: tuple[str, ...] = ()
     if not any(fault.value is not None for fault in setup):
-        start, faults = _without_input_faults(system, options, declared, start, tell)
+        start, faults, doubts = _without_input_faults(system, options, declared, start, tell)
     held = HeldOut(system, start.signals, start.problem.noise, split)
     still = ("the last part of the recording hardly moves: findings could not be checked on it",) if held.still else ()
     return Investigation(
@@ -96,24 +98,33 @@ def _begun(system: System, record: Recorded, options: Options, tell: Progress) -
         last=start.screening,
         input_faults=faults,
         setup_faults=setup,
-        notes=still,
+        notes=(*still, *doubts),
     )
 
 
 def _without_input_faults(
     system: System, options: Options, declared: Noise, start: Nominal, tell: Progress
-) -> tuple[Nominal, tuple[InputFault, ...]]:
-    """Faults of input channels come first: everything else is simulated from the inputs."""
+) -> tuple[Nominal, tuple[InputFault, ...], tuple[str, ...]]:
+    """Faults of input channels come first: everything else is simulated from the inputs.
+
+    With what is not believed of them, in words.
+    """
     faults: list[InputFault] = []
+    doubts: list[str] = []
     for _ in range(_INPUT_FAULTS):
         hit = best_input_fault(start.screening, options.alpha)
         if hit is None:
             break
         tell(0.25, f"input channel {hit.location}")
         fault, signals = compensate(system, start, hit, declared, options.project)
+        reason = out_of_range(fault.term)
+        if reason is not None:
+            name = fault.term.law.name.replace("_", " ")
+            doubts.append(f"{name} at {fault.term.location} is implausible and not named: {reason}")
+            break
         faults.append(fault)
         start = nominal(system, signals, declared, start.split, options.catalogue, options.project)
-    return start, tuple(faults)
+    return start, tuple(faults), tuple(doubts)
 
 
 def _on_everything(state: Investigation) -> Fit:
@@ -125,30 +136,37 @@ def _on_everything(state: Investigation) -> Fit:
     return fit if fit is not None and fit.reduced < _ASTRAY * state.fit.reduced else state.fit
 
 
-def _next_finding(state: Investigation, number: int, tell: Progress) -> Investigation | None:
-    """Find, fit and accept one more finding; None when the rest is noise."""
+def _next_finding(state: Investigation, number: int, tell: Progress) -> Investigation:
+    """Find, fit and accept one more finding; none more when the rest is noise."""
     options = state.options
 
     def new(hits: Iterable[Candidate]) -> list[Candidate]:
-        return [h for h in hits if h.family is not INPUT and not _repeats(state, h)]
+        return [
+            h
+            for h in hits
+            if h.family is not INPUT and not _repeats(state, h) and harmonic(state.problem.part, h.term) is None
+        ]
 
     hits = new(shortlist(state.last, options.alpha, options.multiplicity))
     if not hits:
-        return None
+        return state
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
-    trials = preferred([t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)])
+    believed = [t for t in tried if doubt(t.fit, t.term) is None]
+    worthy = [t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)]
+    trials = preferred([t for t in worthy if any(t is one for one in believed)])
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
+    state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials)))
     if not trials:
-        return None
+        return state
     chosen = trials[0]
     if options.held_out and not state.held.still and state.held.compare(state.fit, chosen.fit).refuted:
-        return None
+        return state
     tests = state.last.tried(chosen.hit.family) if options.multiplicity else 1
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.alpha:
-        return None
-    second = runner_up(state.problem, state.fit, new(state.last.candidates), chosen, tried)
+        return state
+    second = runner_up(state.problem, state.fit, new(state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
@@ -160,6 +178,18 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value)),
         last=screen(problem, fit, options.catalogue, options.project),
     )
+
+
+def _disbelieved(worthy: list[Trial], believed: list[Trial]) -> list[str]:
+    """What fits better than every plausible candidate, with values that it cannot have."""
+    words = []
+    best = max((trial.evidence for trial in believed), default=-np.inf)
+    for trial in worthy:
+        reason = doubt(trial.fit, trial.term)
+        if reason is not None and trial.evidence > best:
+            name = trial.term.law.name.replace("_", " ")
+            words.append(f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}")
+    return words
 
 
 def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[Trial, Fit]:

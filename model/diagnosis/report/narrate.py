@@ -29,7 +29,7 @@ from sprung.model.diagnosis.report.report import (
     Unexplained,
 )
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.laws import ElementLaw, SensorLaw
+from sprung.model.laws import ElementLaw, SensorLaw, reversal_step
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -254,11 +254,11 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
     if corner is None or covariance[corner, corner] <= 0:
         return covariance
     rate = fit.element_motion[1] @ term.port(fit.forward.system)
-    passing = np.abs(np.diff(rate))[rate[1:] * rate[:-1] < 0]
-    if not len(passing):
+    passing = reversal_step(rate)
+    if passing == 0.0:
         return covariance
     width = term.parameters[corner]
-    x = min(np.pi**2 * width / max(float(np.median(passing)), 1e-300), 300.0)
+    x = min(np.pi**2 * width / passing, 300.0)
     along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
     return covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
 

@@ -25,6 +25,7 @@ from sprung.model.diagnosis.selection.evidence import (
     chance,
     monotone_gains,
     occam_cost,
+    process_gain,
     profile_gain,
     unusual_cost,
 )
@@ -301,7 +302,7 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
 def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = RULES.quiet) -> Trial:
     sensors = len(problem.sensors)
     if problem.process_noise:  # how noisy the forces are is what candidates differ in
-        gain = profile_gain(base.residual, fit.residual, sensors, quiet=0.0) + base.log_det - fit.log_det
+        gain = process_gain(base.residual, fit.residual, sensors, (base.log_det, fit.log_det))
         worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
     else:
         worth = base.chi_square - fit.chi_square

@@ -54,18 +54,40 @@ def block_edges(bins: int, rules: EvidenceRules = RULES) -> np.ndarray:
 def profile_gain(
     before: FloatArray, after: FloatArray, sensors: int, quiet: float, rules: EvidenceRules = RULES
 ) -> float:
-    """Gain of one whitened residual (2 F S,) over another.
+    """Gain of one whitened residual (2 F S,) over another that is weighed by the same covariance.
 
     A block quieter than `quiet` times the estimated noise, which is white, owes that to its colour: no evidence.
     """
+    logs, falls = _of_blocks(before, after, sensors, quiet, rules)
+    return bounded_gain(logs, falls)
+
+
+def process_gain(
+    before: FloatArray,
+    after: FloatArray,
+    sensors: int,
+    log_dets: tuple[float, float],
+    rules: EvidenceRules = RULES,
+) -> float:
+    """Gain where each residual is weighed by a covariance of its own, with the log determinants of both.
+
+    A model that needs less noise of the measured forces is weighed more sharply: its blocks may look louder while its
+    determinant falls.  The two belong together, so that nothing of the blocks is left out.
+    """
+    logs, _ = _of_blocks(before, after, sensors, 0.0, rules)
+    return float(np.sum(logs)) + log_dets[0] - log_dets[1]
+
+
+def _of_blocks(
+    before: FloatArray, after: FloatArray, sensors: int, quiet: float, rules: EvidenceRules
+) -> tuple[FloatArray, FloatArray]:
+    """n log(before / after) and the fall of chi-square of every block and sensor."""
     power = [(r.reshape(2, -1, sensors) ** 2).sum(axis=0) for r in (before, after)]
     bins = len(power[0])
     edges = block_edges(bins, rules)
     counts = 2.0 * np.diff(np.append(edges, bins))[:, None]
     levels = [np.maximum(np.add.reduceat(p, edges, axis=0) / counts, max(quiet, 1e-300)) for p in power]
-    logs = counts * np.log(levels[0] / levels[1])
-    change = counts * (levels[0] - levels[1])
-    return bounded_gain(logs, change)
+    return counts * np.log(levels[0] / levels[1]), counts * (levels[0] - levels[1])
 
 
 def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:

@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_forces
-from sprung.model.diagnosis.selection.evidence import profile_gain
+from sprung.model.diagnosis.selection.evidence import process_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
@@ -149,8 +149,7 @@ class HeldOut:
             gain = float(first @ first - second @ second)
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
-            gain = profile_gain(first, second, self.later.sensors.shape[1], quiet=0.0)
-            gain += first_log_det - second_log_det
+            gain = process_gain(first, second, self.later.sensors.shape[1], (first_log_det, second_log_det))
         return HeldOutComparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:

@@ -14,6 +14,7 @@ from sprung.model.diagnosis.selection.evidence import (
     level_gain,
     monotone_gains,
     occam_cost,
+    process_gain,
     profile_gain,
     unusual_cost,
 )
@@ -59,6 +60,17 @@ def test_gain_is_antisymmetric_so_that_a_better_fit_cannot_lose_to_a_worse_one()
         falls = np.sign(logs) * random.exponential(5.0, 10)
         assert bounded_gain(logs, falls) == pytest.approx(-bounded_gain(-logs, -falls))
         assert np.sign(bounded_gain(logs, falls)) in (0, np.sign(np.sum(falls)))
+
+
+def test_a_sharper_noise_level_and_its_determinant_count_together() -> None:
+    """Half the noise of a force: residuals of the same size, and a determinant lower by count log 4."""
+    bins = 1500
+    before, after = (packed(bins, 1, np.ones(bins), seed=seed) for seed in (5, 6))
+    fall = 2 * bins * np.log(4)
+    louder = packed(bins, 1, np.where(np.arange(bins) < 40, 3.0, 1.0), seed=6)  # some blocks look louder by it
+    assert process_gain(before, after, 1, (0.0, -fall)) == pytest.approx(fall, rel=0.1)
+    lost = process_gain(before, after, 1, (0.0, -fall)) - process_gain(before, louder, 1, (0.0, -fall))
+    assert lost == pytest.approx(2 * 40 * np.log(9), rel=0.2)
 
 
 def test_a_parameter_costs_what_the_recording_tells_about_it() -> None:

@@ -1,0 +1,102 @@
+"""Values that a law cannot have in earnest: what has them is not named as physics, however well it fits.
+
+A knee that the motion passes within one sample is a jump, and so is friction; a sensor that shows six times the truth
+and a body of 2.7 times its mass stand for something else; a periodic force at a multiple of the excitation's own
+frequency is what anything non-linear answers with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.record.signals import Part
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import BodyLaw, ElementLaw, SupportLaw, reversal_step
+from sprung.model.signals import FloatArray
+
+_KNEES = 0.5  # of the rate that one sample passes at a reversal: both knees lie within it
+_PURE = 0.8  # of an excitation's power in a few lines, from which it has frequencies of its own
+_LINES, _BINS = 4, 2  # most such lines; bins on either side that belong to one
+_HARMONICS = 30
+_CLOSE = 1.0  # bins, and in shares of a multiple of half a bin, within which a frequency is that multiple
+
+
+def doubt(fit: Fit, term: Term) -> str | None:
+    """Why a fitted term is not believed, in words; None: nothing speaks against it."""
+    reason = out_of_range(term)
+    if reason is not None:
+        return reason
+    if isinstance(term.law, ElementLaw) and term.law.knees:
+        return _unresolved(fit, term)
+    if isinstance(term.law, (BodyLaw, SupportLaw)):
+        return harmonic(fit.forward.part, term)
+    return None
+
+
+def out_of_range(term: Term) -> str | None:
+    """A parameter beyond what it can be in earnest."""
+    for spec, value in zip(term.law.parameters, term.parameters, strict=True):
+        low, high = spec.plausible
+        if not low <= value <= high:
+            unit = "" if spec.unit == "1" else f" {spec.unit}"
+            return f"{spec.name} {value:.3g}{unit} lies outside {low:g} to {high:g}"
+    return None
+
+
+def _unresolved(fit: Fit, term: Term) -> str | None:
+    """A knee of the rate that no sample of the motion resolves."""
+    rate = fit.element_motion[1] @ term.port(fit.forward.system)
+    passed = reversal_step(rate[:: len(rate) // fit.forward.part.grid.samples])
+    for index in term.element_law.knees:
+        if term.parameters[index] < _KNEES * passed:
+            return (
+                f"the knee {term.parameters[index]:.2g} m/s is passed within a sample (the rate changes by "
+                f"{passed:.2g} m/s in one)"
+            )
+    return None
+
+
+def harmonic(part: Part, term: Term) -> str | None:
+    """A periodic force or movement at a multiple of one of the excitation's own frequencies."""
+    names = term.law.names
+    if "frequency" not in names or not (isinstance(term.law, SupportLaw) or getattr(term.law, "load", None)):
+        return None
+    frequency = term.parameters[names.index("frequency")]
+    for line in excitation_lines(part):
+        multiple = round(frequency / line)
+        if (
+            1 <= multiple <= _HARMONICS
+            and abs(frequency - multiple * line) * part.grid.length < _CLOSE + 0.5 * multiple
+        ):
+            return f"{frequency:.4g} Hz is {multiple} times the excitation's own {line:.4g} Hz"
+    return None
+
+
+def excitation_lines(part: Part) -> list[float]:
+    """Frequencies (Hz) of an excitation that consists of a few lines; none where it is broad."""
+    found: list[float] = []
+    omega = part.grid.omega[:, None]
+    for spectrum in (*(1j * omega * part.support).T, *part.force.T):
+        found += _lines_of(np.abs(spectrum) ** 2, part.grid.length)
+    return found
+
+
+def _lines_of(power: FloatArray, length: float) -> list[float]:
+    """Lines that hold most of a power spectrum (F,) together."""
+    left, total = power.copy(), float(power.sum())
+    left[0] = 0.0
+    lines: list[float] = []
+    held = 0.0
+    for _ in range(_LINES if total > 0 else 0):
+        top = int(np.argmax(left))
+        around = slice(max(1, top - _BINS), top + _BINS + 1)
+        weight = float(left[around].sum())
+        if weight <= 0:
+            break
+        lines.append(float(np.arange(len(left))[around] @ left[around]) / weight / length)
+        left[around] = 0.0
+        held += weight
+        if held > _PURE * total:
+            return lines
+    return []

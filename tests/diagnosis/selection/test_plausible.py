@@ -1,0 +1,83 @@
+"""What is not named as physics, however well it fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.record.spectra import Grid
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.selection.plausible import doubt, excitation_lines, harmonic, out_of_range
+from sprung.model.laws import find_law
+
+GRID = Grid(4000, 0.01)
+
+
+@dataclass
+class Excited:
+    """One support and one force over time, as a part of a recording has them."""
+
+    displacement: np.ndarray
+    pushed: np.ndarray
+    grid: Grid = GRID
+    support: np.ndarray = field(init=False)
+    force: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.support, self.force = (GRID.forward(x[:, None]) for x in (self.displacement, self.pushed))
+
+
+def sine(frequency: float) -> np.ndarray:
+    return np.sin(2 * np.pi * frequency * GRID.time)
+
+
+def periodic(frequency: float) -> Term:
+    return Term(find_law("external_force"), "mass", (100.0, frequency, 0.0), "z")
+
+
+@pytest.mark.parametrize("where", ["support", "force"])
+def test_a_multiple_of_the_excitation_is_no_force_of_its_own(where: str) -> None:
+    still = np.zeros(GRID.samples)
+    part = Excited(sine(1.05), still) if where == "support" else Excited(still, sine(1.05))
+    assert excitation_lines(part) == [pytest.approx(1.05, abs=0.02)]
+    for multiple in (1, 3, 5):
+        assert "excitation" in harmonic(part, periodic(multiple * 1.05))
+    assert harmonic(part, periodic(3.7)) is None
+
+
+def test_a_broad_excitation_has_no_harmonics() -> None:
+    road = np.random.default_rng(1).standard_normal(GRID.samples)
+    part = Excited(np.cumsum(road), road)
+    assert excitation_lines(part) == []
+    assert harmonic(part, periodic(3.15)) is None
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "believed"),
+    [
+        ("sensor_gain", (0.9,), True),
+        ("sensor_gain", (6.5,), False),
+        ("mass_change", (1.3,), True),
+        ("mass_change", (2.7,), False),
+    ],
+)
+def test_gains_and_masses_that_stand_for_something_else_are_not_believed(law, values, believed) -> None:
+    reason = out_of_range(Term(find_law(law), "x", values))
+    assert (reason is None) == believed
+
+
+@pytest.mark.parametrize(("knee", "believed"), [(0.2, True), (0.004, False)])
+def test_a_knee_within_one_sample_is_not_believed(knee: float, believed: bool) -> None:
+    rate = np.repeat(0.5 * sine(2.0), 4)  # passes 0.06 m/s within a sample at its reversals
+    term = Term(find_law("damper_blowoff"), "strut", (knee, 0.2))
+    part = SimpleNamespace(grid=GRID)
+    system = SimpleNamespace(elements=("strut",))
+    fit = SimpleNamespace(
+        element_motion=(rate[:, None], rate[:, None]), forward=SimpleNamespace(part=part, system=system)
+    )
+    reason = doubt(fit, term)
+    assert (reason is None) == believed
+    assert believed or "within a sample" in reason
