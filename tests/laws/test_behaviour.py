@@ -44,7 +44,7 @@ def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alik
 
 def test_a_damper_without_a_spring_beside_it_has_other_starts_too():
     """A slide on a guide: what is read has no stiffness."""
-    (restart,) = find_law("series_stiffness").restarts(Reading(0.0, 200.0, 400.0, 12.0))
+    (restart,) = find_law("series_stiffness").restarts(FittedElement(0.0, 200.0, 400.0, 12.0))
     assert restart.stiffness == 1.0 and np.all(np.isfinite(restart.parameters))
 
 
