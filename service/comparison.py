@@ -10,8 +10,9 @@ import numpy as np
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import Ride, fitted_start, simulate_ride
 from sprung.model.system import System, load_system
-from sprung.replay.record import Record, load_record
+from sprung.replay.record import Record
 from sprung.service.errors import UserError
+from sprung.service.opening import open_record
 
 SYSTEM_FILES = (".yaml", ".yml")
 _LEAST = 32  # samples that both need
@@ -47,10 +48,10 @@ def compare(measured: Path, other: Path, system: System, dbc: Path | None) -> Co
 
     Errors: `UserError` when they have nothing in common; the readers' own.
     """
-    record = load_record(measured, system.channels, system.sample_rate, dbc=dbc, time=system.time)
+    record = open_record(measured, system, dbc)
     if other.suffix.lower() in SYSTEM_FILES:
         return _against_system(record, load_system(other, system.catalogue), (measured.name, other.name))
-    second = load_record(other, system.channels, system.sample_rate, dbc=dbc, time=system.time)
+    second = open_record(other, system, dbc)
     first, last, offset = _overlap(record, second, measured, other)
     inputs = len(system.inputs)
     return Comparison(

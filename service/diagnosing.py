@@ -15,7 +15,8 @@ import numpy as np
 
 from sprung.model.system import System
 from sprung.replay.account import Account
-from sprung.replay.record import Record, load_record
+from sprung.replay.record import Record
+from sprung.service.opening import open_record
 from sprung.service.ring import Excerpt
 from sprung.service.threads import hand_over_often, one_thread_each
 from sprung.service.worker import Emit
@@ -86,8 +87,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
 def _load(request: DiagnosisRequest) -> Record:
     if request.path.suffix == ".npz":
         return load_excerpt(request.path)
-    system = request.system
-    return load_record(request.path, system.channels, system.sample_rate, dbc=request.dbc, time=system.time)
+    return open_record(request.path, request.system, request.dbc)
 
 
 def save_excerpt(path: Path, excerpt: Excerpt) -> None:

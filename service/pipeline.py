@@ -15,9 +15,10 @@ from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
+from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
-from sprung.service.times import AHEAD, now_ns
+from sprung.service.times import now_ns
 from sprung.service.views import vehicle_view
 
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
@@ -195,28 +196,17 @@ class Pipeline:
         skip: set[int],
         now: int,
     ) -> tuple[list[WindowRecord], _Vehicle]:
-        """Feed the windows that are newer than what the tracker has seen, in order.
-
-        One that is older is followed all the same when the clock must have been wrong: where the clock of its stream
-        stepped back, and where the last window is stamped in the future.
-        """
+        """Feed the windows that are not skipped, in order."""
         tracker = self.engine.tracker
-        state, last = at.state, at.last_window_ns
+        followed = Followed(at.state, at.last_window_ns)
         records = []
         for window, estimate in zip(windows, estimates, strict=True):
-            posterior, fed = None, False
-            fresh = window.start not in skip
-            if fresh and window.start <= last and (window.new_segment or last > now + AHEAD):
-                state = tracker.rebase(state, window.start)
-                last = window.start - 1
-            if fresh and window.start > last and estimate is None:
-                state = tracker.missed(state)
-            if fresh and window.start > last and estimate is not None:
-                state = tracker.update(state, estimate, window.start)
-                last = window.start
-                fed = True
-                if state.used:  # before, there is nothing but the prior: no measurement, and not drawn as one
-                    posterior = Posterior(*tracker.posterior(state))
+            posterior, before = None, followed
+            if window.start not in skip:
+                followed = followed.after(tracker, window, estimate, now)
+            fed = estimate is not None and followed.last == window.start and followed is not before
+            if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
+                posterior = Posterior(*tracker.posterior(followed.state))
             records.append(
                 WindowRecord(
                     window.start,
@@ -227,7 +217,7 @@ class Pipeline:
                     posterior,
                 )
             )
-        return records, replace(at, state=state, last_window_ns=last)
+        return records, replace(at, state=followed.state, last_window_ns=followed.last)
 
     def _current(self, connection: Connection, vehicle: str) -> _Vehicle:
         """The vehicle's tracker: from memory when that is still what is stored, else read anew."""

@@ -12,10 +12,10 @@ from typing import Any, Protocol, TypeVar
 
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.system import System
-from sprung.replay import open_recording
 from sprung.replay.pacing import paced
 from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
+from sprung.service.opening import open_stream
 from sprung.service.worker import Emit, ProcessLimits, Worker
 
 T = TypeVar("T")
@@ -105,8 +105,7 @@ def windower_of(system: System, stamped: bool = False) -> Windower:
 def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     """Read to the end, handing over pieces of `batch_windows` windows.  Raises UnreadableRecording."""
     system = request.system
-    start = request.path.stat().st_mtime_ns if request.start is None and request.path.is_file() else request.start
-    recording = open_recording(request.path, system.channels, dbc=request.dbc, time=system.time, start=start)
+    recording = open_stream(request.path, system, request.dbc, request.start)
     windower, spans = windower_of(system, recording.stamped), Spans()
     held: list[Window] = []
     whole = 0

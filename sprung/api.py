@@ -11,21 +11,22 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identifier import Identifies, UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
-from sprung.model.simulate.linear import LinearSimulator, knots
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system, parse_system
-from sprung.model.tracking.tracker import Alarm, ParameterReport, Tracker, TrackerSettings
+from sprung.model.simulate.ride import simulate_ride
+from sprung.model.system import System, load_system, parse_system
+from sprung.model.tracking.tracker import Alarm, ParameterReport
 from sprung.replay.record import Record
-from sprung.replay.record import load_record as load_channels
 from sprung.replay.recording import Recording
-from sprung.replay.recording import open_recording as open_channels
-from sprung.replay.windowing import Windower
+from sprung.service.engine import Engine, make_tracker
+from sprung.service.following import Followed
+from sprung.service.opening import bundled_dbc, open_record, open_stream
+from sprung.service.reading import windower_of
 from sprung.service.report import write_report
+from sprung.service.times import now_ns
 
 __all__ = [
     "IdentifiedWindow",
@@ -82,28 +83,33 @@ class Tracked:
     windows: int  # that were tracked
 
 
-def open_recording(path: str | Path, system: System, dbc: str | Path | None = None) -> Recording:
+def open_recording(
+    path: str | Path, system: System, dbc: str | Path | None = None, start: int | None = None
+) -> Recording:
     """A recording as a stream of samples of the system's channels; `.blocks()` reads it, once.
 
     dbc: the CAN database of a BLF, ASC, candump or MF4 file; the bundled one for the bundled system.
+    start: ns since 1970, when it began if its times count from 0; the file's own time otherwise.  The unit of a time
+    column and where it stands are as the system file's `time` says.
     Errors: `UnreadableRecording`, one line, now or while reading.
     """
-    return open_channels(path, system.channels, dbc=dbc or _bundled_dbc(system))
+    return open_stream(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
 
 
-def load_record(path: str | Path, system: System, dbc: str | Path | None = None) -> Record:
-    """A whole recording on one even grid, as `diagnose` wants it.  Errors: `UnreadableRecording`."""
-    return load_channels(path, system.channels, system.sample_rate, dbc=dbc or _bundled_dbc(system))
+def load_record(path: str | Path, system: System, dbc: str | Path | None = None, start: int | None = None) -> Record:
+    """A whole recording on one even grid, as `diagnose` wants it; arguments and errors as of `open_recording`."""
+    return open_record(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
 
 
 def simulate(
     system: System, inputs: FloatArray, parameters: Mapping[str, float] | None = None, start: FloatArray | None = None
 ) -> FloatArray:
-    """What the sensors of a system would show, noise-free, shape (T, S).
+    """What the sensors of a system would show, with the laws of its file and noise-free, shape (T, S).
 
     inputs: measured inputs in the order of `system.inputs`, shape (T, I), sampled at `system.sample_rate`.
     parameters: values that differ from nominal, by name, in SI units.
     start: state at the first sample (displacements, then rates), shape (N,); at rest by default.
+    Errors: `SimulationError`.
 
     >>> import numpy as np, sprung
     >>> system = sprung.load_system()
@@ -115,18 +121,7 @@ def simulate(
     >>> sensors.shape
     (400, 12)
     """
-    inputs = np.asarray(inputs, dtype=np.float64)
-    if inputs.ndim != 2 or inputs.shape[1] != len(system.inputs):
-        raise ValueError(f"inputs: shape (T, {len(system.inputs)}) expected, {inputs.shape} came")
-    windows = np.concatenate([inputs, np.zeros((len(inputs), len(system.sensors)))], axis=1)[None]
-    simulator = LinearSimulator(system)
-    x0 = torch.zeros(1, 2 * system.mechanics.n, dtype=torch.float64)
-    if start is not None:
-        x0[0] = torch.as_tensor(np.asarray(start, dtype=np.float64))
-    log_ratio = torch.as_tensor(_log_ratio(system, parameters or {}))[None]
-    shown, _ = simulator.simulate(log_ratio, torch.as_tensor(knots(system, windows)), x0)
-    result: FloatArray = shown[0].numpy()
-    return result
+    return simulate_ride(system, inputs, parameters, start).sensors
 
 
 def identify(
@@ -157,7 +152,7 @@ def identify(
 
 
 def track(system: System, recording: Recording, model: Identifies | None = None) -> Tracked:
-    """Posterior, drift and alarms of every parameter over a whole recording.
+    """Posterior, drift and alarms of every parameter over a whole recording, as the service follows a vehicle.
 
     >>> import sprung
     >>> system = sprung.load_system()
@@ -166,37 +161,34 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
     >>> [alarm.parameter for alarm in tracked.alarms]
     ['secondary_2l.damping', 'primary_12r.stiffness']
     """
-    model = model or load_identifier(system)
-    rate = system.sample_rate
-    tracker = Tracker(system.tracked, TrackerSettings(window=system.window / rate, hop=system.hop / rate))
-    state, count = tracker.initial_state(), 0
-    for windows in _usable(system, recording):
-        estimates = model.identify(np.stack([w.values for w in windows]))
-        middle = round(0.5e9 * system.window / rate)
-        for window, estimate in zip(windows, estimates, strict=True):
-            state = tracker.update(state, estimate, window.start + middle)
-        count += len(windows)
-    return Tracked(tracker.report(state), state.alarms, tracker.health(state), count)
+    engine = Engine(system, model or load_identifier(system), make_tracker(system))
+    followed, count = Followed(engine.tracker.initial_state()), 0
+    for windows in _cut(system, recording):
+        whole = [window for window in windows if window.outcome != "dropped"]
+        estimates: Iterator[Estimate] = iter(())
+        if whole:
+            found, _ = engine.identify(np.stack([w.values for w in whole]), starts=[w.start for w in whole])
+            estimates = iter(found)
+        for window in windows:
+            estimate = None if window.outcome == "dropped" else next(estimates)
+            followed = followed.after(engine.tracker, window, estimate, now_ns())
+        count += len(whole)
+    state = followed.state
+    return Tracked(engine.tracker.report(state), state.alarms, engine.tracker.health(state), count)
 
 
-def _usable(system: System, recording: Recording) -> Iterator[list[Window]]:
-    """Windows that were not dropped, in batches."""
-    windower = Windower(system.channels, system.sample_rate, system.window, system.hop, inputs=system.needed_inputs)
+def _cut(system: System, recording: Recording) -> Iterator[list[Window]]:
+    """Windows in batches, in order of time."""
+    windower = windower_of(system, recording.stamped)
     held: list[Window] = []
-
-    def windows() -> Iterator[Window]:
-        for block in recording.blocks():
-            yield from windower.push(block)
-        yield from windower.flush()
-
-    for window in windows():
-        if window.outcome != "dropped":
-            held.append(window)
-        if len(held) == AT_ONCE:
-            yield held
-            held = []
-    if held:
-        yield held
+    for block in recording.at_rate(system.sample_rate):
+        held += windower.push(block)
+        while len(held) >= AT_ONCE:
+            yield held[:AT_ONCE]
+            held = held[AT_ONCE:]
+    held += windower.flush()
+    for first in range(0, len(held), AT_ONCE):
+        yield held[first : first + AT_ONCE]
 
 
 def _window(system: System, values: FloatArray | Mapping[str, FloatArray]) -> FloatArray:
@@ -221,19 +213,3 @@ def _values(system: System, estimate: Estimate) -> tuple[ParameterValue, ...]:
         )
         for p, x, s, i in zip(system.tracked, estimate.log_ratio, std, estimate.identifiable, strict=True)
     )
-
-
-def _log_ratio(system: System, values: Mapping[str, float]) -> FloatArray:
-    index = {p.name: i for i, p in enumerate(system.parameters)}
-    result = np.zeros(len(index))
-    for name, value in values.items():
-        if name not in index:
-            raise ValueError(f"{name}: no such parameter; there are {', '.join(index)}")
-        if not value > 0:
-            raise ValueError(f"{name}: a positive value is needed, not {value}")
-        result[index[name]] = np.log(value / system.parameters[index[name]].nominal)
-    return result
-
-
-def _bundled_dbc(system: System) -> Path | None:
-    return MANCHESTER_DBC if system.digest == load_system(MANCHESTER).digest else None

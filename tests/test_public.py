@@ -14,6 +14,10 @@ import numpy as np
 import pytest
 
 import sprung
+from sprung.model.simulate.ride import simulate_ride
+from sprung.service.feed import feed_file
+from sprung.service.pipeline import Pipeline
+from tests.diagnosis_cases import SYSTEM
 
 ROOT = Path(__file__).parents[1]
 
@@ -45,11 +49,46 @@ def test_simulated_values_are_named_and_positive() -> None:
     inputs = np.zeros((100, len(system.inputs)))
     with pytest.raises(ValueError, match="no such parameter"):
         sprung.simulate(system, inputs, {"primary.stiffness": 1.0})
-    with pytest.raises(ValueError, match="positive"):
+    with pytest.raises(ValueError, match="at least 0"):
         sprung.simulate(system, inputs, {"primary_11l.stiffness": -1.0})
     with pytest.raises(ValueError, match="shape"):
         sprung.simulate(system, inputs[:, :3])
     assert np.all(sprung.simulate(system, inputs) == 0)
+
+
+def test_a_simulation_has_the_laws_of_the_file() -> None:
+    plain = sprung.parse_system(SYSTEM)
+    rubbing = sprung.parse_system(
+        SYSTEM.replace(
+            "damping: 2.0e+4}", "damping: 2.0e+4, laws: [{coulomb_friction: {force: 500, smoothing: 1e-3}}]}"
+        )
+    )
+    time = np.arange(400) / plain.sample_rate
+    inputs = np.stack([1e-2 * np.sin(8 * time), 8e-2 * np.cos(8 * time)], axis=1)
+    free, held = sprung.simulate(plain, inputs), sprung.simulate(rubbing, inputs)
+    np.testing.assert_array_equal(held, simulate_ride(rubbing, inputs).sensors)
+    assert np.std(held - free) > 0.05 * np.std(free)
+
+
+def test_recordings_are_read_with_the_time_column_that_the_system_file_names(tmp_path: Path) -> None:
+    system = sprung.parse_system(SYSTEM + "time: {column: clock, unit: ms}\n")
+    table = tmp_path / "ride.csv"
+    rows = [f"{10 * i},{i},{np.sin(0.1 * i)},{np.cos(0.1 * i)},0,0,{np.sin(i)},{np.cos(i)}" for i in range(300)]
+    table.write_text("\n".join(["clock,time,d,v,a,b,e,f", *rows]))
+    assert len(sprung.load_record(table, system).values) == pytest.approx(300, abs=2)
+    start = 1_790_000_000 * 10**9
+    times = np.concatenate([block.time for block in sprung.open_recording(table, system, start=start).blocks()])
+    assert (times.min(), times.max()) == (start, start + 2_990_000_000)
+
+
+def test_tracking_is_that_of_the_service(pipeline: Pipeline) -> None:
+    engine = pipeline.engine
+    ride = sprung.open_recording(ROOT / "tests/data/drift-600s.blf", engine.system)
+    tracked = sprung.track(engine.system, ride, engine.identifier)
+    fed = feed_file(pipeline, ROOT / "tests/data/drift-600s.blf")
+    assert fed.state is not None
+    assert tracked.parameters == engine.tracker.report(fed.state)
+    assert tracked.windows == fed.windows["used"] + fed.windows["repaired"] > 1000
 
 
 def test_an_installed_wheel_leaves_a_users_own_names_alone(tmp_path: Path) -> None:

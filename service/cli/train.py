@@ -14,9 +14,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
-from sprung.replay import open_recording
 from sprung.service.cli.console import errors
 from sprung.service.errors import UserError
+from sprung.service.opening import open_stream
 from sprung.service.reading import windower_of
 
 
@@ -41,7 +41,7 @@ def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatA
     """Windows of all recordings that were not dropped, shape (B, T, C)."""
     found = []
     for path in paths:
-        recording = open_recording(path, system.channels, dbc=dbc, time=system.time)
+        recording = open_stream(path, system, dbc)
         windower = windower_of(system, recording.stamped)
         for block in recording.at_rate(system.sample_rate):
             found += [w.values for w in windower.push(block) if w.outcome != "dropped"]

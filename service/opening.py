@@ -1,0 +1,29 @@
+"""Recordings as a system file says: its channels, the unit and start of its times, its CAN database."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.replay.record import Record, load_record
+from sprung.replay.recording import Recording, open_recording
+
+
+def open_stream(path: Path, system: System, dbc: Path | None = None, start: int | None = None) -> Recording:
+    """A recording as a stream of samples, to be read once.  Raises UnreadableRecording.
+
+    start: ns since 1970, when the recording began if its times count from 0; else the file's own time is taken.
+    """
+    if start is None and path.is_file():
+        start = path.stat().st_mtime_ns
+    return open_recording(path, system.channels, dbc=dbc, time=system.time, start=start)
+
+
+def open_record(path: Path, system: System, dbc: Path | None = None, start: int | None = None) -> Record:
+    """A whole recording on one even grid.  Raises UnreadableRecording."""
+    return load_record(path, system.channels, system.sample_rate, dbc=dbc, time=system.time, start=start)
+
+
+def bundled_dbc(system: System) -> Path | None:
+    """The CAN database that comes with the bundled system."""
+    return MANCHESTER_DBC if system.digest == load_system(MANCHESTER).digest else None
