@@ -10,15 +10,13 @@ from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, C
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.pieces import SURFACE
 from sprung.model.diagnosis.component.search import (
-    RULES,
-    ComponentRules,
+    Progress as Told,
+)
+from sprung.model.diagnosis.component.search import (
     Ranked,
     Search,
     Step,
     search,
-)
-from sprung.model.diagnosis.component.search import (
-    Progress as Told,
 )
 from sprung.model.diagnosis.component.words import finding_of, leftover_words, preload_finding, reversed_finding
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
@@ -35,10 +33,6 @@ from sprung.model.diagnosis.report.report import (
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-_DECLARED = 0.02  # of the force: a declared noise is believed up to this; beyond it has to be seen in the record
-_SURFACE_SERVES = 0.9  # of the held-out power that an unnamed force may leave to be worth reporting
-_NAMED = 0.5  # of the excess power: named laws that explain less than this do not carry the verdict
 
 
 @dataclass(frozen=True)
@@ -77,23 +71,23 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
         def progress(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
             tell(share, f"{name}: {text}")
 
-        judged.append(_judge(one, RULES, progress))
+        judged.append(_judge(replace(one, task=replace(one.task, rules=options.rules.component)), progress))
     tell(0.95, "report")
     report = _report(system, record, options, judged)
     tell(1.0, "done")
     return report
 
 
-def _judge(one: ComponentRecord, rules: ComponentRules, tell: Told) -> Judged:
+def _judge(one: ComponentRecord, tell: Told) -> Judged:
     turned = _turned(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, rules=rules, tell=tell)
+    found = search(one.task, tell=tell)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, noise_floor(one, final), turned, None)
     left = float(np.max(judged.errors.unexplained()))
     share = judged.errors.explained()
-    if left > 0 and (not found.steps or (share is not None and share < _NAMED)):
+    if left > 0 and (not found.steps or (share is not None and share < one.task.rules.named)):
         tell("what is left, as an unnamed force")
         judged = _with_surface(judged)
     return judged
@@ -119,18 +113,18 @@ def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
     declared counts where the record shows less, up to a fiftieth of the force.
     """
     task = one.task
-    cell = max(one.measured_noise, min(one.declared, _DECLARED * float(np.std(task.force))))
+    cell = max(one.measured_noise, min(one.declared, task.rules.declared * float(np.std(task.force))))
     through = np.hypot(
         fit.element.stiffness * task.motion.deflection_noise, fit.element.damping * task.motion.rate_noise
     )
-    return float(np.hypot(cell, min(float(through), _DECLARED * float(np.std(task.force)))))
+    return float(np.hypot(cell, min(float(through), task.rules.declared * float(np.std(task.force)))))
 
 
 def _with_surface(judged: Judged) -> Judged:
     """The rest as an unnamed force, if that serves the held-out part."""
     task, before = judged.final.task, judged.final
     after = fitted(task, judged.final.model.plus(SURFACE, ()))
-    if after.held_out > _SURFACE_SERVES * before.held_out:
+    if after.held_out > after.task.rules.surface_serves * before.held_out:
         return judged
     count = effective_count(after.residual[: task.split])
     gain = level_gain(before.error, after.error, count)

@@ -18,6 +18,7 @@ from scipy.optimize import least_squares, lsq_linear
 
 from sprung.model.diagnosis.component.motion import ElementMotion
 from sprung.model.diagnosis.component.pieces import Piece, Seen, Values
+from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import SpringDamper
 from sprung.model.signals import FloatArray
 
@@ -41,6 +42,7 @@ class ComponentTask:
     force: FloatArray  # N, (T,)
     split: int
     nominal: NominalValues = NominalValues(None, None)
+    rules: ComponentRules = RULES.component
 
     @cached_property
     def seen(self) -> Seen:

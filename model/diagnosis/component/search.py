@@ -22,27 +22,9 @@ from sprung.model.diagnosis.component.fit import (
 )
 from sprung.model.diagnosis.component.paths import stop_path
 from sprung.model.diagnosis.component.pieces import PIECES, Piece
+from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
 
-
-@dataclass(frozen=True)
-class ComponentRules:
-    """Deciding constants of a component's diagnosis."""
-
-    search: int = 4000  # samples that trial shapes are compared on, and
-    fit: int = 16000  # that the final fit uses: a record of a periodic test holds far fewer independent numbers
-    most: int = 3  # laws: real rigs have more imperfections than a record can name
-    alpha: float = 1e-3  # chance of a false finding per recording
-    least_share: float = 0.2  # of the power that is still left, that a further law must remove: less is imitation
-    naming_margin: float = 6.0  # evidence by which a law must beat its look-alikes: odds of 20 to 1
-    plain_cost: float = 6.0  # evidence by which a law must beat a commoner one that it contains
-    starts: int = 2  # trial shapes from which a law is refined
-    close: int = 6  # laws that are refined in every round
-
-
-RULES = ComponentRules()
-_LOST = 0.05  # of the stiffness: a spring that keeps less within its gap has lost it
-_SLIPS = 0.05  # of the time: what slips less has shown its gap only
 Progress = Callable[[str], None]
 
 
@@ -87,10 +69,10 @@ class Search:
 def search(
     task: ComponentTask,
     pieces: tuple[Piece, ...] = PIECES,
-    rules: ComponentRules = RULES,
     tell: Progress = lambda text: None,
 ) -> Search:
     """Grow a model of the component until the rest is noise, or nothing explains enough of it."""
+    rules = task.rules
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = fitted(quick, ComponentModel())
@@ -190,11 +172,13 @@ def plausible(fit: ComponentFit) -> bool:
     if piece.effect == "friction_backlash":  # what never slips is a spring with a gap
         gap, reach = fit.model.shapes[index]
         u = np.abs(stop_path(fit.task.motion.deflection, 0.5 * gap + reach))
-        return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > _SLIPS)
+        return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > fit.task.rules.slips)
     if piece.effect == "clearance":
-        return bool(np.abs(strengths[0] / max(fit.element.stiffness, 1e-300) - 1) < _LOST)  # no force within the gap
+        return bool(
+            np.abs(strengths[0] / max(fit.element.stiffness, 1e-300) - 1) < fit.task.rules.lost
+        )  # no force in the gap
     if piece.effect == "bump_stop":  # and with none, the stop is the spring, and has a clearance
-        return bool(fit.element.stiffness > _LOST * strengths[0])
+        return bool(fit.element.stiffness > fit.task.rules.lost * strengths[0])
     return True
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.pieces import Values
-from sprung.model.diagnosis.component.search import RULES, Step
+from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic
 from sprung.model.signals import FloatArray
@@ -78,7 +78,7 @@ def _family(step: Step) -> str | None:
     near = [
         r.last.effect
         for r in step.rivals
-        if r.evidence > best.evidence - RULES.naming_margin and r.last.effect != best.last.effect
+        if r.evidence > best.evidence - best.fit.task.rules.naming_margin and r.last.effect != best.last.effect
     ]
     return " or ".join([best.last.effect, *dict.fromkeys(near)]) if near else None
 

@@ -16,6 +16,7 @@ from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import given_terms
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.system import System
 
 _REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
@@ -25,14 +26,16 @@ _DIVERGED = (
 )
 
 
-def baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
+def baseline(
+    system: System, signals: Signals, declared: Noise, split: int, rules: Rules = RULES
+) -> tuple[Problem, Fit]:
     """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
 
     Errors: `DiagnosisError` where the numbers of system file and recording fit each other so badly that none comes out.
     """
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
-            problem, fit = _baseline(system, signals, declared, split)
+            problem, fit = _baseline(system, signals, declared, split, rules)
     except (np.linalg.LinAlgError, FloatingPointError):
         raise DiagnosisError(_DIVERGED) from None
     if not np.isfinite(fit.chi_square):
@@ -40,11 +43,11 @@ def baseline(system: System, signals: Signals, declared: Noise, split: int) -> t
     return problem, fit
 
 
-def _baseline(system: System, signals: Signals, declared: Noise, split: int) -> tuple[Problem, Fit]:
+def _baseline(system: System, signals: Signals, declared: Noise, split: int, rules: Rules) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
-    problem = Problem(system, part, signals.sensor_index, noise)
+    problem = Problem(system, part, signals.sensor_index, noise, rules)
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):

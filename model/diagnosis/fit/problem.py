@@ -16,6 +16,7 @@ from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.response.harmonic_balance import LawForces
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -39,6 +40,7 @@ class Problem:
     part: Part
     sensors: np.ndarray  # indices of the present sensors
     noise: Noise
+    rules: Rules = RULES  # by which fits to it are judged
 
     @property
     def process_noise(self) -> bool:

@@ -13,6 +13,7 @@ from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.holdout import FreeRun, HeldOut
@@ -46,6 +47,7 @@ class Options:
     most_findings: int = 4
     file: str = ""  # name of the recording, for the report
     catalogue: tuple[Law, ...] = CATALOGUE
+    rules: Rules = RULES  # every number that decides
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
+from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
@@ -35,13 +36,6 @@ from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
 from sprung.model.laws import ElementLaw
 from sprung.model.system import System
-
-# a finding beside earlier ones counts from this share of what they are worth: at the same place and elsewhere
-_MINOR_BESIDE, _MINOR_ELSEWHERE = 0.05, 0.002
-_MINOR_FOLLOWED = 0.01  # elsewhere, where the gain is of logarithms: a law is simulated no better than that
-_MOST_LEFT = 0.5  # or from this share of what they left of forces that nobody measured
-_ASTRAY = 1.5  # rise of the reduced chi-square from the first part to the whole recording
-_INPUT_FAULTS = 2  # of input channels that are looked for, one after the other
 
 
 def investigate(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome:
@@ -67,22 +61,22 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
 def _begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
     """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
     tell(0.02, "channels and noise")
-    prepared = prepare(system, system.undistorted(record.values), record.sample_rate)
+    prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
     signals, split = cut(prepared.signals, options.train_share)
     declared = declared_noise(system, signals)
     tell(0.05, "nominal structure identified again; screening all laws at all places")
-    start = nominal(system, signals, declared, split, options.catalogue, options.project)
+    start = nominal(system, signals, declared, split, options)
     tell(0.15, "set-up: signs, channels, nodes, scales, positions")
     system, mended, setup = without_setup_faults(system, signals, declared, split, start.problem, start.fit)
     if setup:
         split, signals = fitted_samples(signals, mended, split), mended
-        start = nominal(system, signals, declared, split, options.catalogue, options.project)
+        start = nominal(system, signals, declared, split, options)
     tell(0.2, "input channels")
     faults: tuple[InputFault, ...] = ()
     doubts: tuple[str, ...] = ()
     if not any(fault.value is not None for fault in setup):
         start, faults, doubts = _without_input_faults(system, options, declared, start, tell)
-    held = HeldOut(system, start.signals, start.problem.noise, split)
+    held = HeldOut(system, start.signals, start.problem.noise, split, options.rules)
     still = ("the last part of the recording hardly moves: findings could not be checked on it",) if held.still else ()
     return Investigation(
         system=system,
@@ -111,19 +105,19 @@ def _without_input_faults(
     """
     faults: list[InputFault] = []
     doubts: list[str] = []
-    for _ in range(_INPUT_FAULTS):
+    for _ in range(options.rules.acceptance.input_faults):
         hit = best_input_fault(start.screening, options.alpha)
         if hit is None:
             break
         tell(0.25, f"input channel {hit.location}")
-        fault, signals = compensate(system, start, hit, declared, options.project)
+        fault, signals = compensate(system, start, hit, declared, options)
         reason = out_of_range(fault.term)
         if reason is not None:
             name = fault.term.law.name.replace("_", " ")
             doubts.append(f"{name} at {fault.term.location} is implausible and not named: {reason}")
             break
         faults.append(fault)
-        start = nominal(system, signals, declared, start.split, options.catalogue, options.project)
+        start = nominal(system, signals, declared, start.split, options)
     return start, tuple(faults), tuple(doubts)
 
 
@@ -133,30 +127,35 @@ def _on_everything(state: Investigation) -> Fit:
     part = transform(state.signals, state.problem.noise, differentiated=differentiated)
     problem = replace(state.problem, part=part)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
-    return fit if fit is not None and fit.reduced < _ASTRAY * state.fit.reduced else state.fit
+    most = state.options.rules.acceptance.astray * state.fit.reduced
+    return fit if fit is not None and fit.reduced < most else state.fit
 
 
 def _next_finding(state: Investigation, number: int, tell: Progress) -> Investigation:
     """Find, fit and accept one more finding; none more when the rest is noise."""
     options = state.options
 
+    plausible = options.rules.plausible
+
     def new(hits: Iterable[Candidate]) -> list[Candidate]:
         return [
             h
             for h in hits
-            if h.family is not INPUT and not _repeats(state, h) and harmonic(state.problem.part, h.term) is None
+            if h.family is not INPUT
+            and not _repeats(state, h)
+            and harmonic(state.problem.part, h.term, plausible) is None
         ]
 
-    hits = new(shortlist(state.last, options.alpha, options.multiplicity))
+    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules.selection))
     if not hits:
         return state
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
-    believed = [t for t in tried if doubt(t.fit, t.term) is None]
+    believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
     worthy = [t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)]
-    trials = preferred([t for t in worthy if any(t is one for one in believed)])
+    trials = preferred([t for t in worthy if any(t is one for one in believed)], options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
-    state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials)))
+    state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials, plausible)))
     if not trials:
         return state
     chosen = trials[0]
@@ -180,12 +179,12 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     )
 
 
-def _disbelieved(worthy: list[Trial], believed: list[Trial]) -> list[str]:
+def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> list[str]:
     """What fits better than every plausible candidate, with values that it cannot have."""
     words = []
     best = max((trial.evidence for trial in believed), default=-np.inf)
     for trial in worthy:
-        reason = doubt(trial.fit, trial.term)
+        reason = doubt(trial.fit, trial.term, rules)
         if reason is not None and trial.evidence > best:
             name = trial.term.law.name.replace("_", " ")
             words.append(f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}")
@@ -224,18 +223,19 @@ def _repeats(state: Investigation, hit: Candidate) -> bool:
 
 def _minor(state: Investigation, trial: Trial) -> bool:
     """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
+    rules = state.options.rules.acceptance
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
-            least = _MINOR_FOLLOWED if state.problem.process_noise else _MINOR_ELSEWHERE
+            least = rules.minor_followed if state.problem.process_noise else rules.minor_elsewhere
             if trial.gain < least * found.trial.gain:
                 return True
         elif not trial.named:
             return True
         elif state.problem.process_noise:
             left = float(np.sum(state.fit.noise.force**2))
-            if trial.worth < min(_MINOR_BESIDE * found.trial.worth, _MOST_LEFT * left):
+            if trial.worth < min(rules.minor_beside * found.trial.worth, rules.most_left * left):
                 return True
-        elif trial.worth < _MINOR_BESIDE * _worth(state.fit, state.given + index):
+        elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index):
             return True
     return False
 

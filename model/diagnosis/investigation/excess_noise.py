@@ -7,12 +7,8 @@ from scipy import stats
 
 from sprung.model.diagnosis.investigation.course import Investigation, NoiseFault
 from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.rules import NoiseRules
 from sprung.model.diagnosis.selection.holdout import FreeRun
-
-_LEAST = 1.12  # ratio to its peers from which a noise level is a fault
-_SIGMAS = 6.0
-_INACCURACY = 0.05  # of the power of what the findings changed
-_UPPER = 0.38  # of the sample rate
 
 
 def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple[NoiseFault, ...]:
@@ -22,7 +18,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     wrong by a little; that much is no noise of the sensor.
     """
     declared = declared_noise(state.system, state.prepared.signals)
-    noise = state.problem.noise
+    noise, rules = state.problem.noise, state.options.rules.noise
     grid = state.problem.part.grid
     count = grid.band.stop
     found: list[NoiseFault] = []
@@ -31,23 +27,25 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     inside = noise.sensors / known
     # what is left of physics is no noise: noise goes on above the band that is compared
     white = upper_ratio(state, known) > 1 + 0.5 * (inside - 1)
-    inaccuracy = _INACCURACY * np.mean((after.simulated - before.simulated) ** 2, axis=0)
+    inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
-    found += _outliers(names, inside, white, count)
+    found += _outliers(names, inside, white, count, rules)
     pairs = state.problem.part.pairs
     if len(pairs):
         supports = [state.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
-        found += _outliers([f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count)
-        found += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count)
+        found += _outliers(
+            [f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count, rules
+        )
+        found += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count, rules)
     return tuple(found)
 
 
 def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     """Residual over declared noise above the compared band, up to where anti-alias filters cut, per sensor."""
     grid, plant = state.problem.part.grid, state.fit.forward.plant
-    upper = slice(grid.band.stop, int(_UPPER * grid.samples))
+    upper = slice(grid.band.stop, int(state.options.rules.noise.upper * grid.samples))
     if upper.stop - upper.start < 20:
         return np.full(len(declared), np.inf)
     variance = state.problem.noise.support_variance(grid.omega[upper])
@@ -56,7 +54,9 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(power - through, 0.0)) / declared
 
 
-def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: float) -> list[NoiseFault]:
+def _outliers(
+    names: list[str], ratio: np.ndarray, white: np.ndarray, count: float, rules: NoiseRules
+) -> list[NoiseFault]:
     """Channels whose ratio of noise to declared noise leaves that of the others."""
     found = []
     for i, name in enumerate(names):
@@ -67,7 +67,7 @@ def _outliers(names: list[str], ratio: np.ndarray, white: np.ndarray, count: flo
         relative = float(ratio[i]) / usual
         sigma = 1 / np.sqrt(2 * max(count, 2.0))
         z = float(np.log(relative) / sigma)
-        if relative > _LEAST and z > _SIGMAS:
+        if relative > rules.least and z > rules.sigmas:
             p_value = float(min(1.0, len(names) * stats.norm.sf(z)))
             found.append(NoiseFault(name, float(ratio[i]), float(ratio[i] * sigma), usual, z, p_value))
     return found

@@ -9,7 +9,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.course import InputFault, Nominal
+from sprung.model.diagnosis.investigation.course import InputFault, Nominal, Options
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT
@@ -18,17 +18,14 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.system import System
 
-_ROUNDS = 3
-_RIVAL, _RIVALS = 0.3, 3  # share of the leader's score from which others are tried, and how many
-_DONE = 0.01  # score below which nothing of the fault is left
-
 
 def nominal(
-    system: System, signals: Signals, declared: Noise, split: int, laws: tuple[Law, ...], project: bool
+    system: System, signals: Signals, declared: Noise, split: int, options: Options, laws: tuple[Law, ...] | None = None
 ) -> Nominal:
-    """The nominal structure on the first `split` samples, and all candidates screened on its residual."""
-    problem, fit = baseline(system, signals, declared, split)
-    return Nominal(signals, problem, fit, screen(problem, fit, laws, project))
+    """The nominal structure on the first `split` samples, and all candidates (or those of `laws`) screened on its
+    residual."""
+    problem, fit = baseline(system, signals, declared, split, options.rules)
+    return Nominal(signals, problem, fit, screen(problem, fit, laws or options.catalogue, options.project))
 
 
 def best_input_fault(screening: Screening, alpha: float) -> Candidate | None:
@@ -41,20 +38,21 @@ def best_input_fault(screening: Screening, alpha: float) -> Candidate | None:
 
 
 def compensate(
-    system: System, present: Nominal, hit: Candidate, declared: Noise, project: bool
+    system: System, present: Nominal, hit: Candidate, declared: Noise, options: Options
 ) -> tuple[InputFault, Signals]:
     """The leading input fault, chosen among its rivals and estimated, and the signals without it."""
+    rules = options.rules.acceptance
     rivals = [h for h in present.screening.candidates if h.family is INPUT and h.term.key != hit.term.key]
     rivals.sort(key=lambda h: -h.score)
-    candidates = [hit, *[h for h in rivals if h.score > _RIVAL * hit.score][:_RIVALS]]
-    tried = [_estimated(system, present, candidate.term, declared, project) for candidate in candidates]
+    candidates = [hit, *[h for h in rivals if h.score > rules.input_rival * hit.score][: rules.input_rivals]]
+    tried = [_estimated(system, present, candidate.term, declared, options) for candidate in candidates]
     _, term, std = min(tried, key=lambda one: one[0])
     fault = InputFault(term, std, hit.score, present.screening.p_value(hit), None)
     return fault, compensated(present.signals, term)
 
 
 def _estimated(
-    system: System, present: Nominal, term: Term, declared: Noise, project: bool
+    system: System, present: Nominal, term: Term, declared: Noise, options: Options
 ) -> tuple[float, Term, float]:
     """Estimate an input fault by compensating, screening again and compensating the rest.
 
@@ -63,11 +61,11 @@ def _estimated(
     value, std = term.parameters[0], 0.0
     law = term.law
     assert isinstance(law, SensorLaw)
-    for _ in range(_ROUNDS):
+    for _ in range(options.rules.acceptance.input_rounds):
         signals = compensated(present.signals, term.at(np.array([value])))
-        rest = nominal(system, signals, declared, present.split, (law,), project)
+        rest = nominal(system, signals, declared, present.split, options, (law,))
         again = _of_key(rest.screening.candidates, term)
-        if again is None or again.score < _DONE:
+        if again is None or again.score < options.rules.acceptance.input_done:
             break
         change = again.term.parameters[0]
         std = abs(change - law.absent[0]) / max(np.sqrt(again.score), 1e-12)

@@ -9,13 +9,13 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
-from sprung.model.diagnosis.investigation.verdict import RULES, HeldOutErrors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.signals import FloatArray
 
-_SPREAD = 4.0  # standard deviations by which the noise of so many samples may leave its mean
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
 
 
@@ -25,12 +25,13 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     Where laws follow the sensors' motion and the free run loses its phase, errors of the run say little: then the
     forces that nobody measured are judged, over the inertia forces.
     """
+    rules = state.options.rules.verdict
     noise = bounded(state)
     floor = state.held.noise_rms(state.fit, noise)
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     expected = floor / np.where(size > 0, size, 1.0)
-    errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after))
-    lost = state.problem.process_noise and after.nrmse > RULES.strange
+    errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
+    lost = state.problem.process_noise and after.nrmse > rules.strange
     deciding = errors
     if lost:
         shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]
@@ -42,14 +43,14 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     effects += [fault.term.law.name for fault in state.input_faults]
     effects += ["sensor_stuck"] * len(state.prepared.stuck) + ["sensor_noise"] * len(noisy)
     effects += [found.trial.term.law.name for found in state.found]
-    verdict = verdict_of(effects, deciding)
+    verdict = verdict_of(effects, deciding, rules)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
     carried = verdict != "unknown_physics" or not state.found or not state.found[0].trial.named
     return Judgement(
         errors=errors,
         verdict=verdict,
         floor=floor,
-        strange=strange if verdict == "unknown_physics" and strange > RULES.strange else None,
+        strange=strange if verdict == "unknown_physics" and strange > rules.strange else None,
         lost_phase=lost,
         carried=carried,
         place=_place(state),
@@ -64,19 +65,19 @@ def bounded(state: Investigation) -> Noise:
     present = np.isin(prepared.sensor_index, state.signals.sensor_index)
     known = declared.sensors[present]
     seen = upper_ratio(state, known) * known
-    noise = state.problem.noise
-    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0))
-    force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)))
+    noise, slack = state.problem.noise, state.options.rules.verdict.slack
+    sensors = bounded_noise(noise.sensors, known, np.where(np.isfinite(seen), seen, 0.0), slack)
+    force = bounded_noise(noise.force, declared.force, np.zeros(len(noise.force)), slack)
     return replace(noise, sensors=sensors, force=force)
 
 
-def realised_floor(expected: FloatArray, after: FreeRun) -> FloatArray:
+def realised_floor(expected: FloatArray, after: FreeRun, rules: VerdictRules = RULES.verdict) -> FloatArray:
     """Noise floor of each sensor on the held-out samples themselves.
 
     The estimated noise would give `expected` on average; these samples had their own.  Where the free run errs by
     no more than that within sampling error, its error is noise, and is the floor.
     """
-    spread = _SPREAD * np.sqrt(1 / (2 * len(after.measured)))
+    spread = rules.spread * np.sqrt(1 / (2 * len(after.measured)))
     return np.where(np.abs(after.per_sensor / expected - 1) < spread, after.per_sensor, expected)
 
 
@@ -100,7 +101,7 @@ def _place(state: Investigation) -> str:
 
 def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:
     """Place, size and frequencies of what is left, empty where nothing is."""
-    left = errors.unexplained()
+    left = errors.unexplained(state.options.rules.verdict)
     if not np.any(left > 0):
         return ""
     worst = int(np.argmax(left))

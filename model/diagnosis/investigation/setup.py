@@ -22,28 +22,11 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.rules import SetupRules
 from sprung.model.schema import MotionSensor, SystemFile
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-
-@dataclass(frozen=True)
-class SetupRules:
-    """Deciding constants of the search for wrong set-ups."""
-
-    strange: float = 4e-3  # misfit of a sensor from which a set-up is suspected: vehicles fitted well have 1e-3
-    promising: float = 0.85  # of the present misfit that a hypothesis may leave, by spectra, to be fitted
-    tried: int = 5  # hypotheses that are fitted
-    beside: int = 2  # faults of single sensors that are fitted beside them
-    explains: float = 0.3  # of the misfit that one may leave, once fitted, to be accepted
-    latest: float = 0.5  # s, of a node
-    scale: float = 1.3  # ratio from which a scale is wrong: less is a sensor's gain
-    offset: float = 0.1  # m, from which a position is wrong
-    rounds: int = 2  # in which an accepted delay or scale is estimated again
-    most: int = 2  # faults of one recording
-
-
-RULES = SetupRules()
 ORDINARY = ("sensor_gain", "sensor_lag")  # that screening seeks; they only have to be beaten
 _EDGE = 5  # samples beside a cut that a shift between samples spoils
 _STEPS = 4  # of a delay
@@ -81,7 +64,8 @@ def without_setup_faults(
     """System and signals with faults of the set-up undone, and which they were."""
     found: list[SetupFault] = []
     present = misfit(fit)
-    while len(found) < RULES.most and float(np.max(present)) > RULES.strange:
+    rules = problem.rules.setup
+    while len(found) < rules.most and float(np.max(present)) > rules.strange:
         best = _best(system, signals, declared, split, problem, fit, present)
         if best is None:
             break
@@ -123,6 +107,7 @@ def _best(
     present: FloatArray,
 ) -> _Accepted | None:
     """The hypothesis that explains most, fitted, if one explains enough."""
+    rules = problem.rules.setup
     shown = [ModelResponse.of(problem, fit.forward)]
     shown.append(
         ModelResponse.of(problem, Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta))))
@@ -132,22 +117,22 @@ def _best(
         for hypothesis in one.hypotheses(system, signals):
             key = (hypothesis.effect, hypothesis.location)
             share = replace(hypothesis, left=hypothesis.left / one.total)
-            if share.left < RULES.promising and (key not in promising or share.left < promising[key].left):
+            if share.left < rules.promising and (key not in promising or share.left < promising[key].left):
                 promising[key] = share
     by_left = sorted(promising.values(), key=lambda h: h.left)
-    ranked = [h for h in by_left if h.effect not in ORDINARY][: RULES.tried]
+    ranked = [h for h in by_left if h.effect not in ORDINARY][: rules.tried]
     if not ranked:
         return None
-    ranked += [h for h in by_left if h.effect in ORDINARY][: RULES.beside]
+    ranked += [h for h in by_left if h.effect in ORDINARY][: rules.beside]
     total, best = float(np.sum(present)), None
     for hypothesis in ranked:
         changed, mended = hypothesis.undo(system, signals)
         try:
-            other, again = baseline(changed, mended, declared, fitted_samples(signals, mended, split))
+            other, again = baseline(changed, mended, declared, fitted_samples(signals, mended, split), problem.rules)
         except (ValueError, FloatingPointError):
             continue
         left = float(np.sum(misfit(again)))
-        if left < RULES.explains * total and (best is None or left < best[0].after):
+        if left < rules.explains * total and (best is None or left < best[0].after):
             std = _deviation(hypothesis, left)
             fault = SetupFault(
                 hypothesis.effect, hypothesis.location, hypothesis.value, std, total, left, hypothesis.axis
@@ -166,7 +151,7 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
         return accepted
     at = [signals.sensor_names.index(name) for name in names]
     value = fault.value
-    for _ in range(RULES.rounds):
+    for _ in range(problem.rules.setup.rounds):
         shown = ModelResponse.of(problem, fit.forward)
         if fault.effect == "node_delay":
             change = shown.late(at, 0.0)
@@ -182,7 +167,7 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
             undo = _move_sensor(fault.location, fault.axis, change)
         system, mended = undo(system, signals)
         split, signals = fitted_samples(signals, mended, split), mended
-        problem, fit = baseline(system, signals, declared, split)
+        problem, fit = baseline(system, signals, declared, split, problem.rules)
     left = float(np.sum(misfit(fit)))
     std = shown.value_deviation(fault.effect, at, fit) * (value if fault.effect == "wrong_scale" else 1.0)
     if fault.effect == "wrong_position":
@@ -207,6 +192,7 @@ class ModelResponse:
     omega: FloatArray
     step: float
     samples: int
+    rules: SetupRules
 
     @classmethod
     def of(cls, problem: Problem, forward: Forward) -> ModelResponse:
@@ -223,6 +209,7 @@ class ModelResponse:
             part.grid.omega[band],
             part.grid.step,
             part.grid.samples,
+            problem.rules.setup,
         )
 
     @property
@@ -253,7 +240,7 @@ class ModelResponse:
                 ("sensor_lag", late, turned[:, None] * shown[:, [i]], _advance_sensors([i], late)),
             ):
                 alone = _relative(self.measured[:, [i]] - answer, self.measured[:, [i]])[0]
-                if ratio > 0 and abs(late) < RULES.latest:
+                if ratio > 0 and abs(late) < self.rules.latest:
                     yield Hypothesis(effect, name, value, float(np.sum(own) - own[i] + alone), undo)
 
     def _signs(self, signals: Signals) -> Iterator[Hypothesis]:
@@ -297,7 +284,7 @@ class ModelResponse:
         size = np.maximum(np.sum(np.abs(self.measured) ** 2, axis=0), 1e-300)
         own = _relative(self.measured - shown, self.measured)
         lags = (np.arange(self.samples) + self.samples // 2) % self.samples - self.samples // 2
-        near = np.abs(lags) * self.step <= RULES.latest
+        near = np.abs(lags) * self.step <= self.rules.latest
         full = np.zeros((self.samples // 2 + 1, len(own)), dtype=complex)
         full[1 : len(shown) + 1] = shown.conj() * self.measured / size
         agree = np.fft.irfft(full, self.samples, axis=0)[near] * self.samples
@@ -312,7 +299,7 @@ class ModelResponse:
                 left = rest + float(np.sum(_relative(self.measured[:, at] - turned, self.measured[:, at])))
                 yield Hypothesis("node_delay", names, late, left, _advance_sensors(at, late))
             ratio = float(np.sum(np.real(full[1 : len(shown) + 1, at])) / max(np.sum(power[at]), 1e-300))
-            if ratio > RULES.scale or 0 < ratio < 1 / RULES.scale:
+            if ratio > self.rules.scale or 0 < ratio < 1 / self.rules.scale:
                 left = rest + float(
                     np.sum(_relative(self.measured[:, at] - ratio * shown[:, at], self.measured[:, at]))
                 )
@@ -353,7 +340,7 @@ class ModelResponse:
                 if sensor.kind not in _ORDERS or f"{sensor.body}.{turn}" not in dofs:
                     continue
                 offset, change = self.offset(system, i, name, axis)
-                if abs(offset) < RULES.offset:
+                if abs(offset) < self.rules.offset:
                     continue
                 error = self.measured[:, i] - shown[:, i]
                 alone = _relative((error - offset * change)[:, None], self.measured[:, [i]])[0]

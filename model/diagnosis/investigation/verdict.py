@@ -17,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 
+from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.laws import CATALOGUE
 from sprung.model.signals import FloatArray
 
@@ -29,20 +30,6 @@ NO_FAULTS = frozenset({"preload"})  # nuisances: reported, and no reason for any
 
 
 @dataclass(frozen=True)
-class VerdictRules:
-    """Deciding constants of the verdict."""
-
-    clear: float = 1.5  # error over the floor, pooled, up to which nothing is left: parameters' errors and chance
-    clear_sensor: float = 2.0  # the same of a single sensor
-    carried: float = 0.5  # of the excess error that findings must explain to carry the verdict
-    strange: float = 0.6  # error over the signal from which the system file does not describe the recording
-    least: float = 2e-3  # error over the signal that sampling and differentiation leave of a perfect model
-
-
-RULES = VerdictRules()
-
-
-@dataclass(frozen=True)
 class HeldOutErrors:
     """Held-out errors over the measured signal, rms over rms, per sensor (S,)."""
 
@@ -50,18 +37,18 @@ class HeldOutErrors:
     after: FloatArray  # with the findings
     floor: FloatArray  # bounded noise
 
-    def bounded(self, rules: VerdictRules = RULES) -> FloatArray:
+    def bounded(self, rules: VerdictRules = RULES.verdict) -> FloatArray:
         """The floor with what sampling leaves of a perfect model, (S,)."""
         return np.hypot(self.floor, rules.least)
 
-    def unexplained(self, rules: VerdictRules = RULES) -> FloatArray:
+    def unexplained(self, rules: VerdictRules = RULES.verdict) -> FloatArray:
         """Share of every sensor's power that neither the model nor bounded noise explains; 0 where that is nothing."""
         floor = self.bounded(rules)
         pooled = np.sqrt(np.mean(self.after**2)) > rules.clear * np.sqrt(np.mean(floor**2))
         left = (self.after > rules.clear_sensor * floor) | (pooled & (self.after > rules.clear * floor))
         return np.where(left, np.maximum(self.after**2 - floor**2, 0.0), 0.0)
 
-    def explained(self, rules: VerdictRules = RULES) -> float | None:
+    def explained(self, rules: VerdictRules = RULES.verdict) -> float | None:
         """Share of the error power beyond the bounded floor that the findings remove; None: there was none."""
         floor = float(np.mean(self.bounded(rules) ** 2))
         excess = float(np.mean(self.before**2)) - floor
@@ -69,7 +56,7 @@ class HeldOutErrors:
         return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
 
 
-def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRules = RULES) -> Verdict:
+def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRules = RULES.verdict) -> Verdict:
     """The verdict for findings of the given effects, best first, and the errors that they leave."""
     left = bool(np.any(errors.unexplained(rules) > 0))
     named = [effect for effect in effects if effect not in NO_FAULTS]
@@ -87,7 +74,9 @@ def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRule
     return "unknown_physics" if physics[0] == "unknown" else "missing_physics"
 
 
-def bounded_noise(learnt: FloatArray, declared: FloatArray, measured: FloatArray, slack: float = 1.5) -> FloatArray:
+def bounded_noise(
+    learnt: FloatArray, declared: FloatArray, measured: FloatArray, slack: float = RULES.verdict.slack
+) -> FloatArray:
     """Noise levels that a floor may use: what was learnt, but no more than was declared or independently measured.
 
     slack: a declaration is a round number.

@@ -8,14 +8,12 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-MINIMUM_SAMPLES = 200
-_GAP_SECONDS = 0.05  # longest gap that is closed by interpolation
-_MOVES = 2.0  # standard deviations of its noise by which at least one sensor has to move
-_STUCK_SHARE = 0.02  # of the recording: a run of equal values this long (and at least a second) is no chance
+MINIMUM_SAMPLES = RULES.record.minimum_samples
 
 
 class DiagnosisError(ValueError):
@@ -35,7 +33,7 @@ class Prepared:
     notes: tuple[str, ...]
 
 
-def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
+def prepare(system: System, values: FloatArray, sample_rate: float, rules: RecordRules = RULES.record) -> Prepared:
     """Sort columns (T, C) in the order of `system.channels` by role.
 
     Errors: `DiagnosisError` when an input is missing, `TooLittleError` when too little is left or nothing moves.
@@ -47,12 +45,12 @@ def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
     notes: list[str] = []
     resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
     notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
-    stuck = _blank_stuck(values, names, sample_rate, resting)
-    first, last = _usable_stretch(system, values, sample_rate)
-    if last - first < MINIMUM_SAMPLES:
+    stuck = _blank_stuck(values, names, sample_rate, resting, rules.stuck)
+    first, last = _usable_stretch(values, max(1, int(rules.gap * sample_rate)))
+    if last - first < rules.minimum_samples:
         raise TooLittleError(
             f"too short to decide anything: the recording has {last - first} usable samples in a row; "
-            f"at least {MINIMUM_SAMPLES} ({MINIMUM_SAMPLES / sample_rate:.1f} s) are needed"
+            f"at least {rules.minimum_samples} ({rules.minimum_samples / sample_rate:.1f} s) are needed"
         )
     if last - first < len(values):
         notes.append(
@@ -60,27 +58,27 @@ def prepare(system: System, values: FloatArray, sample_rate: float) -> Prepared:
         )
     values = _close_gaps(values[first:last])
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
-    _require_motion(system, prepared.signals)
+    _require_motion(system, prepared.signals, rules)
     return prepared
 
 
-def _require_motion(system: System, signals: Signals) -> None:
+def _require_motion(system: System, signals: Signals, rules: RecordRules) -> None:
     listed = list(system.file.sensors.values())
     noise = np.array([listed[index].noise for index in signals.sensor_index])
     moves = np.std(signals.sensors, axis=0)
-    if np.all(moves < _MOVES * noise):
+    if np.all(moves < rules.moves * noise):
         best = int(np.argmax(moves / noise))
         raise TooLittleError(
-            f"too still to decide anything: no sensor moves by {_MOVES:g} times its noise "
+            f"too still to decide anything: no sensor moves by {rules.moves:g} times its noise "
             f"({signals.sensor_names[best]}: {moves[best]:.2g}, noise {noise[best]:.2g}); "
             "record faster or on rougher track"
         )
 
 
 def _blank_stuck(
-    values: FloatArray, names: list[str], sample_rate: float, resting: set[str]
+    values: FloatArray, names: list[str], sample_rate: float, resting: set[str], share: float
 ) -> list[tuple[str, float]]:
-    """Columns that repeat one value for long become NaN, but for those that rest."""
+    """Columns that repeat one value for long (a share of the recording) become NaN, but for those that rest."""
     found = []
     for column, name in enumerate(names):
         series = values[:, column]
@@ -91,16 +89,15 @@ def _blank_stuck(
         edges = np.concatenate([[-1], change, [len(good) - 1]])
         runs = np.diff(edges)
         longest = int(np.argmax(runs))
-        if runs[longest] >= max(sample_rate, _STUCK_SHARE * len(values), 20):
+        if runs[longest] >= max(sample_rate, share * len(values), 20):
             found.append((name, float(good[edges[longest] + 1] / sample_rate)))
             values[:, column] = np.nan
     return found
 
 
-def _usable_stretch(system: System, values: FloatArray, sample_rate: float) -> tuple[int, int]:
+def _usable_stretch(values: FloatArray, longest_gap: int) -> tuple[int, int]:
     """Longest run of samples in which every channel that is present at all has no long gap."""
     present = np.isfinite(values).any(axis=0)
-    longest_gap = max(1, int(_GAP_SECONDS * sample_rate))
     bad = np.zeros(len(values), dtype=bool)
     for column in np.flatnonzero(present):
         missing = ~np.isfinite(values[:, column])

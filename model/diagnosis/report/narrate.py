@@ -29,19 +29,14 @@ from sprung.model.diagnosis.report.report import (
     Unexplained,
 )
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws import ElementLaw, SensorLaw, reversal_step
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_NAMING_MARGIN = 6.0  # evidence by which a law must beat its look-alikes to be named alone (odds of 20 to 1)
-_CHANGED = 0.25  # a parameter this far from nominal, and surely so, is listed as changed
-_ALIKE = 0.5  # correlation of measured and simulated from which a sign or a scale is a likely reason
-_SCALE = 3.0  # ratio of sizes that no parameter explains
-_FAR = 1.6  # log-ratio to nominal, a factor of 5: no rebuilt vehicle is as far off
 _NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
 _NO_LONGER = 900.0  # %, of a value that stood for something else
-_LOOSE = 0.2  # standard deviation of a log-ratio from which a parameter counts as undecided
 
 
 def narrate(outcome: Outcome, record: Recorded) -> Report:
@@ -164,17 +159,17 @@ def _nothing_fits(outcome: Outcome, strange: float) -> str:
 def likely_reasons(outcome: Outcome) -> list[str]:
     """Two or three reasons for which nothing fits, by what the record shows."""
     course, before = outcome.investigation, outcome.before
-    names = course.signals.sensor_names
+    names, rules = course.signals.sensor_names, course.options.rules.report
     turned, scales = [], []
     for i, name in enumerate(names):
         measured, simulated = before.measured[:, i], before.simulated[:, i]
         power = float(np.sum(measured**2) * np.sum(simulated**2))
         alike = float(measured @ simulated) / np.sqrt(power) if power > 0 else 0.0
-        if alike < -_ALIKE:
+        if alike < -rules.alike:
             turned.append(name)
-        elif alike > _ALIKE:
+        elif alike > rules.alike:
             scale = float(np.sqrt(np.sum(measured**2) / np.sum(simulated**2)))
-            if not 1 / _SCALE < scale < _SCALE:
+            if not 1 / rules.scale < scale < rules.scale:
                 scales.append(f"{name} is {scale:.3g} times what it should show (a unit or a scale?)")
     reasons = [f"the sign of {', '.join(turned)}"] if turned else []
     reasons += scales[:1]
@@ -182,7 +177,7 @@ def likely_reasons(outcome: Outcome) -> list[str]:
     far = [
         i
         for i in np.argsort(-np.abs(course.base.point.theta))
-        if abs(course.base.point.theta[i]) > _FAR * (1 + sigma[i])
+        if abs(course.base.point.theta[i]) > rules.far * (1 + sigma[i])
     ]
     if far:
         parameter = course.system.parameters[int(far[0])]
@@ -270,7 +265,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
         term = course.fit.point.terms[course.given + index]
         parameters, block = _law_parameters(outcome.final, course.given + index)
         rival = found.runner_up
-        family, advice = _look_alikes(found)
+        family, advice = _look_alikes(found, course.options.rules.report)
         finding = Finding(
             location=term.location,
             effect=term.law.name,
@@ -287,13 +282,13 @@ def _physics(outcome: Outcome) -> list[Finding]:
     return findings
 
 
-def _look_alikes(found: Found) -> tuple[str | None, str | None]:
+def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:
     """The laws at the same place that the recording cannot tell from the chosen one, and what would."""
     best = found.trial
     near = [
         t
         for t in found.trials
-        if t.evidence > best.evidence - _NAMING_MARGIN
+        if t.evidence > best.evidence - rules.naming_margin
         and t.named
         and t.term.location == best.term.location
         and t.term.law.name != best.term.law.name
@@ -423,7 +418,7 @@ def _stuck_finding(name: str, at: float) -> Finding:
 def _undecided(course: Investigation) -> list[str]:
     """What the recording is too short or too still to tell."""
     sigma = _deviations(course.system, course.base)
-    loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > _LOOSE]
+    loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > course.options.rules.report.loose]
     if not loose:
         return []
     shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")
@@ -440,7 +435,7 @@ def _changes(outcome: Outcome) -> tuple[str, ...]:
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
     for i in order:
-        if abs(theta[i]) > np.log1p(_CHANGED) and abs(theta[i]) > 5 * sigma[i]:
+        if abs(theta[i]) > np.log1p(course.options.rules.report.changed) and abs(theta[i]) > 5 * sigma[i]:
             change = 100 * (np.exp(theta[i]) - 1)
             words.append(f"{course.system.parameters[i].name} is {change:+.0f} % from nominal")
     return tuple(words)

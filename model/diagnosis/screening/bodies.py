@@ -13,6 +13,7 @@ from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.response.forward import structure_of
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import LINE, MASS, MODE
 from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
@@ -20,9 +21,6 @@ from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
 
 _RATIOS = (0.01, 0.03)  # damping ratios of trial modes
-_LOWEST = 1.0  # Hz, of trial modes
-_COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
-_HIGHEST = 0.4  # of the sample rate
 
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
@@ -64,7 +62,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
     bare = structure_of(system, projector.problem.sensors, fit.point.theta)
     element_force = bare.stiffness * fit.motions.deflection[band] + bare.damping * fit.motions.rate[band]  # (F, E)
     kinds = plant.structure.sensor_kind
-    frequencies, ratios = _mode_grid(1 / grid.step)
+    frequencies, ratios = _mode_grid(1 / grid.step, projector.problem.rules.screening)
     w0 = 2 * np.pi * frequencies[:, None]
     h = np.reciprocal(w0**2 - omega**2 + 2j * ratios[:, None] * w0 * omega)  # (trials, F)
     for variant in law.variants(system.mechanics, index):
@@ -89,11 +87,11 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
         yield Candidate(term, float(score[i]), MODE), len(frequencies)
 
 
-def _mode_grid(sample_rate: float) -> tuple[FloatArray, FloatArray]:
+def _mode_grid(sample_rate: float, rules: ScreeningRules) -> tuple[FloatArray, FloatArray]:
     frequencies, ratios = [], []
     for ratio in _RATIOS:
-        count = int(np.log(_HIGHEST * sample_rate / _LOWEST) / ratio)
-        grid = np.geomspace(_LOWEST, _HIGHEST * sample_rate, max(count, 2))
+        count = int(np.log(rules.highest_mode * sample_rate / rules.lowest_mode) / ratio)
+        grid = np.geomspace(rules.lowest_mode, rules.highest_mode * sample_rate, max(count, 2))
         frequencies.append(grid)
         ratios.append(np.full(len(grid), ratio))
     return np.concatenate(frequencies), np.concatenate(ratios)
@@ -120,7 +118,7 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Ca
         scores = np.empty(2 * len(on) - 1)
         scores[0::2], scores[1::2] = on, between
         scores[:4] = 0.0
-        scores = scores / np.maximum(1.0, _local_median(scores) / 1.386)
+        scores = scores / np.maximum(1.0, _local_median(scores, projector.problem.rules.screening.reach) / 1.386)
         i = int(np.argmax(scores))
         count += len(scores)
         if scores[i] > best[0]:
@@ -131,7 +129,7 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Ca
     return _refined_line(projector, law, name, variant, bin_number, score), count
 
 
-def _local_median(scores: FloatArray, reach: int = 24) -> FloatArray:
+def _local_median(scores: FloatArray, reach: int) -> FloatArray:
     return median_filter(scores, size=2 * reach + 1, mode="nearest")
 
 
@@ -157,4 +155,4 @@ def _refined_line(
     amplitude = float(np.hypot(sine, cosine))
     values = (amplitude, float(frequency), float(np.arctan2(cosine, sine)))
     term = Term(law, name, values, variant, scales=(max(amplitude, 1e-9), 1.0, 1.0))
-    return Candidate(term, min(score, _COLOUR * rough), LINE)
+    return Candidate(term, min(score, projector.problem.rules.screening.colour * rough), LINE)

@@ -15,6 +15,7 @@ from scipy.ndimage import median_filter
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import HARMONIC
 from sprung.model.diagnosis.screening.places import wheelsets
 from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
@@ -23,11 +24,7 @@ from sprung.model.signals import FloatArray
 
 _FINER = 8  # frequencies per bin: the last harmonic drifts by half a turn at most over the recording
 _PHASES = 64
-_LOWEST, _HIGHEST = 0.5, 15.0  # Hz, of fundamentals: rail joints at walking pace to wheels at 150 km/h
-_LEAST = 2  # harmonics that are seen: one alone is a line
-_REACH = 24  # bins around one that tell the level of a coloured residual
 _MEDIAN = 1.386  # of chi-square with two degrees of freedom
-_COLOUR = 2.5  # most by which exact columns may raise a score that is weighed by the residual's level
 
 
 def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
@@ -41,10 +38,10 @@ def harmonic_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator
 
 def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Candidate, int]:
     absent = Candidate(Term(law, location, law.absent), 0.0, HARMONIC)
-    names = supports(projector.problem.system)
+    names, rules = supports(projector.problem.system), projector.problem.rules.screening
     at = [names.index(name) for name in location.split("|")]
     channel = ScalarResponse(projector, projector.of_support[:, :, at].sum(axis=2))
-    fundamentals, products, sizes = _products(projector.grid, law, channel)
+    fundamentals, products, sizes = _products(projector.grid, law, channel, rules)
     tests = len(fundamentals) * len(law.harmonics)
     best = np.argmax(products, axis=1)
     product = np.take_along_axis(products, best[:, None], axis=1)[:, 0]
@@ -53,23 +50,25 @@ def _best(projector: Projector, law: SupportLaw, location: str) -> tuple[Candida
         return absent, tests
     i = int(np.argmax(scores))
     values, exact = _refined(projector.grid, law, channel, float(fundamentals[i]), best[i] / _PHASES)
-    score = min(exact, _COLOUR * float(scores[i]))
+    score = min(exact, rules.colour * float(scores[i]))
     term = Term(law, location, values, scales=(max(values[0], 1e-9), 1.0, 0.1))
     return Candidate(term, score, HARMONIC), tests
 
 
-def _products(grid: Grid, law: SupportLaw, channel: ScalarResponse) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _products(
+    grid: Grid, law: SupportLaw, channel: ScalarResponse, rules: ScreeningRules
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Fundamentals (m,) in Hz, products with the residual (m, phases) and squares (m,) of movements of unit depth.
 
     Both are divided by how much stronger than noise the residual is around every bin.
     """
     scores = np.abs(channel.product) ** 2 / np.maximum(channel.size, 1e-300)
-    colour = np.maximum(1.0, median_filter(scores, size=2 * _REACH + 1, mode="nearest") / _MEDIAN)
+    colour = np.maximum(1.0, median_filter(scores, size=2 * rules.reach + 1, mode="nearest") / _MEDIAN)
     product, size, bins = channel.product / colour, channel.size / colour, len(colour)
     series = scipy.fft.ifft(np.pad(product, (0, grid.samples - bins))).real * np.sqrt(grid.samples)
     spectrum = scipy.fft.rfft(series, _FINER * grid.samples)
-    first, last = (int(f * _FINER * grid.length) for f in (_LOWEST, _HIGHEST))
-    steps = np.arange(max(first, 1), min(last, _FINER * (bins - 1) // _LEAST) + 1)
+    first, last = (int(f * _FINER * grid.length) for f in (rules.slowest, rules.fastest))
+    steps = np.arange(max(first, 1), min(last, _FINER * (bins - 1) // rules.harmonics) + 1)
     turned = np.zeros((len(steps), _PHASES), dtype=complex)
     squares = np.zeros(len(steps))
     for n, weight in enumerate(law.harmonics, 1):

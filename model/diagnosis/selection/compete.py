@@ -18,9 +18,9 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.point import Point, advance
 from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.rules import RULES, EvidenceRules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.evidence import (
-    RULES,
     bic,
     chance,
     monotone_gains,
@@ -31,17 +31,6 @@ from sprung.model.diagnosis.selection.evidence import (
 )
 from sprung.model.laws import BodyLaw, ElementLaw
 from sprung.model.laws.base import FittedElement, Restart
-
-_UNNAMED_RATIO = 1.3  # and explain this many times as much
-_CLOSE = 0.25  # share of the best score from which a candidate is fitted
-_NEAR = 45.0  # or this close to it
-_MOST = 9  # candidates that are fitted
-_STRONGER = 1.1
-_HINT = 0.02  # share of a law's strength at which its first step is taken
-_SETTLING = 3  # rounds in which fits that still fall and could lead are fitted on
-_LAST, _MOST_FINISHED = 3, 6  # that are fitted to the end in any case; when they are close to the best
-_FURTHER = 3  # candidates that are tried for a runner-up where none was close
-_CHANCE = 4.0  # standard deviations by which what is noise exceeds it
 
 
 @dataclass(frozen=True)
@@ -78,7 +67,9 @@ class Trial:
         return bic(self.gain, len(self.term.parameters), self.fit.count)
 
 
-def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> list[Candidate]:
+def shortlist(
+    screening: Screening, alpha: float, multiplicity: bool = True, rules: SelectionRules = RULES.selection
+) -> list[Candidate]:
     """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
     good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
@@ -90,15 +81,15 @@ def shortlist(screening: Screening, alpha: float, multiplicity: bool = True) -> 
     unnamed: dict[str, int] = {}
     for hit in good:
         s = hit.strength
-        share = _CLOSE if hit.location == place else 0.6
-        if s < share * top and s < top - _NEAR:
+        share = rules.close if hit.location == place else rules.close_elsewhere
+        if s < share * top and s < top - rules.near:
             continue
         if not hit.term.law.named:
             unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
-            if unnamed[hit.location] > 2:
+            if unnamed[hit.location] > rules.unnamed:
                 continue
         chosen.append(hit)
-        if len(chosen) >= _MOST:
+        if len(chosen) >= rules.most:
             break
     return chosen
 
@@ -110,6 +101,7 @@ def compete(
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Trial]:
     """Fits of the hits around the present model, best evidence first."""
+    rules = problem.rules.selection
     places = sorted({hit.location for hit in hits})
     progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
 
@@ -128,8 +120,8 @@ def compete(
     best = trials[0].evidence
 
     def close(rank: int, trial: Trial) -> bool:
-        near = problem.process_noise or trial.evidence > best - max(_NEAR, 0.3 * abs(best))
-        return rank < _LAST or (rank < _MOST_FINISHED and near)
+        near = problem.process_noise or trial.evidence > best - max(rules.near, rules.near_share * abs(best))
+        return rank < rules.last or (rank < rules.finished and near)
 
     leading = [trial for rank, trial in enumerate(trials) if close(rank, trial)]
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
@@ -144,7 +136,7 @@ def compete(
 
 def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence, none of which could lead if only it were fitted on: a fit that still falls is no gain."""
-    for _ in range(_SETTLING):
+    for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
         falling = [t for t in trials if t.finished and not t.fit.converged and t.evidence + t.fit.left > best]
         if not falling:
@@ -162,7 +154,7 @@ def runner_up(problem: Problem, base: Fit, hits: list[Candidate], chosen: Trial,
         return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
     fitted = {t.hit.term.key for t in tried}
     others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
-    for hit in sorted(others, key=lambda h: h.strength, reverse=True)[:_FURTHER]:
+    for hit in sorted(others, key=lambda h: h.strength, reverse=True)[: problem.rules.selection.further]:
         trial = _begun(problem, base, hit)
         if trial is not None and trial.gain > 0:
             return replace(trial, finished=False)
@@ -182,18 +174,19 @@ def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     if problem.process_noise or len(named) < 2:
         return True
     best = max(named, key=lambda trial: trial.worth)
-    noise = 1 + _CHANCE * np.sqrt(2 / best.fit.count)
-    return unnamed.score > best.worth or not RULES.quiet <= best.fit.reduced <= noise
+    noise = 1 + problem.rules.selection.chance * np.sqrt(2 / best.fit.count)
+    return unnamed.score > best.worth or not problem.rules.evidence.quiet <= best.fit.reduced <= noise
 
 
 def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
+    rules = problem.rules.evidence
     least = min((t.fit.reduced for t in trials), default=1.0)
-    if least < RULES.quiet and not problem.process_noise:
-        again = [_judged(problem, base, t.hit, t.fit, RULES.quiet * least) for t in trials]
+    if least < rules.quiet and not problem.process_noise:
+        again = [_judged(problem, base, t.hit, t.fit, rules.quiet * least) for t in trials]
         trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
     if not problem.process_noise:
-        gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials])
+        gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials], rules)
         trials = [
             replace(t, gain=gain, evidence=t.evidence - (t.gain - gain)) for t, gain in zip(trials, gains, strict=True)
         ]
@@ -226,8 +219,9 @@ def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
     if law.restarts is not None:
         restarts = law.restarts(_reading(problem, base, hit.location))
     elif hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
-        values = law.scaled(hit.term.parameters, 1 / _STRONGER)
-        restarts = (Restart(1.0, _STRONGER * hit.beyond, tuple(values)),)
+        stronger = problem.rules.selection.stronger
+        values = law.scaled(hit.term.parameters, 1 / stronger)
+        restarts = (Restart(1.0, stronger * hit.beyond, tuple(values)),)
     else:
         return []
     points = []
@@ -259,7 +253,7 @@ def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
     law = hit.term.law
     if not isinstance(law, ElementLaw) or law.strength is None or not law.named:
         return start
-    hint = hit.term.at(law.scaled(hit.term.parameters, _HINT))
+    hint = hit.term.at(law.scaled(hit.term.parameters, problem.rules.selection.hint))
     faint = start_of(base, replace(hit, term=hint))
     try:
         with np.errstate(all="ignore"):
@@ -299,34 +293,36 @@ def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     return _judged(problem, base, trial.hit, fit)
 
 
-def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float = RULES.quiet) -> Trial:
+def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
+    rules = problem.rules.evidence
+    quiet = rules.quiet if quiet is None else quiet
     sensors = len(problem.sensors)
     if problem.process_noise:  # how noisy the forces are is what candidates differ in
-        gain = process_gain(base.residual, fit.residual, sensors, (base.log_det, fit.log_det))
+        gain = process_gain(base.residual, fit.residual, sensors, (base.log_det, fit.log_det), rules)
         worth = float(np.sum(base.noise.force**2) - np.sum(fit.noise.force**2))
     else:
         worth = base.chi_square - fit.chi_square
-        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet))
-    dear = cost(fit, len(hit.term.parameters)) + hit.term.law.prior_cost
+        gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
+    dear = cost(fit, len(hit.term.parameters), rules) + hit.term.law.prior_cost
     freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(hit, fit, gain, worth, gain - dear, freedom)
 
 
-def preferred(trials: list[Trial]) -> list[Trial]:
+def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:
     """Trials by evidence, but an unnamed force leads only if it explains far more than every named candidate."""
     if not trials or trials[0].named:
         return trials
     named = [t for t in trials if t.named]
-    if named and trials[0].explains < _UNNAMED_RATIO * named[0].explains:
+    if named and trials[0].explains < rules.unnamed_ratio * named[0].explains:
         return [named[0], *[t for t in trials if t is not named[0]]]
     return trials
 
 
-def cost(fit: Fit, count: int) -> float:
+def cost(fit: Fit, count: int, rules: EvidenceRules = RULES.evidence) -> float:
     """What the last `count` law parameters cost in evidence."""
     term = fit.point.terms[-1]
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[-count:], 0)) / np.abs(term.slopes) if count else np.zeros(0)
-    total = occam_cost([spec.log for spec in term.law.parameters], term.scales, sigma)
+    total = occam_cost([spec.log for spec in term.law.parameters], term.scales, sigma, rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
-        total += unusual_cost(value / scale, spec.usual)
+        total += unusual_cost(value / scale, spec.usual, rules)
     return total

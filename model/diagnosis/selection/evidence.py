@@ -19,31 +19,15 @@ tells about it, so a shape that does not matter costs nothing, where BIC would c
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
+from sprung.model.diagnosis.rules import RULES, EvidenceRules
 from sprung.model.signals import FloatArray
 
 
-@dataclass(frozen=True)
-class EvidenceRules:
-    """Deciding constants of the evidence."""
-
-    blocks: int = 14  # frequency blocks per sensor; chosen on simulated vehicles, insensitive from 8 to 24
-    first_block: int = 24  # bins of the first: the level of a block is then known to 20 %
-    quiet: float = 0.5  # least noise power of a block over the estimated one: white noise is no quieter by chance
-    plainly: float = 1.2  # ratio of what two fits leave from which one is plainly better: white noise gives 1.02
-    log_width: float = 4.6  # prior width of a parameter of unknown order: a factor of 100
-    widths: float = 4.0  # prior width of other parameters, in sizes at which they matter
-    unusual: float = 4.0  # evidence that a factor e outside the usual range of a parameter costs
-
-
-RULES = EvidenceRules()
-
-
-def block_edges(bins: int, rules: EvidenceRules = RULES) -> np.ndarray:
+def block_edges(bins: int, rules: EvidenceRules = RULES.evidence) -> np.ndarray:
     """Edges of the frequency blocks over `bins` bins, each at least one bin: [0, ..., < bins]."""
     if bins <= rules.first_block:
         return np.array([0])
@@ -52,7 +36,7 @@ def block_edges(bins: int, rules: EvidenceRules = RULES) -> np.ndarray:
 
 
 def profile_gain(
-    before: FloatArray, after: FloatArray, sensors: int, quiet: float, rules: EvidenceRules = RULES
+    before: FloatArray, after: FloatArray, sensors: int, quiet: float, rules: EvidenceRules = RULES.evidence
 ) -> float:
     """Gain of one whitened residual (2 F S,) over another that is weighed by the same covariance.
 
@@ -67,7 +51,7 @@ def process_gain(
     after: FloatArray,
     sensors: int,
     log_dets: tuple[float, float],
-    rules: EvidenceRules = RULES,
+    rules: EvidenceRules = RULES.evidence,
 ) -> float:
     """Gain where each residual is weighed by a covariance of its own, with the log determinants of both.
 
@@ -104,7 +88,7 @@ def bounded_gain(logs: FloatArray, falls: FloatArray) -> float:
     return up - down
 
 
-def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: EvidenceRules = RULES) -> list[float]:
+def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: EvidenceRules = RULES.evidence) -> list[float]:
     """Gains of rival fits, none more than that of one that leaves clearly less chi-square.
 
     Sums of logarithms weigh quiet blocks like loud ones; that may tell fits apart which leave about the same, but no
@@ -117,7 +101,7 @@ def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: Evidenc
 
 
 def occam_cost(
-    logarithmic: Sequence[bool], scales: Sequence[float], sigma: FloatArray, rules: EvidenceRules = RULES
+    logarithmic: Sequence[bool], scales: Sequence[float], sigma: FloatArray, rules: EvidenceRules = RULES.evidence
 ) -> float:
     """What free parameters cost: each by how much narrower the recording makes it than its prior was."""
     total = 0.0
@@ -128,7 +112,7 @@ def occam_cost(
     return total
 
 
-def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRules = RULES) -> float:
+def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRules = RULES.evidence) -> float:
     """What a value outside a law's usual range costs: look-alikes pass into each other there.
 
     relative: the value over the size at which it matters.

@@ -18,12 +18,11 @@ from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.diagnosis.selection.evidence import process_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
-_STILL = 0.05  # of the motion in the fitted part
-_CHANCE = 3.0  # standard deviations
 _ROUNDS = 4  # of laws' forces and the state at the start
 
 
@@ -48,6 +47,7 @@ class HeldOutComparison:
     gain: float  # by how much the second says more, as twice the log-likelihood ratio or alike
     apart: float  # distance of what they say, in units of noise
     scatter: float  # variance along it: noise, and what the parameters' own uncertainty adds to it at most
+    chance: float = RULES.selection.refuted  # standard deviations that are no longer chance
 
     @property
     def refuted(self) -> bool:
@@ -55,7 +55,7 @@ class HeldOutComparison:
 
         Were it true, its gain would scatter about apart^2 by 2 apart: the error of the first is then apart and noise.
         """
-        return self.gain < min(0.0, self.apart**2 - _CHANCE * 2 * self.apart * np.sqrt(self.scatter))
+        return self.gain < min(0.0, self.apart**2 - self.chance * 2 * self.apart * np.sqrt(self.scatter))
 
 
 @dataclass(frozen=True)
@@ -66,6 +66,7 @@ class HeldOut:
     signals: Signals
     noise: Noise  # by which runs are judged
     split: int
+    rules: Rules = RULES
 
     @cached_property
     def differentiated(self) -> BoolArray:
@@ -97,7 +98,7 @@ class HeldOut:
     def still(self) -> bool:
         """Whether the held-out part hardly moves, so that nothing can be judged on it."""
         first, later = (np.std(part, axis=0) for part in np.split(self.signals.sensors, [self.split]))
-        return bool(np.all(later < _STILL * first))
+        return bool(np.all(later < self.rules.selection.still * first))
 
     def run(self, point: Point) -> FreeRun:
         """Simulate with the measured inputs from the state that the fitted part ends in."""
@@ -149,8 +150,10 @@ class HeldOut:
             gain = float(first @ first - second @ second)
         else:
             (first, first_log_det), (second, second_log_det) = self._followed(before), self._followed(after)
-            gain = process_gain(first, second, self.later.sensors.shape[1], (first_log_det, second_log_det))
-        return HeldOutComparison(gain, float(np.linalg.norm(first - second)), self.signals.samples / self.split)
+            logs = first_log_det, second_log_det
+            gain = process_gain(first, second, self.later.sensors.shape[1], logs, self.rules.evidence)
+        apart, scatter = float(np.linalg.norm(first - second)), self.signals.samples / self.split
+        return HeldOutComparison(gain, apart, scatter, self.rules.selection.refuted)
 
     def _followed(self, fit: Fit) -> tuple[FloatArray, float]:
         """Whitened residual of the held-out part under a fit's own noise, and its log determinant."""

@@ -12,25 +12,20 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import BodyLaw, ElementLaw, SupportLaw, reversal_step
 from sprung.model.signals import FloatArray
 
-_KNEES = 0.5  # of the rate that one sample passes at a reversal: both knees lie within it
-_PURE = 0.8  # of an excitation's power in a few lines, from which it has frequencies of its own
-_LINES, _BINS = 4, 2  # most such lines; bins on either side that belong to one
-_HARMONICS = 30
-_CLOSE = 1.0  # bins, and in shares of a multiple of half a bin, within which a frequency is that multiple
 
-
-def doubt(fit: Fit, term: Term) -> str | None:
+def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """Why a fitted term is not believed, in words; None: nothing speaks against it."""
     reason = out_of_range(term)
     if reason is not None:
         return reason
     if isinstance(term.law, ElementLaw) and term.law.knees:
-        return _unresolved(fit, term)
+        return _unresolved(fit, term, rules)
     if isinstance(term.law, (BodyLaw, SupportLaw)):
-        return harmonic(fit.forward.part, term)
+        return harmonic(fit.forward.part, term, rules)
     return None
 
 
@@ -44,12 +39,12 @@ def out_of_range(term: Term) -> str | None:
     return None
 
 
-def _unresolved(fit: Fit, term: Term) -> str | None:
+def _unresolved(fit: Fit, term: Term, rules: PlausibleRules) -> str | None:
     """A knee of the rate that no sample of the motion resolves."""
     rate = fit.element_motion[1] @ term.port(fit.forward.system)
     passed = reversal_step(rate[:: len(rate) // fit.forward.part.grid.samples])
     for index in term.element_law.knees:
-        if term.parameters[index] < _KNEES * passed:
+        if term.parameters[index] < rules.knees * passed:
             return (
                 f"the knee {term.parameters[index]:.2g} m/s is passed within a sample (the rate changes by "
                 f"{passed:.2g} m/s in one)"
@@ -57,46 +52,46 @@ def _unresolved(fit: Fit, term: Term) -> str | None:
     return None
 
 
-def harmonic(part: Part, term: Term) -> str | None:
+def harmonic(part: Part, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """A periodic force or movement at a multiple of one of the excitation's own frequencies."""
     names = term.law.names
     if "frequency" not in names or not (isinstance(term.law, SupportLaw) or getattr(term.law, "load", None)):
         return None
     frequency = term.parameters[names.index("frequency")]
-    for line in excitation_lines(part):
+    for line in excitation_lines(part, rules):
         multiple = round(frequency / line)
         if (
-            1 <= multiple <= _HARMONICS
-            and abs(frequency - multiple * line) * part.grid.length < _CLOSE + 0.5 * multiple
+            1 <= multiple <= rules.harmonics
+            and abs(frequency - multiple * line) * part.grid.length < rules.close + 0.5 * multiple
         ):
             return f"{frequency:.4g} Hz is {multiple} times the excitation's own {line:.4g} Hz"
     return None
 
 
-def excitation_lines(part: Part) -> list[float]:
+def excitation_lines(part: Part, rules: PlausibleRules = RULES.plausible) -> list[float]:
     """Frequencies (Hz) of an excitation that consists of a few lines; none where it is broad."""
     found: list[float] = []
     omega = part.grid.omega[:, None]
     for spectrum in (*(1j * omega * part.support).T, *part.force.T):
-        found += _lines_of(np.abs(spectrum) ** 2, part.grid.length)
+        found += _lines_of(np.abs(spectrum) ** 2, part.grid.length, rules)
     return found
 
 
-def _lines_of(power: FloatArray, length: float) -> list[float]:
+def _lines_of(power: FloatArray, length: float, rules: PlausibleRules) -> list[float]:
     """Lines that hold most of a power spectrum (F,) together."""
     left, total = power.copy(), float(power.sum())
     left[0] = 0.0
     lines: list[float] = []
     held = 0.0
-    for _ in range(_LINES if total > 0 else 0):
+    for _ in range(rules.lines if total > 0 else 0):
         top = int(np.argmax(left))
-        around = slice(max(1, top - _BINS), top + _BINS + 1)
+        around = slice(max(1, top - rules.bins), top + rules.bins + 1)
         weight = float(left[around].sum())
         if weight <= 0:
             break
         lines.append(float(np.arange(len(left))[around] @ left[around]) / weight / length)
         left[around] = 0.0
         held += weight
-        if held > _PURE * total:
+        if held > rules.pure * total:
             return lines
     return []

@@ -1,0 +1,205 @@
+"""Every number that decides what a diagnosis says, by stage, with its reason.
+
+A number is here when another value could change a verdict, a place or a name.  Tolerances of the numerics, which only
+have to be small, stay beside the code that iterates.  A reason begins with "derived" where the number follows from
+statistics or the sampling, and with "chosen" where it was found on simulated vehicles; `sprung bench sensitivity`
+varies every one over its range and prints what changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import Field, dataclass, field, fields, replace
+from typing import Any
+
+
+def rule(value: Any, reason: str, low: Any, high: Any) -> Any:
+    """A deciding number with its reason, and the range over which `sprung bench sensitivity` varies it."""
+    return field(default=value, metadata={"reason": reason, "range": (low, high)})
+
+
+@dataclass(frozen=True)
+class RecordRules:
+    """What can be used of a recording."""
+
+    minimum_samples: int = rule(200, "derived: two periods of the slowest mode of a vehicle at 100 Hz", 100, 400)
+    gap: float = rule(0.05, "s; derived: a period of the highest frequency compared at 100 Hz loses nothing", 0.02, 0.1)
+    moves: float = rule(2.0, "noise deviations by which one sensor has to move; chosen: 1 is noise alone", 1.5, 3.0)
+    stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
+
+
+@dataclass(frozen=True)
+class ScreeningRules:
+    """Which trials are scored."""
+
+    slowest: float = rule(0.5, "Hz, of fundamentals; derived: rail joints at walking pace", 0.3, 1.0)
+    fastest: float = rule(15.0, "Hz, of fundamentals; derived: wheels of 0.92 m at 150 km/h", 12.0, 25.0)
+    harmonics: int = rule(2, "that are seen; derived: one alone is a line", 2, 3)
+    reach: int = rule(24, "bins; derived: a median of 49 knows the level to 18 %", 12, 48)
+    colour: float = rule(2.5, "by which exact columns may raise a score; chosen", 1.5, 4.0)
+    lowest_mode: float = rule(1.0, "Hz; derived: below, an elastic mode is a rigid one of a train's body", 0.5, 2.0)
+    highest_mode: float = rule(0.4, "of the sample rate; derived: there anti-alias filters cut", 0.3, 0.45)
+
+
+@dataclass(frozen=True)
+class EvidenceRules:
+    """What a better fit is worth."""
+
+    blocks: int = rule(14, "per sensor; chosen", 8, 24)
+    first_block: int = rule(24, "bins; derived: the level of a block is then known to 20 %", 16, 48)
+    quiet: float = rule(0.5, "of the noise power; derived: no white block of 24 bins is quieter by chance", 0.3, 0.7)
+    plainly: float = rule(1.2, "ratio of what two fits leave; derived: white noise gives 1.02", 1.05, 1.5)
+    log_width: float = rule(4.6, "derived: the logarithm of a factor of 100, an unknown order", 2.3, 9.2)
+    widths: float = rule(4.0, "sizes at which a parameter matters; chosen", 2.0, 8.0)
+    unusual: float = rule(4.0, "evidence for a factor e outside the usual range; chosen", 2.0, 8.0)
+
+
+@dataclass(frozen=True)
+class SelectionRules:
+    """Which candidates are fitted, and which of them leads."""
+
+    close: float = rule(0.25, "of the best score, from which a candidate at its place is fitted; chosen", 0.12, 0.5)
+    close_elsewhere: float = rule(0.6, "the same at other places; chosen", 0.4, 0.8)
+    near: float = rule(45.0, "score or evidence to the best one that is close in any case; chosen", 25.0, 90.0)
+    near_share: float = rule(0.3, "of the best evidence, the same; chosen", 0.15, 0.5)
+    most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
+    unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
+    last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
+    finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)
+    settling: int = rule(3, "rounds in which fits that still fall and could lead are fitted on; chosen", 1, 6)
+    further: int = rule(3, "candidates tried for a runner-up where none was close; chosen", 1, 6)
+    chance: float = rule(4.0, "standard deviations; derived: one noise in 30 000 exceeds it", 3.0, 6.0)
+    unnamed_ratio: float = rule(1.3, "times a named law, that an unnamed force explains; chosen", 1.1, 1.7)
+    stronger: float = rule(1.1, "times the damper that a law of shares asks for, as a second start; chosen", 1.02, 1.5)
+    hint: float = rule(0.02, "of a law's strength at which its first step is taken; chosen", 0.005, 0.1)
+    still: float = rule(0.05, "of the fitted part's motion, below which nothing is judged; chosen", 0.02, 0.1)
+    refuted: float = rule(3.0, "standard deviations; derived: one true finding in 700 is refuted", 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class PlausibleRules:
+    """What is not believed, however well it fits."""
+
+    knees: float = rule(0.5, "of the rate passed within a sample; derived: both knees lie within it", 0.3, 0.8)
+    pure: float = rule(0.8, "of an excitation's power in a few lines, its own frequencies; chosen", 0.6, 0.95)
+    lines: int = rule(4, "of them at most; chosen", 2, 8)
+    bins: int = rule(2, "on either side of a line; derived: they hold 92 % of a sine between two bins", 1, 4)
+    harmonics: int = rule(30, "of a line that a non-linear answer may have; chosen", 15, 60)
+    close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
+
+
+@dataclass(frozen=True)
+class AcceptanceRules:
+    """When a further finding counts, and how input channels are mended."""
+
+    minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)
+    minor_elsewhere: float = rule(0.002, "of an earlier finding elsewhere; chosen", 0.0005, 0.01)
+    minor_followed: float = rule(0.01, "of logarithmic gains; chosen: laws are simulated no better", 0.003, 0.03)
+    most_left: float = rule(0.5, "of the unmeasured forces that earlier findings left; chosen", 0.3, 0.8)
+    astray: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)
+    input_faults: int = rule(2, "of input channels that are looked for; chosen", 1, 4)
+    input_rounds: int = rule(3, "of estimating and compensating an input fault; chosen", 2, 5)
+    input_rival: float = rule(0.3, "of the leading input fault's score, from which others are tried; chosen", 0.15, 0.6)
+    input_rivals: int = rule(3, "of them; chosen", 1, 6)
+    input_done: float = rule(0.01, "chi-square, below which nothing of an input fault is left; derived", 0.001, 0.1)
+
+
+@dataclass(frozen=True)
+class NoiseRules:
+    """When the noise of a single channel is a fault."""
+
+    least: float = rule(1.12, "ratio to its peers; chosen: less is no maintenance", 1.06, 1.25)
+    sigmas: float = rule(6.0, "by which the ratio leaves its peers'; derived: chance and modelling errors", 4.0, 8.0)
+    inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
+    upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
+
+
+@dataclass(frozen=True)
+class SetupRules:
+    """Deciding constants of the search for wrong set-ups."""
+
+    strange: float = rule(4e-3, "misfit of a sensor; chosen: vehicles fitted well have 1e-3", 2e-3, 8e-3)
+    promising: float = rule(0.85, "of the misfit that one may leave by spectra, to be fitted; chosen", 0.7, 0.95)
+    tried: int = rule(5, "hypotheses that are fitted; chosen", 3, 8)
+    beside: int = rule(2, "faults of single sensors that are fitted beside them; chosen", 1, 4)
+    explains: float = rule(0.3, "of the misfit that one may leave once fitted; chosen", 0.15, 0.5)
+    latest: float = rule(0.5, "s, of a node; derived: later, a node is another recording", 0.3, 1.0)
+    scale: float = rule(1.3, "ratio from which a scale is wrong; derived: less is a sensor's gain", 1.2, 1.5)
+    offset: float = rule(0.1, "m, from which a position is wrong; derived: less is a mounting tolerance", 0.05, 0.2)
+    rounds: int = rule(2, "in which an accepted delay or scale is estimated again; chosen", 1, 4)
+    most: int = rule(2, "faults of one recording; chosen", 1, 3)
+
+
+@dataclass(frozen=True)
+class VerdictRules:
+    """What the held-out errors come to."""
+
+    clear: float = rule(1.5, "error over the floor, pooled, up to which nothing is left; chosen", 1.25, 2.0)
+    clear_sensor: float = rule(2.0, "the same of a single sensor; chosen", 1.6, 3.0)
+    carried: float = rule(0.5, "of the excess error; derived: findings explain more than they leave", 0.3, 0.7)
+    strange: float = rule(0.6, "error over the signal, of another vehicle than the file's; chosen", 0.45, 0.8)
+    least: float = rule(2e-3, "error over the signal that sampling leaves of a perfect model; derived", 1e-3, 4e-3)
+    spread: float = rule(4.0, "standard deviations of a level; derived: one in 16 000 leaves them", 3.0, 6.0)
+    slack: float = rule(1.5, "times a declared noise; chosen: a declaration is a round number", 1.2, 2.0)
+
+
+@dataclass(frozen=True)
+class ReportRules:
+    """What a report says beside the verdict."""
+
+    naming_margin: float = rule(6.0, "evidence over look-alikes to be named alone; derived: odds of 20 to 1", 3.0, 10.0)
+    changed: float = rule(0.25, "from nominal, at which a parameter is listed as changed; chosen", 0.15, 0.4)
+    alike: float = rule(0.5, "correlation from which a sign or scale is a likely reason; chosen", 0.3, 0.7)
+    scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
+    far: float = rule(1.6, "log-ratio to nominal; chosen: a factor of 5, no rebuilt vehicle is as far off", 1.1, 2.3)
+    loose: float = rule(0.2, "standard deviation of a log-ratio of an undecided parameter; chosen", 0.1, 0.4)
+
+
+@dataclass(frozen=True)
+class ComponentRules:
+    """Deciding constants of a component's diagnosis."""
+
+    search: int = rule(4000, "samples that trial shapes are compared on; chosen", 2000, 8000)
+    fit: int = rule(16000, "samples of the final fit; chosen: few of them are independent", 8000, 32000)
+    most: int = rule(3, "laws; chosen: real rigs have more imperfections than a record can name", 2, 4)
+    alpha: float = rule(1e-3, "chance of a false finding per recording; chosen", 1e-4, 1e-2)
+    least_share: float = rule(0.2, "of the power still left that a further law must remove; chosen", 0.1, 0.4)
+    naming_margin: float = rule(6.0, "evidence over look-alikes; derived: odds of 20 to 1", 3.0, 10.0)
+    plain_cost: float = rule(6.0, "evidence over a commoner law that it contains; derived: odds of 20 to 1", 3.0, 10.0)
+    starts: int = rule(2, "trial shapes from which a law is refined; chosen", 1, 4)
+    close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
+    declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
+    surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
+    named: float = rule(0.5, "of the excess power; derived: named laws explain more than they leave", 0.3, 0.7)
+    lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
+    slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
+
+
+@dataclass(frozen=True)
+class Rules:
+    """The rules of every stage, in the order in which they decide."""
+
+    record: RecordRules = RecordRules()
+    setup: SetupRules = SetupRules()
+    screening: ScreeningRules = ScreeningRules()
+    evidence: EvidenceRules = EvidenceRules()
+    selection: SelectionRules = SelectionRules()
+    plausible: PlausibleRules = PlausibleRules()
+    acceptance: AcceptanceRules = AcceptanceRules()
+    noise: NoiseRules = NoiseRules()
+    verdict: VerdictRules = VerdictRules()
+    report: ReportRules = ReportRules()
+    component: ComponentRules = ComponentRules()
+
+    def constants(self) -> Iterator[tuple[str, Field[Any]]]:
+        """Every number as the stage's name and its field."""
+        for stage in fields(self):
+            for one in fields(getattr(self, stage.name)):
+                yield stage.name, one
+
+    def varied(self, stage: str, name: str, value: Any) -> Rules:
+        """The same with one number changed."""
+        return replace(self, **{stage: replace(getattr(self, stage), **{name: value})})
+
+
+RULES = Rules()
