@@ -3,7 +3,8 @@
 For every known record in DIR (benchmarks/real_records.py): the verdict, the laws with their values, the held-out error
 before and after, the noise floor, what is left unexplained; beside a linear and a plain Bouc-Wen model fitted by SciPy
 to the same first 70 % and judged on the same rest.  Errors are rms over the force's deviation.  `--out` draws the
-measured and modelled loops of the held-out part.
+measured and modelled loops of the held-out part.  Without measured inputs: natural frequencies over time beside the
+spectral peaks, and beside what was measured of the cause and no diagnosis saw.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import spearmanr
 
 from sprung.benchmarks.real_picture import loops
 from sprung.benchmarks.real_records import MeasuredRecord, records
@@ -21,6 +23,8 @@ from sprung.benchmarks.real_reference import bouc_wen, linear
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import component_records
 
+HALF, PADDED = 0.5, 16  # of the first natural frequency, where peaks are sought from; finer bins
+SURE = 0.02  # deviation over the frequency up to which a window counts
 MOST_REFERENCE = 12_000  # samples that the references are fitted on; more only take longer
 
 
@@ -39,6 +43,8 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             line["reference"] = references(record)
             best = min(line["reference"].values())
             line["met"] = line["held_out"] <= best or report.verdict == "unknown_physics"
+        if record.witness is not None and report.track:
+            line["track"] = followed(record, report)
         if out is not None and record.component:
             line["picture"] = str(loops(report, record.name, out))
         yield line
@@ -57,6 +63,33 @@ def said(report: Report) -> dict[str, Any]:
         "floor": report.noise_floor.nrmse,
         "unexplained": report.unexplained.share,
         "where": report.unexplained.where,
+    }
+
+
+def followed(record: MeasuredRecord, report: Report) -> dict[str, Any]:
+    """The lowest natural frequency beside the spectral peak of every window, and both beside the witness."""
+    assert record.witness is not None
+    low, high = HALF * report.track[0].frequency[0], 2 * report.track[0].frequency[0]
+    found, peaks, beside, sure = [], [], [], []
+    for point in report.track:
+        at = slice(round(point.begin * record.sample_rate), round(point.end * record.sample_rate))
+        series = record.values[at, 0] - record.values[at, 0].mean()
+        power = np.abs(np.fft.rfft(series * np.hanning(len(series)), PADDED * len(series)))
+        frequency = np.fft.rfftfreq(PADDED * len(series), 1 / record.sample_rate)
+        inside = (frequency > low) & (frequency < high)
+        peaks.append(float(frequency[inside][np.argmax(power[inside])]))
+        found.append(point.frequency[0])
+        sure.append(point.adequate and point.deviation[0] < SURE * point.frequency[0])
+        beside.append(float(np.median(record.witness[at])))
+    one, other, rank = np.array(found)[sure], np.array(peaks)[sure], np.array(beside)[sure]
+    return {
+        "windows": len(found),
+        "sure": len(one),
+        "lowest_hz": float(one.min()),
+        "highest_hz": float(one.max()),
+        "median_difference_to_peak": float(np.median(np.abs(one / other - 1))),
+        "rank_correlation_with_witness": float(spearmanr(one, rank)[0]),
+        "peaks_rank_correlation_with_witness": float(spearmanr(other, rank)[0]),
     }
 
 

@@ -32,6 +32,7 @@ class MeasuredRecord:
     sample_rate: float
     lost: int = 0
     component: bool = False  # displacement [, velocity], force of one element: references can be fitted
+    witness: Array | None = None  # what no diagnosis sees and a natural frequency must follow, (T,)
 
 
 def component(name: str, rate: float, velocity: bool) -> System:
@@ -83,7 +84,9 @@ def cantilever(path: Path) -> MeasuredRecord:
     """DROPBEAR: the acceleration of a beam whose support moves; nobody measured what excites it."""
     table = np.genfromtxt(path, skip_header=9, invalid_raise=False)
     rate = 5000.0 / DROPBEAR_FINER
-    acceleration = decimate(table[np.isfinite(table[:, 1]), 1], DROPBEAR_FINER, ftype="fir")
+    acceleration, pin = (
+        decimate(table[np.isfinite(table[:, 1]), column], DROPBEAR_FINER, ftype="fir") for column in (1, 2)
+    )
     system = parse_system(f"""
 name: cantilever
 sample_rate: {rate:g}
@@ -92,7 +95,7 @@ bodies: {{tip: {{mass: {{value: 1.0, fixed: true}}}}}}
 elements: {{beam: {{upper: tip, lower: ground, stiffness: 4.5e+4, damping: 10.0}}}}
 sensors: {{tip: {{kind: acceleration, body: tip, csv: acceleration, noise: 2.0e-3}}}}
 """)
-    return MeasuredRecord(path.stem, system, acceleration[:, None], rate)
+    return MeasuredRecord(path.stem, system, acceleration[:, None], rate, witness=pin)
 
 
 READERS: tuple[tuple[str, Callable[[Path], MeasuredRecord]], ...] = (

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import scipy.linalg
 
 from sprung.model.ambient.excitation import Prior
-from sprung.model.ambient.whittle import Evaluation, Whittle
+from sprung.model.ambient.whittle import Evaluation
 from sprung.model.signals import BoolArray, FloatArray
 
 STEP_LIMIT = 1.0  # largest change of a logarithm in one step
 CONVERGED = 0.03  # a step this small, in standard deviations, ends the iteration
 SLOPE_STEP = 8  # damping is raised or lowered by this factor
 HARDEST = 1e6  # damping beyond which no further step is tried
+
+
+class Likelihood(Protocol):
+    """What can be fitted."""
+
+    def evaluate(self, x: FloatArray) -> Evaluation:
+        """At a point; `LinAlgError` where there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +37,7 @@ class Fitted:
     iterations: int
 
 
-def fit(likelihood: Whittle, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40) -> Fitted:
+def fit(likelihood: Likelihood, x: FloatArray, prior: Prior, free: BoolArray | None = None, limit: int = 40) -> Fitted:
     """Scoring from `x` with a Gaussian prior; what is not `free` stays where it is and counts as known."""
     chosen = np.flatnonzero(np.ones(len(x), dtype=bool) if free is None else free)
     precision = prior.std[chosen] ** -2.0

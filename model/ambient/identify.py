@@ -12,6 +12,7 @@ from sprung.model.ambient.forces import ForceExcitation
 from sprung.model.ambient.periodogram import Spectra
 from sprung.model.ambient.sensing import Sensing, sensing
 from sprung.model.ambient.speed import Track
+from sprung.model.ambient.transient import USUAL, TransientFit, TransientWindow
 from sprung.model.ambient.window import LOAD_STD, Told, WindowFit
 from sprung.model.identifier import PRIOR_STD, StageTimes, UnusableWindow
 from sprung.model.schema import Body
@@ -88,13 +89,80 @@ class AmbientIdentifier:
         return _silent(P, len(present)) if told is None else _as_estimate(told, P, present)
 
     def _checked(self, windows: FloatArray) -> FloatArray:
-        windows = np.asarray(windows, dtype=np.float64)
-        channels = self.system.channels
-        if windows.ndim != 3 or windows.shape[2] != len(channels):
-            raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
-        for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
-            raise UnusableWindow(f"{channels[column].name}: not finite")
-        return windows
+        return checked(self.system, windows)
+
+
+class OutputOnlyIdentifier:
+    """Identifies windows of a structure without inputs, from free decay to steady ambient vibration.
+
+    Where white forces do not explain a window, forces with a slope over frequency are tried.
+    """
+
+    def __init__(self, system: System) -> None:
+        self.system, self.times = system, StageTimes()
+        self.window, self.coloured = TransientWindow(system), AmbientIdentifier(system)
+
+    @property
+    def digest(self) -> str:
+        """Names the model that made an estimate."""
+        return self.system.digest
+
+    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
+        """One `Estimate` per window (B, T, C), NaN columns for absent sensors; see `model.identifier.Identifies`.
+
+        states: never simulated, for nobody knows what moved the system.  Errors: `UnusableWindow`.
+        """
+        windows = checked(self.system, windows)
+        begin = time.perf_counter()
+        found = [self._estimate(values, None if start is None else start[b]) for b, values in enumerate(windows)]
+        self.times = StageTimes(0.0, time.perf_counter() - begin)
+        return found
+
+    def _estimate(self, values: FloatArray, start: FloatArray | None) -> Estimate:
+        present = np.asarray(np.isfinite(values).all(axis=0))
+        sensors, P = np.flatnonzero(present), len(self.system.parameters)
+        told = self.window.told(values[:, sensors], sensors, start) if len(sensors) else None
+        if told is None:
+            return _silent(P, len(present))
+        if not told.adequate:
+            coloured = self.coloured.told(values, start)
+            if coloured is not None:
+                seen = _as_estimate(coloured, P, present)
+                if seen.adequate and seen.identifiable.any():
+                    return seen
+        return _of_transient(told, P, present)
+
+
+def checked(system: System, windows: FloatArray) -> FloatArray:
+    """Windows as numbers of the right shape.  Errors: `UnusableWindow`."""
+    windows = np.asarray(windows, dtype=np.float64)
+    channels = system.channels
+    if windows.ndim != 3 or windows.shape[2] != len(channels):
+        raise UnusableWindow(f"windows: shape (B, T, {len(channels)}) expected, {windows.shape} came")
+    for column in np.flatnonzero(np.isinf(windows).any(axis=(0, 1))):
+        raise UnusableWindow(f"{channels[column].name}: not finite")
+    return windows
+
+
+def _of_transient(told: TransientFit, P: int, present: BoolArray) -> Estimate:
+    """The first P unknowns are the system's parameters."""
+    covariance = told.covariance[:P, :P]
+    identifiable = np.sqrt(np.diag(covariance)) < IDENTIFIABLE_STD
+    share = told.noise_share
+    per_sensor = np.full(len(present), np.nan)
+    per_sensor[present] = share
+    return Estimate(
+        log_ratio=np.where(identifiable, told.fitted.x[:P], 0.0),
+        covariance=np.where(np.outer(identifiable, identifiable), covariance, np.eye(P) * PRIOR_STD**2),
+        identifiable=identifiable,
+        nrmse=float(np.sqrt(np.mean(share**2))),
+        per_sensor=per_sensor,
+        chi_square=max(1.0, told.misfit / USUAL) ** 2,
+        adequate=told.adequate,
+        converged=told.fitted.converged,
+        iterations=told.fitted.iterations,
+        informative=bool(identifiable.any()),
+    )
 
 
 def _as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from sprung.model.ambient.foreseen import foreseen
-from sprung.model.ambient.identify import AmbientIdentifier
+from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
@@ -147,31 +147,6 @@ class Identifier:
 
 
 @dataclass(slots=True)
-class OutputOnly:
-    """Windows of a system without inputs: a free decay where that explains the window, ambient forces otherwise."""
-
-    decay: Identifier
-    ambient: AmbientIdentifier
-    times: StageTimes = field(default_factory=StageTimes)
-
-    @property
-    def digest(self) -> str:
-        """Names the model that made an estimate."""
-        return self.ambient.digest
-
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
-        """One `Estimate` per window; see `model.identifier.Identifies`."""
-        found = self.decay.identify(windows, start, states=states)
-        shaken = [b for b, estimate in enumerate(found) if not (estimate.adequate and estimate.identifiable.any())]
-        again = self.ambient.identify(windows[shaken], None if start is None else start[shaken])
-        for b, estimate in zip(shaken, again, strict=True):
-            found[b] = estimate
-        spent = self.decay.times.refine + (self.ambient.times.refine if shaken else 0.0)
-        self.times = StageTimes(0.0, spent)
-        return found
-
-
-@dataclass(slots=True)
 class Undistorted:
     """Windows without the faults of measurements that the system file states."""
 
@@ -204,7 +179,7 @@ def load_identifier(system: System, model: str | Path | None = None, workers: in
     if system.on_track:
         return AmbientIdentifier(system)
     if not system.file.inputs:
-        return OutputOnly(Identifier(system, None, workers), AmbientIdentifier(system))
+        return OutputOnlyIdentifier(system)
     estimator = load_estimator(model, system) if model is not None else bundled_estimator(system)
     return Identifier(system, estimator, workers)
 

@@ -92,7 +92,12 @@ def _modes(system: System) -> Table:
 
 
 def _parameters(system: System, told: Any) -> Table:
-    title = f"What one window of {system.window / system.sample_rate:g} s on an average track tells"
+    under = "on an average track"
+    if not system.file.inputs:
+        under = "without any measured input, of vibration well above the noise,"
+    elif system.on_track:
+        under = "on an average track that nobody measures"
+    title = f"What one window of {system.window / system.sample_rate:g} s {under} tells"
     table = Table("parameter", "nominal", "standard deviation", "", title=title, title_justify="left")
     for parameter, std in zip(system.parameters, np.asarray(told), strict=True):
         known = std < KNOWN_SHARE * PRIOR_STD

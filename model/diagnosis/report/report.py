@@ -8,6 +8,7 @@ optional.  With T samples of the held-out part, S sensors in the system's order,
     finding.i.time / .deflection / .rate / .force_before / .force_after (n,)
     finding.i.curve_axis ("deflection" | "rate"), .curve_x / .curve_mean / .curve_std / .curve_law (m,)
     finding.i.loop_x / .loop_y (p,)
+    track.time (W,) s, track.frequency / .std (W, modes) Hz
     finding.i.map_d (a,), .map_v (b,), .map_force / .map_std (b, a)
 """
 
@@ -184,6 +185,21 @@ class RecordingFacts:
         return {"file": self.file, "seconds": self.seconds, "samples": self.samples, "lost": self.lost}
 
 
+@dataclass(frozen=True, slots=True)
+class TrackPoint:
+    """Natural frequencies of one window of a recording without measured inputs."""
+
+    begin: float  # s
+    end: float
+    frequency: tuple[float, ...]  # Hz, the lowest first
+    deviation: tuple[float, ...]  # Hz
+    adequate: bool  # whether the structure explains the window
+
+    def to_dict(self) -> dict[str, Any]:
+        modes = [[_number(f), _number(s)] for f, s in zip(self.frequency, self.deviation, strict=True)]
+        return {"begin": self.begin, "end": self.end, "frequencies": modes, "adequate": self.adequate}
+
+
 @dataclass(slots=True)
 class Report:
     """The answer of one diagnosis."""
@@ -206,6 +222,7 @@ class Report:
     noise: Mapping[str, float] = field(default_factory=dict)  # channel -> deviation of one sample, as found
     summary: str = ""
     advice: tuple[str, ...] = ()  # what could not be decided and why
+    track: tuple[TrackPoint, ...] = ()  # without measured inputs: natural frequencies over time
     evidence: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
@@ -233,7 +250,7 @@ class Report:
             "noise": {name: _number(level) for name, level in self.noise.items()},
             "summary": self.summary,
             "advice": list(self.advice),
-        }
+        } | ({"track": [point.to_dict() for point in self.track]} if self.track else {})
 
 
 def _number(value: float | None) -> float | None:

@@ -1,0 +1,33 @@
+"""Whether a recording without inputs is one free decay: then it is simulated from its first sample."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.signals import FloatArray
+
+BLOCKS = 12  # of a recording, whose levels are compared
+RISE = 1.15  # of a level over the one before, up to which it still falls
+FALLEN = 0.5  # of the first level that the last may have
+LEAST = 0.6  # of the recording that a decay must cover
+
+
+def decay_begin(signals: Signals, noise: FloatArray) -> int | None:
+    """The sample from which the sensors only decay, with noise (S,) of one sample; None where they do not."""
+    edges = np.linspace(0, signals.samples, BLOCKS + 1).astype(int)
+    moved = signals.sensors - np.median(signals.sensors, axis=0)
+    blocks = [moved[a:b] for a, b in pairwise(edges)]
+    level = np.array([np.sqrt(np.mean(np.mean((block / noise) ** 2, axis=0))) for block in blocks])
+    first = int(np.argmax(level))
+    falling = np.maximum(level[first:], 2.0)  # below twice the noise nothing is told
+    if edges[first] > (1 - LEAST) * signals.samples or falling[-1] > FALLEN * falling[0]:
+        return None
+    if np.any(falling[1:] > RISE * falling[:-1]):
+        return None
+    if first == 0:
+        return 0
+    size = np.abs(moved[edges[first - 1] : edges[first + 1]] / noise).max(axis=1)
+    return int(edges[first - 1] + np.argmax(size))

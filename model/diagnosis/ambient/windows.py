@@ -1,0 +1,161 @@
+"""A recording without measured inputs as windows, each with its parameters and how well the structure explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.ambient.identify import AmbientIdentifier
+from sprung.model.ambient.sensing import sensing
+from sprung.model.ambient.transient import TransientWindow
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.system import System
+
+MOST = 60  # windows that are looked at of structures; of vehicles on a track
+MOST_TRACK = 8
+PARTS = 40  # of the band, in which powers are compared
+
+Told = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class Powers:
+    """Power of S sensors in parts of the band."""
+
+    frequency: FloatArray  # Hz, (F,)
+    whole: FloatArray  # (F, S)
+    rest: FloatArray  # without what the window's start and end explain, (F, S)
+    expected: FloatArray  # of the rest, by the model, (F, S)
+    count: FloatArray  # degrees of freedom of every bin, (F,)
+
+
+@dataclass(frozen=True)
+class WindowResult:
+    """One window."""
+
+    begin: float  # s
+    end: float
+    log_ratio: FloatArray  # (P,)
+    covariance: FloatArray  # (P, P)
+    adequate: bool
+    powers: Powers
+
+    @property
+    def middle(self) -> float:
+        return 0.5 * (self.begin + self.end)
+
+
+class Structure:
+    """Windows of a structure under forces that nobody measured."""
+
+    def __init__(self, system: System, sensors: np.ndarray) -> None:
+        self.system, self.sensors, self.window = system, sensors, TransientWindow(system)
+
+    def result(self, values: FloatArray, at: tuple[float, float], known: FloatArray | None) -> WindowResult | None:
+        """Of a window (T, S); with `known` log-ratios only the forces' levels are fitted."""
+        told = self.window.told(values, self.sensors, None, known)
+        if told is None:
+            return None
+        P = len(self.system.parameters)
+        powers = Powers(told.frequency, told.whole, told.rest, told.expected, np.ones(len(told.frequency)))
+        return WindowResult(*at, told.fitted.x[:P], told.covariance[:P, :P], told.adequate, powers)
+
+
+class OnTrack:
+    """Windows of a vehicle on a track that nobody measured."""
+
+    def __init__(self, system: System, sensors: np.ndarray) -> None:
+        self.system, self.sensors, self.identifier = system, sensors, AmbientIdentifier(system)
+
+    def result(self, values: FloatArray, at: tuple[float, float], known: FloatArray | None) -> WindowResult | None:
+        """Of a window (T, S); its parameters are always its own."""
+        window = np.full((len(values), len(self.system.channels)), np.nan)
+        window[:, len(self.system.inputs) + self.sensors] = values
+        told, (estimate,) = self.identifier.told(window), self.identifier.identify(window[None])
+        if told is None:
+            return None
+        sensed = sensing(self.system.mechanics, self.sensors, self.system.sensor_noise[self.sensors])
+        back, P = np.linalg.pinv(sensed.rows), len(self.system.parameters)
+        seen = np.einsum("sr,frt,st->fs", back, sensed.seen(told.spectra.matrix), back).real
+        expected = np.einsum("sr,frt,st->fs", back, told.fitted.at.covariance, back).real
+        powers = Powers(told.spectra.frequency, seen, seen, expected, told.spectra.weight)
+        return WindowResult(*at, told.log_ratio[:P], told.covariance[:P, :P], estimate.adequate, powers)
+
+
+def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], str]:
+    """First and last samples of the windows, half overlapping, and what was left out, in words."""
+    length = min(system.window, signals.samples)
+    hop = max(1, length // 2)
+    starts = list(range(0, signals.samples - length + 1, hop))
+    most = MOST_TRACK if system.on_track else MOST
+    note = ""
+    if len(starts) > most:
+        chosen = np.unique(np.round(np.linspace(0, len(starts) - 1, most)).astype(int))
+        note = (
+            f"looked at {len(chosen)} windows of {length / signals.sample_rate:g} s spread over the recording, "
+            f"of {len(starts)}: more would say the same more exactly"
+        )
+        starts = [starts[i] for i in chosen]
+    return [(start, start + length) for start in starts], note
+
+
+def all_windows(system: System, signals: Signals, tell: Told) -> tuple[list[WindowResult], str]:
+    """Every window that tells anything, and what was left out, in words."""
+    kind = OnTrack if system.on_track else Structure
+    looked = kind(system, signals.sensor_index)
+    cuts, note = stretches(system, signals)
+    found = []
+    for number, (start, stop) in enumerate(cuts):
+        tell(number / len(cuts))
+        at = (signals.start + start / signals.sample_rate, signals.start + stop / signals.sample_rate)
+        result = looked.result(signals.sensors[start:stop], at, None)
+        if result is not None:
+            found.append(result)
+    return found, note
+
+
+def with_known(system: System, signals: Signals, windows: list[WindowResult], known: FloatArray) -> list[WindowResult]:
+    """The same windows under parameters (P,) that all of them share."""
+    if system.on_track:
+        return windows
+    looked, again = Structure(system, signals.sensor_index), []
+    for window in windows:
+        start, stop = (round((at - signals.start) * signals.sample_rate) for at in (window.begin, window.end))
+        result = looked.result(signals.sensors[start:stop], (window.begin, window.end), known)
+        if result is not None:
+            again.append(result)
+    return again
+
+
+def displaced(windows: list[WindowResult]) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+    """Share of every sensor's power that the model puts at other frequencies, what chance gives, and where most is.
+
+    Shares (S,) and (S,), frequencies in Hz.  Chance is that of the measured bins, whatever the model expects.
+    """
+    frequency = windows[0].powers.frequency
+    edges = np.linspace(frequency[0], frequency[-1] * (1 + 1e-9), min(PARTS, max(1, len(frequency) // 4)) + 1)
+    sensors = windows[0].powers.whole.shape[1]
+    apart, chance = np.zeros((len(edges) - 1, sensors)), np.zeros((len(edges) - 1, sensors))
+    whole = np.zeros(sensors)
+    for window in windows:
+        powers = window.powers
+        place = np.clip(np.digitize(powers.frequency, edges) - 1, 0, len(edges) - 2)
+        np.add.at(apart, place, powers.count[:, None] * (powers.rest - powers.expected))
+        np.add.at(chance, place, powers.count[:, None] * powers.rest**2 / 2)  # bins are exponential about their mean
+        whole += powers.count @ np.maximum(powers.whole, np.maximum(powers.rest, powers.expected))
+    share = 0.5 * np.abs(apart) / np.maximum(whole, 1e-300)
+    by_chance = 0.5 * np.sqrt(2 / np.pi * chance) / np.maximum(whole, 1e-300)
+    worst = int(np.argmax(share.sum(axis=1)))
+    return share.sum(axis=0), by_chance.sum(axis=0), (float(edges[worst]), float(edges[worst + 1]))
+
+
+def independent(windows: list[WindowResult]) -> BoolArray:
+    """Windows that share no sample with an earlier chosen one, (W,)."""
+    chosen, last = np.zeros(len(windows), dtype=bool), -np.inf
+    for i, window in enumerate(windows):
+        if window.begin >= last - 1e-9:
+            chosen[i], last = True, window.end
+    return chosen
