@@ -20,7 +20,7 @@ __all__ = ["DiagnosisError", "Finding", "Options", "Recorded", "Report", "TooLit
 
 
 @dataclass(frozen=True)
-class Excerpt:
+class Trimmed:
     """A recording from some sample on."""
 
     sample_rate: float
@@ -43,7 +43,7 @@ def diagnose(
         begin = None if system.on_track else decay_begin(prepared.signals, system.sensor_noise)
         if begin is None:
             return diagnose_unforced(system, prepared, record, options, tell)
-        record = Excerpt(record.sample_rate, record.values[begin:], record.lost)
+        record = Trimmed(record.sample_rate, record.values[begin:], record.lost)
     outcome = investigate(system, record, options, tell)
     tell(0.95, "report")
     report = narrate(outcome, record)

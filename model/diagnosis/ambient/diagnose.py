@@ -20,15 +20,15 @@ from sprung.model.diagnosis.ambient.windows import (
     with_known,
 )
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
-from sprung.model.diagnosis.investigation.verdict import Errors, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, verdict_of
 from sprung.model.diagnosis.record.channels import Prepared, TooLittleError
 from sprung.model.diagnosis.report.report import (
     Finding,
     FitFigures,
     LawParameter,
-    ParameterValue,
     RecordingFacts,
     Report,
+    ReportedParameter,
     TrackPoint,
     Unexplained,
 )
@@ -59,7 +59,7 @@ class Pooled:
 def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, options: Options, tell: Progress) -> Report:
     """Diagnose a recording of sensors alone.
 
-    Errors: `TooLittleError` where no window tells anything.
+    HeldOutErrors: `TooLittleError` where no window tells anything.
     """
     signals = prepared.signals
     windows, note = all_windows(system, signals, lambda share: tell(0.05 + 0.5 * share, "windows"))
@@ -117,11 +117,11 @@ def pool(windows: list[WindowResult]) -> Pooled:
     return Pooled(mean, deviation, varying, chance)
 
 
-def _errors(before: list[WindowResult], after: list[WindowResult]) -> tuple[Errors, tuple[float, float]]:
+def _errors(before: list[WindowResult], after: list[WindowResult]) -> tuple[HeldOutErrors, tuple[float, float]]:
     """Before: one value of every parameter for all windows; after: with what varies."""
     one, chance, _ = displaced([w for w, good in zip(before, independent(before), strict=True) if good])
     own, _, band = displaced([w for w, good in zip(after, independent(after), strict=True) if good])
-    return Errors(np.sqrt(one), np.sqrt(own), np.sqrt(chance)), band
+    return HeldOutErrors(np.sqrt(one), np.sqrt(own), np.sqrt(chance)), band
 
 
 def _report(
@@ -131,7 +131,7 @@ def _report(
     options: Options,
     windows: list[WindowResult],
     pooled: Pooled,
-    errors: Errors,
+    errors: HeldOutErrors,
     band: tuple[float, float],
 ) -> Report:
     names = prepared.signals.sensor_names
@@ -155,7 +155,7 @@ def _report(
     track = tuple(_point(system, window) for window in windows)
     share = errors.explained() if any(f.effect != "unknown" for f in findings) else None
     values = tuple(
-        ParameterValue(p.name, value, value * float(s), p.nominal, p.unit)
+        ReportedParameter(p.name, value, value * float(s), p.nominal, p.unit)
         for p, value, s in zip(
             system.parameters,
             (np.array([p.nominal for p in system.parameters]) * np.exp(pooled.log_ratio)).tolist(),
@@ -250,7 +250,7 @@ def _summary(system: System, verdict: str, findings: list[Finding], track: tuple
     return f"{text}; {lowest}."
 
 
-def _advice(system: System, pooled: Pooled, errors: Errors, adequate: float, strange: bool) -> list[str]:
+def _advice(system: System, pooled: Pooled, errors: HeldOutErrors, adequate: float, strange: bool) -> list[str]:
     words = []
     if strange:
         words.append(

@@ -48,7 +48,7 @@ class WindowResult:
         return 0.5 * (self.begin + self.end)
 
 
-class Structure:
+class ShakenStructure:
     """Windows of a structure under forces that nobody measured."""
 
     def __init__(self, system: System, sensors: np.ndarray) -> None:
@@ -64,7 +64,7 @@ class Structure:
         return WindowResult(*at, told.fitted.x[:P], told.covariance[:P, :P], told.adequate, powers)
 
 
-class OnTrack:
+class UnmeasuredTrack:
     """Windows of a vehicle on a track that nobody measured."""
 
     def __init__(self, system: System, sensors: np.ndarray) -> None:
@@ -104,7 +104,7 @@ def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], 
 
 def all_windows(system: System, signals: Signals, tell: Told) -> tuple[list[WindowResult], str]:
     """Every window that tells anything, and what was left out, in words."""
-    kind = OnTrack if system.on_track else Structure
+    kind = UnmeasuredTrack if system.on_track else ShakenStructure
     looked = kind(system, signals.sensor_index)
     cuts, note = stretches(system, signals)
     found = []
@@ -121,7 +121,7 @@ def with_known(system: System, signals: Signals, windows: list[WindowResult], kn
     """The same windows under parameters (P,) that all of them share."""
     if system.on_track:
         return windows
-    looked, again = Structure(system, signals.sensor_index), []
+    looked, again = ShakenStructure(system, signals.sensor_index), []
     for window in windows:
         start, stop = (round((at - signals.start) * signals.sample_rate) for at in (window.begin, window.end))
         result = looked.result(signals.sensors[start:stop], (window.begin, window.end), known)
