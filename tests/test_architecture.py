@@ -38,7 +38,19 @@ ORDER = [
 ]
 _BELOW = ORDER[: ORDER.index("identification")]
 BESIDE = {"diagnosis": _BELOW, "exchange": _BELOW, "alps": ORDER}
-STAGES = ("rules", "record", "response", "fit", "screening", "selection", "investigation", "report", "component", "api")
+STAGES = (
+    "rules",
+    "record",
+    "response",
+    "fit",
+    "screening",
+    "selection",
+    "investigation",
+    "report",
+    "component",
+    "ambient",
+    "api",
+)
 # Imports inside functions of `model`, each with its reason
 LATE: dict[str, str] = {}
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}

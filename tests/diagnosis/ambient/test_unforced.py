@@ -31,7 +31,7 @@ sensors:
 
 
 @dataclass
-class Recording:
+class ShakenRecording:
     values: FloatArray
     sample_rate: float = RATE
     lost: int = 0
@@ -55,7 +55,7 @@ def tower(seed: int, seconds: float, force: float = 50.0, k: FloatArray = STIFFN
 
 
 def diagnosed(system: System, values: FloatArray) -> Report:
-    return diagnose(system, Recording(values))
+    return diagnose(system, ShakenRecording(values))
 
 
 @pytest.mark.parametrize("noise", [0.0001, 0.01])
