@@ -8,6 +8,7 @@ command that was stopped, or that ran out of `--minutes`, goes on where it was w
 from __future__ import annotations
 
 import json
+import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, cast, get_args
 
 import torch
 
-from sprung.benchmarks import paper_analysis, paper_train, paper_visual
+from sprung.benchmarks import paper_analysis, paper_settings, paper_train, paper_visual
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import OutOfTime
@@ -47,7 +48,8 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """One dict per row: task, method, figures, the paper's values, settings.
 
-    task: one of `TASKS`, all by default; method: one of the task's; seeds: how many, from `seed` on;
+    task: one of `TASKS`, all by default; method: one of the task's, or "core": the paper's and the untrained ones;
+    seeds: how many, from `seed` on, each with data, frames and networks of its own;
     out: folder of checkpoints and pictures; minutes: stop after this long, to be resumed by the same command.
     """
     _check(task, method, budget, device)
@@ -60,11 +62,25 @@ def run(
             settings.folder.mkdir(parents=True, exist_ok=True)
             try:
                 for row in rows(settings):
+                    row |= {"commit": commit(), "sources": paper_settings.sources()}
                     _keep(settings, row)
                     yield row
             except OutOfTime as stop:
                 yield {"task": name, "seed": at, "unfinished": str(stop)}
                 return
+
+
+def commit() -> str:
+    """The commit that a row was made at, "+" after it where files differ; "unknown" outside a checkout."""
+    root = Path(__file__).resolve().parent.parent
+    try:
+        found = subprocess.run(
+            ["git", "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"],
+            cwd=root, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return "unknown"
+    return found.stdout.strip()
 
 
 def _keep(settings: PaperSettings, row: dict[str, Any]) -> None:
@@ -83,7 +99,7 @@ def _check(task: str | None, method: str | None, budget: str, device: str) -> No
         raise UserError(f"bench paper: no budget {budget!r}; known are {', '.join(get_args(Budget))}")
     if method is not None:
         known = TASKS[task][1] if task else tuple({m for _, methods in TASKS.values() for m in methods})
-        if method not in known:
+        if method not in (*known, paper_settings.CORE):
             raise UserError(f"bench paper: no method {method!r}; known are {', '.join(known) or 'none'}")
     if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
         raise UserError(f"bench paper: no device {device!r} here; leave --device out for the CPU")

@@ -2,11 +2,32 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import TimeLimit
+
+CORE = "core"
+EXTRA = (
+    "autoencoder_plain", "cdm_plain", "alps_plain", "no_opening", "no_affine_head", "all_states_shown", "no_phases",
+    "no_tempering", "no_falling_prior", "scales_halved", "scales_doubled", "hamiltonian", "decoder_free",
+)  # fmt: skip
+
+
+_ROOT = Path(__file__).resolve().parent.parent
+
+
+@cache
+def sources() -> str:
+    """Digest of the code that makes the rows: systems, methods, training, figures.  Rows of other code are stale."""
+    digest = hashlib.sha256()
+    files = [*(_ROOT / "model" / "alps").glob("*.py"), *(_ROOT / "benchmarks").glob("paper_*.py")]
+    for path in sorted(path for path in files if path.stem not in ("paper_report", "paper_pictures")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -38,4 +59,7 @@ class PaperSettings:
         return TimeLimit() if self.until is None else TimeLimit(self.until)
 
     def wants(self, method: str) -> bool:
+        """Whether a row was asked for: all of them, the paper's own and the untrained ones, or one."""
+        if self.method == CORE:
+            return method not in EXTRA
         return self.method in (None, method)

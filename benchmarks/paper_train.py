@@ -17,7 +17,7 @@ from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps import train_fit
 from sprung.model.alps.task import WINDOW, windows
 from sprung.model.alps.train_fit import StateEstimator, TrainConfig, TrainMethod
-from sprung.model.alps.train_system import STEPS, TrainData, full_state_system, generate, to_points
+from sprung.model.alps.train_system import STEPS, TRAJECTORIES, TrainData, full_state_system, generate, to_points
 from sprung.model.identification.estimator import Estimator, bundled_estimator, new_estimator, noise_power
 from sprung.model.identification.refine import Refiner
 from sprung.model.system import System, load_system
@@ -25,6 +25,7 @@ from sprung.model.system import System, load_system
 CONSTANT_METHODS = ("alps", "alps_smoothed", "no_fourier", "cdm", "alps_from_sensors", "alps_known_sensors")
 CHANGING_METHODS = (
     "alps",
+    "alps_many",
     "force_balance",
     "refined",
     "output_error",
@@ -46,9 +47,12 @@ UPDATES = {
 }  # fmt: skip
 
 
-def data_of(changing: bool) -> TrainData:
-    """The data: the same for every method and seed of training."""
-    return generate(changing, np.random.default_rng([8, int(changing)]))
+MANY = 400  # trajectories, half of them to train: what the paper's estimator does with many vehicles
+
+
+def data_of(changing: bool, seed: int = 0, trajectories: int = TRAJECTORIES) -> TrainData:
+    """The data of a seed: the same for every method."""
+    return generate(changing, np.random.default_rng([8, int(changing), seed]), trajectories)
 
 
 def _config(settings: PaperSettings, method: str) -> TrainConfig:
@@ -60,7 +64,7 @@ def _config(settings: PaperSettings, method: str) -> TrainConfig:
 
 def constant_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """The paper's benchmark: 20 trajectories, one parameter vector; SE over states in units of their rms."""
-    data = data_of(False)
+    data = data_of(False, settings.seed)
     _, test = train_fit.halves(data)
     yield _row(settings, "train", "guess_nominal", _mean_guess(data))
     if settings.method is None:
@@ -94,14 +98,18 @@ def _bound_rows(settings: PaperSettings, data: TrainData) -> Iterator[dict[str, 
 
 def changing_rows(settings: PaperSettings) -> Iterator[dict[str, Any]]:
     """Every trajectory with its own parameters: the paper's estimator, and what keeps the phase."""
-    data = data_of(True)
+    data = data_of(True, settings.seed)
     yield _row(settings, "train_changing", "guess_nominal", _mean_guess(data))
-    if settings.wants("alps"):
-        config = _config(settings, "alps")
-        model = train_fit.fit("alps", data, config, settings.folder, settings.clock, "train changing")
+    for method, seen in (("alps", data), ("alps_many", data_of(True, settings.seed, MANY))):
+        if not settings.wants(method):
+            continue
+        config = replace(_config(settings, "alps"), decay=0.0)  # decay suits parameters that never change
+        folder = settings.folder / method
+        folder.mkdir(exist_ok=True)
+        model = train_fit.fit("alps", seen, config, folder, settings.clock, f"changing {method}")
         yield _row(
-            settings, "train_changing", "alps", train_fit.figures(model, data), settings=asdict(config),
-            note="the paper's estimator on parameters that it has not seen",
+            settings, "train_changing", method, train_fit.figures(model, seen), settings=asdict(config),
+            vehicles=len(seen.states) // 2, note="the paper's estimator on parameters that it has not seen",
         )  # fmt: skip
     yield from _refined_rows(settings, data)
     yield from _sensor_rows(settings, data)

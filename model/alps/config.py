@@ -6,9 +6,66 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Method = Literal["alps", "no_fourier", "no_attention", "autoencoder", "cdm"]
-METHODS: tuple[Method, ...] = ("alps", "no_fourier", "no_attention", "autoencoder", "cdm")
+Dynamics = Literal["simulator", "context", "hamiltonian", "none"]
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """What makes a method: its parts, and the help that its training gets.
+
+    The last seven are the departures from the paper's text that docs/paper.md lists; rows `no_...` and `alps_plain`
+    leave them out one by one and all together.
+    """
+
+    dynamics: Dynamics = "simulator"
+    attention: bool = True  # else positions frame by frame, rates by first differences
+    fourier: bool = True  # the estimator sees abs(FFT) of the states, else the states
+    drawn: bool = True  # a decoder shows the simulated states; else the physics is followed in the latent alone
+    straight: bool = True  # positions are an affine image of the embedding
+    opening: bool = True  # they start from the task's opening, if it has one
+    positions_shown: bool = True  # the decoder sees positions only, else all states
+    phased: bool = True  # the task's phases, else one: everything over the whole window
+    tempered: bool = True  # outliers weigh less, else plain squares
+    falling_prior: bool = True  # the prior's weight falls, else it has its last value throughout
+    scale: float = 1.0  # factor on the sizes that states are taken to have: how much hangs on knowing them
+
+    @property
+    def physical(self) -> bool:
+        """Has a simulator, and so an estimator of its parameters."""
+        return self.dynamics == "simulator"
+
+
+_PLAIN = Recipe(straight=False, opening=False, positions_shown=False, phased=False, tempered=False, falling_prior=False)
+_HELPED_LATENT = Recipe(dynamics="none", positions_shown=False)  # with nothing else to say it in, all states are shown
+
+RECIPES: dict[str, Recipe] = {
+    "alps": Recipe(),
+    # the paper's ablations
+    "no_fourier": Recipe(fourier=False),
+    "no_attention": Recipe(attention=False),
+    # its baselines, with the same openings, affine positions, phases and scaled inputs as alps
+    "autoencoder": _HELPED_LATENT,
+    "cdm": Recipe(dynamics="context"),
+    # both as printed
+    "autoencoder_plain": replace(_PLAIN, dynamics="none"),
+    "cdm_plain": replace(_PLAIN, dynamics="context"),
+    # the paper as printed, and each departure left out
+    "alps_plain": _PLAIN,
+    "no_opening": Recipe(opening=False),
+    "no_affine_head": Recipe(straight=False),
+    "all_states_shown": Recipe(positions_shown=False),
+    "no_phases": Recipe(phased=False),
+    "no_tempering": Recipe(tempered=False),
+    "no_falling_prior": Recipe(falling_prior=False),
+    "scales_halved": Recipe(scale=0.5),
+    "scales_doubled": Recipe(scale=2.0),
+    # since the paper
+    "hamiltonian": Recipe(dynamics="hamiltonian"),
+    "decoder_free": Recipe(attention=False, drawn=False),
+}
+METHODS = tuple(RECIPES)
 Budget = Literal["quick", "full"]
+WHOLE_WINDOW = 99  # steps of a window: a simulation that never restarts
 
 
 @dataclass(frozen=True)
@@ -63,7 +120,8 @@ class TrainingConfig:
     observation_weight: float = 1.0  # squared error of the standardised embedding, mean
     pixel_weight: float = 20.0  # squared error of pixels in [0, 1], mean; end_to_end only
     state_weight: float = 1.0  # squared error of the chart, summed over its columns, mean over samples
-    outlier: float = 0.1  # squared error beyond which a sample counts less (see `losses.py`)
+    spread_weight: float = 0.1  # without a decoder: positions keep the unit spread of their prior (see `losses.py`)
+    outlier: float = 0.1  # squared error beyond which a sample counts less (see `losses.py`); infinite: plain squares
 
     @property
     def updates(self) -> int:
@@ -117,8 +175,20 @@ _QUICK = {
 }
 
 
+def for_recipe(config: TrainingConfig, recipe: Recipe) -> TrainingConfig:
+    """Settings of a task as a recipe trains: as many updates, without what it leaves out."""
+    if not recipe.phased:
+        rates = (config.phases[0].learning_rate[0], config.phases[-1].learning_rate[1])
+        config = replace(config, phases=(Phase("all", WHOLE_WINDOW, config.updates, rates),))
+    if not recipe.tempered:
+        config = replace(config, outlier=math.inf)
+    if not recipe.falling_prior:
+        config = replace(config, divergence_start=config.divergence_weight)
+    return config
+
+
 def training_config(task: str, budget: Budget, seed: int) -> TrainingConfig:
-    """Settings of a visual task.  `full` is meant for one GPU."""
+    """Settings of a visual task; `seed` draws data, frames and networks.  `full` is meant for one GPU."""
     config = replace(_QUICK[task], seed=seed)
     if budget == "quick":
         return config

@@ -73,11 +73,9 @@ class PosteriorHead(nn.Module):
         """
         if self.opening is None:
             return
-        mean = embeddings.mean(0)
-        _, size, directions = torch.linalg.svd(embeddings - mean, full_matrices=False)
-        whiten = directions[:2] / (size[:2, None] / len(embeddings) ** 0.5)
-        weights, bias = self.opening((embeddings - mean) @ whiten.mT)
-        rows, offsets = weights @ whiten, bias - weights @ whiten @ mean
+        directions, mean = principal_components(embeddings)
+        weights, bias = self.opening((embeddings.double() - mean) @ directions.mT)
+        rows, offsets = (weights @ directions).float(), (bias - weights @ directions @ mean).float()
         at = 0
         for columns in self._mean_columns().values():
             here = slice(at, at + columns.stop - columns.start)
@@ -137,6 +135,20 @@ class _Block(nn.Module):
         seen = nn.functional.scaled_dot_product_attention(query, key, value)
         z = z + self.join(seen.transpose(1, 2).reshape(batch, length, width))
         return z + self.forward_net(self.between(z))
+
+
+def principal_components(embeddings: Tensor) -> tuple[Tensor, Tensor]:
+    """Two rows (2, E) that whiten the first two components of embeddings (M, E), and the mean (E,); float64.
+
+    By the covariance in double precision: single precision leaves digits that depend on where a tensor lies in memory.
+    The sign, which is free, is that of the largest entry.
+    """
+    x = embeddings.double()
+    mean = x.mean(0)
+    variance, vectors = torch.linalg.eigh((x - mean).mT @ (x - mean) / len(x))
+    directions = vectors[:, [-1, -2]].mT / variance[[-1, -2], None].sqrt()
+    largest = directions.gather(1, directions.abs().argmax(1, keepdim=True))
+    return directions * largest.sign(), mean
 
 
 class AttentionEncoder(nn.Module):

@@ -1,14 +1,17 @@
 """Training of the visual tasks: first the frame autoencoder, then each method on its embeddings.
 
 Checkpoints, learning-rate schedule and seeding are those of `model.identification.training`: every update draws from
-(seed, step), so that an interrupted run ends in the same weights as one that was not, up to rounding.
+(seed, step), so that an interrupted run ends in the same weights as one that was not.  Tensors that come from a file
+are copied, for the memory they are mapped to is not aligned like torch's own, and sums of the same numbers then differ
+in their last bit.
 """
 
 from __future__ import annotations
 
+import copy
 import json
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,14 +20,14 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from sprung.model.alps.config import Method, NetworkConfig, TrainingConfig
+from sprung.model.alps.config import RECIPES, NetworkConfig, TrainingConfig, for_recipe
 from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import loss_of, picture_loss, state_loss
 from sprung.model.alps.network import Network
 from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 from sprung.model.identification.training import TrainingRun
 
-_STREAMS = {"train": 0, "test": 1, "unseen": 2}
+_STREAMS = {"train": 0, "test": 1, "unseen": 2, "below": 3}
 
 
 class OutOfTime(Exception):
@@ -60,10 +63,14 @@ class VisualModel(nn.Module):
 
 
 def draw_rollouts(task: Task, config: TrainingConfig, split: str) -> Rollouts:
-    """The rollouts of a split; the same for every method and seed of training."""
-    rng = np.random.default_rng([7, _STREAMS[split]])
+    """The rollouts of a split: "train", "test", "unseen" (parameters above the range) or "below" it.
+
+    The same for every method; another seed draws others.
+    """
+    rng = np.random.default_rng([7, _STREAMS[split], config.seed])
     count = config.trajectories if split == "train" else config.test_trajectories
-    return task.sample(count, rng, task.unseen if split == "unseen" else task.seen)
+    bounds = {"unseen": task.unseen, "below": task.below}.get(split, task.seen)
+    return task.sample(count, rng, bounds)
 
 
 def pick_windows(config: TrainingConfig, step: int, batch: int) -> tuple[Tensor, Tensor]:
@@ -124,15 +131,34 @@ def embedded(
     if path.is_file():
         with safe_open(path, framework="pt") as file:
             if (file.metadata() or {}).get("made_by") == made_by:
-                return Split(rollouts, file.get_tensor("embeddings"))
+                return Split(rollouts, file.get_tensor("embeddings").clone())
     embeddings = frames.encode_rollouts(task, rollouts.states.to(device)).cpu()
     save_file({"embeddings": embeddings.contiguous()}, path, metadata={"made_by": made_by})
     return Split(rollouts, embeddings)
 
 
+def new_model(
+    task: Task, method: str, data: Split, frames: FrameAutoencoder, config: TrainingConfig, sizes: NetworkConfig,
+    device: str = "cpu",
+) -> VisualModel:  # fmt: skip
+    """An untrained model of a method, opened on the training split where its recipe says so.
+
+    Frames that are trained with the rest are the method's own: a copy.
+    """
+    torch.manual_seed(config.seed)
+    recipe = RECIPES[method]
+    drive = data.rollouts.inputs.square().mean((0, 1)).sqrt() if recipe.opening and task.inputs else None
+    if config.end_to_end:
+        frames = copy.deepcopy(frames)
+    model = VisualModel(frames, Network(task, method, sizes, drive)).to(device)
+    if recipe.opening:
+        model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1)[::7].to(device))
+    return model
+
+
 def train_method(
     task: Task,
-    method: Method,
+    method: str,
     data: Split,
     frames: FrameAutoencoder,
     config: TrainingConfig,
@@ -142,10 +168,9 @@ def train_method(
     device: str = "cpu",
 ) -> VisualModel:
     """One method of one task, trained or from its checkpoint."""
-    torch.manual_seed(config.seed)
-    model = VisualModel(frames, Network(task, method, sizes)).to(device)
-    if model.network.estimator is not None:  # methods without physics have no positions to start with
-        model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1)[::7].to(device))
+    config = for_recipe(config, RECIPES[method])
+    model = new_model(task, method, data, frames, config, sizes, device)
+    task = model.network.task  # in the recipe's units
     trained = model if config.end_to_end else model.network
     run = TrainingRun(trained, folder / f"{method}-s{config.seed}", config, _name(task, config, method))
     run.resume()
@@ -182,7 +207,7 @@ def _update_loss(task: Task, model: VisualModel, data: Split, config: TrainingCo
         embeddings = windows(data.embeddings, starts, rows).to(device)
     passed = model.network(embeddings, inputs, phase.horizon, warm_up=phase.trains in ("rates", "states"))
     loss = loss_of(task, passed, embeddings, config, config.divergence(step)).total
-    if pictures is not None:
+    if pictures is not None and passed.observed is not None:
         loss = loss + config.pixel_weight * picture_loss(model.frames.decode(passed.observed.flatten(0, 1)), pictures)
     return loss
 
@@ -206,6 +231,14 @@ def _encode_all(task: Task, model: VisualModel, data: Split, config: TrainingCon
         embeddings = model.frames.encode_rollouts(task, data.rollouts.states.to(device))
     starts = range(ROLLOUT - WINDOW + 1)
     return torch.stack([model.network.encoder(embeddings[:, at : at + WINDOW]).mean for at in starts], dim=1)
+
+
+def seen_by(model: VisualModel, task: Task, split: Split, config: TrainingConfig) -> Split:
+    """A split as a trained model's own convolutions see it; the split itself where they are the shared ones."""
+    if not config.end_to_end:
+        return split
+    device = next(model.parameters()).device
+    return replace(split, embeddings=model.frames.encode_rollouts(task, split.rollouts.states.to(device)).cpu())
 
 
 def _frames_name(task: Task, config: TrainingConfig) -> str:

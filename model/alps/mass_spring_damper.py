@@ -100,6 +100,7 @@ TASK = Task(
     parameters=("primary stiffness [N/m]",),
     seen=Range((4e3,), (4e6,)),
     unseen=Range((4e6,), (5e6,)),
+    below=Range((1e3,), (4e3,)),
     inputs=2,
     simulate=simulate,
     sample=sample,

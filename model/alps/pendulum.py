@@ -92,6 +92,7 @@ TASK = Task(
     parameters=("friction [1/s]",),
     seen=Range((0.1,), (1.0,)),
     unseen=Range((1.0,), (1.3,)),
+    below=Range((0.02,), (0.1,)),
     inputs=0,
     simulate=simulate,
     sample=sample,

@@ -42,6 +42,10 @@ class Rollouts:
     inputs: Tensor  # (R, T, I), float64; I may be 0
     parameters: Tensor  # (R, P), float64
 
+    def first(self, count: int) -> Rollouts:
+        """The first `count` trajectories."""
+        return Rollouts(self.states[:count], self.inputs[:count], self.parameters[:count])
+
 
 @dataclass(frozen=True)
 class Task:
@@ -55,7 +59,8 @@ class Task:
     state_scale: tuple[float, ...]  # size of each state: the networks work in units of it
     parameters: tuple[str, ...]
     seen: Range
-    unseen: Range  # for the generalisation figure: just outside `seen`
+    unseen: Range  # for the generalisation figures: just above `seen`
+    below: Range  # and just below
     inputs: int
     simulate: Simulate  # (x0 (B, N), parameters (B, P), inputs (B, T, I)) -> (B, T, N)
     sample: Sample  # (rollouts, rng, range) -> Rollouts of ROLLOUT steps
@@ -90,6 +95,18 @@ class Task:
                 columns += [torch.cos(column), torch.sin(column)]
             else:
                 columns.append(column / scale)
+        return torch.stack(columns, dim=-1)
+
+    def from_chart(self, chart: Tensor) -> Tensor:
+        """The states of a full chart: the inverse of `to_chart`, angles from any length of (cos, sin)."""
+        columns, at = [], 0
+        for index, scale in enumerate(self.state_scale):
+            if index in self.angles:
+                columns.append(torch.atan2(chart[..., at + 1], chart[..., at]))
+                at += 2
+            else:
+                columns.append(scale * chart[..., at])
+                at += 1
         return torch.stack(columns, dim=-1)
 
     def chart_width(self) -> int:

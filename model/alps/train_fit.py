@@ -76,7 +76,7 @@ class StateContext(nn.Module):
     def __init__(self, task: Task, data: TrainData) -> None:
         super().__init__()
         self.model = ContextDynamics(task, NetworkConfig())
-        self.register_buffer("drive", data.knots.square().mean((0, 1)).sqrt().float())
+        self.register_buffer("drive", data.knots[data.training].square().mean((0, 1)).sqrt().float())
         self.drive: Tensor
 
     def forward(self, states: Tensor, knots: Tensor, horizon: int = WINDOW - 1) -> Tensor:
@@ -125,8 +125,8 @@ class SensorAutoencoder(nn.Module):
         super().__init__()
         config = NetworkConfig()
         self.task, self.simulator = task, LinearSimulator(load_system())
-        self.register_buffer("scale", data.observations.square().mean((0, 1)).sqrt())
-        self.register_buffer("drive", data.knots.square().mean((0, 1)).sqrt())
+        self.register_buffer("scale", data.observations[data.training].square().mean((0, 1)).sqrt())
+        self.register_buffer("drive", data.knots[data.training].square().mean((0, 1)).sqrt())
         self.scale: Tensor
         self.drive: Tensor
         sensors, inputs = len(self.scale), len(self.drive)
@@ -162,11 +162,12 @@ def halves(data: TrainData) -> tuple[Tensor, Tensor]:
 
 def build(method: TrainMethod, data: TrainData) -> nn.Module:
     """An untrained model."""
+    if method in ("alps_from_sensors", "alps_known_sensors"):
+        task = train_task(data, data.expected_size())
+        return SensorAutoencoder(task, data, known=method == "alps_known_sensors")
     task = train_task(data)
     if method == "cdm":
         return StateContext(task, data)
-    if method in ("alps_from_sensors", "alps_known_sensors"):
-        return SensorAutoencoder(task, data, known=method == "alps_known_sensors")
     smooth = data.noise if method == "alps_smoothed" else None
     return StateEstimator(task, fourier=method != "no_fourier", smooth=smooth)
 
@@ -204,13 +205,14 @@ def _loss(model: nn.Module, data: TrainData, rows: Tensor, starts: Tensor, confi
         return ((simulated - measured) / data.noise).square().mean()
     if isinstance(model, StateContext):
         horizon = (3, 9, 33)[min(2, 3 * step // config.updates)]
-        return ((model(measured, known, horizon) - measured) / data.size).square().mean()
+        size = measured.new_tensor(model.model.task.state_scale)
+        return ((model(measured, known, horizon) - measured) / size).square().mean()
     observations, knots = windows(data.observations, starts, rows), windows(data.knots, starts, rows)
     assert isinstance(model, SensorAutoencoder)
     encoded, _, simulated, decoded = model(observations, knots, nominal=step < config.nominal * config.updates)
     divergence = encoded.divergence.mean()
     observation = (decoded - observations / model.scale).square().mean()
-    state = ((encoded.draw - simulated) / data.size).square().sum(-1).mean()
+    state = ((encoded.draw - simulated) / simulated.new_tensor(model.task.state_scale)).square().sum(-1).mean()
     return config.divergence_weight * divergence + config.observation_weight * observation + 0.1 * state
 
 

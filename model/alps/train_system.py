@@ -39,7 +39,25 @@ class TrainData:
     observations: Tensor  # accelerometers with noise, (R, T, 12)
     log_ratio: Tensor  # truth, (R, 24)
     noise: Tensor  # standard deviation of each measured state, (18,)
-    size: Tensor  # rms of each true state, (18,): units in which networks work
+    size: Tensor  # rms of each true state, (18,): the unit of errors of states in figures; no method sees it
+
+    @property
+    def training(self) -> slice:
+        """Rows of the training trajectories, the first half."""
+        return slice(len(self.states) // 2)
+
+    def measured_size(self) -> Tensor:
+        """rms of each measured state over the training trajectories (18,): units for methods that measure states."""
+        return self.measured[self.training].square().mean((0, 1)).sqrt()
+
+    def expected_size(self) -> Tensor:
+        """rms of each state (18,) of the nominal vehicle on the training inputs: units where no state is measured."""
+        simulator = LinearSimulator(load_system())
+        knots = self.knots[self.training]
+        nominal = torch.zeros(len(knots), self.log_ratio.shape[1], dtype=torch.float64)
+        discrete = simulator.discretise(simulator.element_values(nominal))
+        states = simulator.states(discrete, knots, knots.new_zeros(len(knots), self.states.shape[2]))
+        return states.square().mean((0, 1)).sqrt()
 
 
 def full_state_system(system: System, noise: FloatArray | None = None, known_inputs: bool = True) -> System:
@@ -132,8 +150,12 @@ def smoothed(simulator: LinearSimulator, log_ratio: Tensor, measured: Tensor, in
     return simulator.states(discrete, inputs, start)
 
 
-def train_task(data: TrainData) -> Task:
-    """The train as a task of the common networks; its parameters are log-ratios to nominal values."""
+def train_task(data: TrainData, size: Tensor | None = None) -> Task:
+    """The train as a task of the common networks; its parameters are log-ratios to nominal values.
+
+    `size`: unit of each state (18,), that of the measured training states by default.
+    """
+    size = data.measured_size() if size is None else size
     system = load_system()
     simulator = LinearSimulator(system)
 
@@ -146,7 +168,7 @@ def train_task(data: TrainData) -> Task:
         return Rollouts(drawn.states, drawn.knots, drawn.log_ratio)
 
     low, high = float(np.log(1 - SPREAD)), float(np.log(1 + SPREAD))
-    size = len(system.parameters)
+    count = len(system.parameters)
     dofs = system.mechanics.dofs
     return Task(
         name="train",
@@ -154,10 +176,11 @@ def train_task(data: TrainData) -> Task:
         states=(*dofs, *(f"{name} rate" for name in dofs)),
         angles=(),
         velocity_of=tuple((i + len(dofs), i) for i in range(len(dofs))),
-        state_scale=tuple(float(v) for v in data.size),
+        state_scale=tuple(float(v) for v in size),
         parameters=tuple(p.name for p in system.parameters),
-        seen=Range((low,) * size, (high,) * size),
-        unseen=Range((low,) * size, (high,) * size),
+        seen=Range((low,) * count, (high,) * count),
+        unseen=Range((low,) * count, (high,) * count),
+        below=Range((low,) * count, (high,) * count),
         inputs=data.knots.shape[2],
         simulate=simulate,
         sample=sample,

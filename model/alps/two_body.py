@@ -131,6 +131,7 @@ TASK = Task(
     parameters=("binding energy",),
     seen=Range((0.4,), (1.0,)),
     unseen=Range((1.0,), (1.2,)),
+    below=Range((0.38,), (0.4,)),  # larger orbits leave the picture
     inputs=0,
     simulate=simulate,
     sample=sample,
