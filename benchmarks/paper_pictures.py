@@ -71,10 +71,12 @@ def frames(task: Task, models: dict[str, VisualModel], shown: dict[str, Predicte
     true = task.render(next(iter(shown.values())).true[0, steps])
     rows = [("true", true)]
     for method in wanted:
+        observed = shown[method].observed
+        assert observed is not None  # these three decode
         with torch.no_grad():
             model = models[method]
             device = next(model.parameters()).device
-            drawn = model.frames.decode(shown[method].observed[0, steps].to(device)).cpu()
+            drawn = model.frames.decode(observed[0, steps].to(device)).cpu()
         rows.append((METHOD_NAMES[method], drawn))
     for line, (name, pictures) in zip(axes, rows, strict=True):
         for ax, picture in zip(line, pictures, strict=True):

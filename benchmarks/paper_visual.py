@@ -182,11 +182,13 @@ def _answered(
 
 def _gauge_free(task: Task, found: Predicted) -> dict[str, float | None]:
     """SE and R^2 of each state after the affine map."""
-    share = metrics.explained(task, found.simulated, found.true)
-    return {
+    figures: dict[str, float | None] = {
         "SE_affine": metrics.state_error(task, found.simulated, found.true),
         "SE_affine_relative": metrics.relative_state_error(task, found.simulated, found.true),
-    } | {f"R2 {name.split()[0]}": value for name, value in zip(task.states, share, strict=True)}
+    }
+    for name, share in zip(task.states, metrics.explained(task, found.simulated, found.true), strict=True):
+        figures[f"R2 {name.split()[0]}"] = share
+    return figures
 
 
 def _figures(data: _Data, model: VisualModel) -> tuple[dict[str, float | None], dict[str, np.ndarray], Predicted]:

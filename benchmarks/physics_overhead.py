@@ -95,7 +95,7 @@ def _stepwise(method: str) -> Task:
 def _model(task: Task, method: str, device: str) -> tuple[VisualModel, torch.optim.Optimizer]:
     torch.manual_seed(0)
     sizes = NetworkConfig()
-    model = VisualModel(FrameAutoencoder(sizes), Network(task, method, sizes)).to(device)  # type: ignore[arg-type]
+    model = VisualModel(FrameAutoencoder(sizes), Network(task, method, sizes)).to(device)
     return model, torch.optim.Adam(model.parameters(), 1e-4)
 
 

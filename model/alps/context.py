@@ -34,7 +34,7 @@ class Context(nn.Module):
     def describe(self, states: Tensor, inputs: Tensor) -> Tensor:
         """The window's first states (B, T, N) and inputs (B, T, I) -> context (B, 10)."""
         seen = torch.cat([self.task.to_chart(states[:, :HISTORY]), self.scaled(inputs[:, :HISTORY])], dim=-1)
-        return self.summarise(seen.flatten(1))  # type: ignore[no-any-return]
+        return self.summarise(seen.flatten(1))
 
 
 class ContextDynamics(Context):

@@ -152,7 +152,7 @@ def _from(task: Task, read: Tensor, inputs: Tensor, parameters: Tensor) -> Fitte
         damping = torch.full((len(read),), 1e-2, dtype=torch.float64)
         now = error(unknown, samples)
         for _ in range(ITERATIONS):
-            jacobian = _jacobian(lambda x, n=samples: error(x, n), unknown, now)  # type: ignore[misc]
+            jacobian = _jacobian(lambda x, n=samples: error(x, n), unknown, now)
             normal = jacobian.mT @ jacobian
             gradient = (jacobian.mT @ now[..., None])[..., 0]
             weight = damping[:, None] * (normal.diagonal(dim1=1, dim2=2) + 1e-6)
