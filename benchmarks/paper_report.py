@@ -142,7 +142,7 @@ def comparisons(task: str, errors: Path, best: str = "alps") -> str:
 
 
 @dataclass(frozen=True)
-class Compared:
+class MethodComparison:
     """Errors of one method over those of another."""
 
     ratio: float
@@ -151,7 +151,7 @@ class Compared:
     p: float
 
 
-def _compared_cell(compared: Compared | None) -> str:
+def _compared_cell(compared: MethodComparison | None) -> str:
     if compared is None:
         return "- | -"
     return f"{compared.ratio:.3g} ({compared.low:.3g} to {compared.high:.3g}) | {compared.p:.2g}"
@@ -168,7 +168,7 @@ def _errors(folder: Path, task: str, method: str) -> dict[int, dict[str, np.ndar
 
 def _compared(
     one: dict[int, dict[str, np.ndarray]], other: dict[int, dict[str, np.ndarray]], key: str, draws: int = 2000
-) -> Compared | None:
+) -> MethodComparison | None:
     pairs = [(one[seed][key], other[seed][key]) for seed in one if seed in other and key in one[seed]]
     if not pairs or key not in next(iter(other.values())):
         return None
@@ -184,7 +184,7 @@ def _compared(
     left, right = (np.concatenate(side) for side in zip(*pairs, strict=True))
     p = float(stats.wilcoxon(left, right).pvalue) if np.any(left != right) else 1.0
     low, high = np.quantile(ratios, [0.025, 0.975])
-    return Compared(float(np.mean(left) / np.mean(right)), float(low), float(high), p)
+    return MethodComparison(float(np.mean(left) / np.mean(right)), float(low), float(high), p)
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:

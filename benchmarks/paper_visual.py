@@ -164,7 +164,7 @@ def _same(states: Tensor) -> Tensor:
 
 
 def _answered(
-    task: Task, method: str, reading: output_error.Reading | None, split: Split, rows: Tensor, starts: Tensor
+    task: Task, method: str, reading: output_error.PositionReading | None, split: Split, rows: Tensor, starts: Tensor
 ) -> Predicted:
     """What an untrained method answers for windows of a split."""
     true = windows(split.rollouts.states, starts, rows)

@@ -29,7 +29,7 @@ _CONVERGED = 1e-6  # relative change of the sum of squares
 
 
 @dataclass(frozen=True)
-class Reading:
+class PositionReading:
     """An affine map from embeddings to positions: angles as (sin, cos), the rest in units of their size."""
 
     task: Task
@@ -51,7 +51,7 @@ class Reading:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedWindows:
     """Windows explained by the simulator."""
 
     parameters: Tensor  # (B, P)
@@ -71,7 +71,7 @@ def _columns(task: Task, states: Tensor) -> Tensor:
     return torch.stack(columns, dim=-1)
 
 
-def regressed(task: Task, embeddings: Tensor, states: Tensor) -> Reading:
+def regressed(task: Task, embeddings: Tensor, states: Tensor) -> PositionReading:
     """The reading that brings embeddings (..., E) nearest to the positions of states (..., N)."""
     x, y = embeddings.double().flatten(0, -2), _columns(task, states).flatten(0, -2)
     mean, aim = x.mean(0), y.mean(0)
@@ -79,17 +79,17 @@ def regressed(task: Task, embeddings: Tensor, states: Tensor) -> Reading:
     normal = x.mT @ x
     normal += _RIDGE * normal.diagonal().mean() * torch.eye(len(normal), dtype=x.dtype)
     matrix = torch.linalg.solve(normal, x.mT @ y)
-    return Reading(task, matrix, aim - mean @ matrix)
+    return PositionReading(task, matrix, aim - mean @ matrix)
 
 
-def opened(task: Task, data: Split) -> Reading:
+def opened(task: Task, data: Split) -> PositionReading:
     """The untrained reading.  Errors: `ValueError` for a task with neither opening nor inputs."""
     embeddings = data.embeddings.double().flatten(0, 1)[::7]
     if task.opening is not None:
         directions, mean = principal_components(embeddings)
         weights, bias = task.opening((embeddings - mean) @ directions.mT)
         rows = weights @ directions
-        return Reading(task, rows.mT, bias - rows @ mean)
+        return PositionReading(task, rows.mT, bias - rows @ mean)
     if not task.inputs:
         raise ValueError(f"{task.name}: nothing says where positions start: no opening, no inputs")
     count = len(data.embeddings)
@@ -111,9 +111,9 @@ def differences(task: Task, read: Tensor) -> Tensor:
     return torch.stack([columns[index] for index in range(len(task.states))], dim=-1)
 
 
-def fit_windows(task: Task, read: Tensor, inputs: Tensor) -> Fitted:
+def fit_windows(task: Task, read: Tensor, inputs: Tensor) -> FittedWindows:
     """Start and parameters of each window from its read positions (B, T, n) and inputs (B, T, I)."""
-    best: Fitted | None = None
+    best: FittedWindows | None = None
     low, high = (torch.tensor(bound, dtype=torch.float64) for bound in (task.seen.low, task.seen.high))
     for share in (0.2, 0.5, 0.8):
         found = _from(task, read, inputs, low + share * (high - low))
@@ -121,7 +121,7 @@ def fit_windows(task: Task, read: Tensor, inputs: Tensor) -> Fitted:
             best = found
             continue
         better = found.misfit < best.misfit
-        best = Fitted(
+        best = FittedWindows(
             torch.where(better[:, None], found.parameters, best.parameters),
             torch.where(better[:, None, None], found.simulated, best.simulated),
             torch.where(better, found.misfit, best.misfit),
@@ -130,7 +130,7 @@ def fit_windows(task: Task, read: Tensor, inputs: Tensor) -> Fitted:
     return best
 
 
-def _from(task: Task, read: Tensor, inputs: Tensor, parameters: Tensor) -> Fitted:
+def _from(task: Task, read: Tensor, inputs: Tensor, parameters: Tensor) -> FittedWindows:
     """Levenberg-Marquardt from one start of the parameters, all windows at once, finite differences."""
     scale = torch.tensor(task.state_scale, dtype=torch.float64)
     size = len(scale)
@@ -168,7 +168,7 @@ def _from(task: Task, read: Tensor, inputs: Tensor, parameters: Tensor) -> Fitte
                 break
     path = states(unknown, read.shape[1])
     misfit = _position_error(task, path, read).square().mean((1, 2)).sqrt()
-    return Fitted(low + span * unknown[:, size:], path, misfit)
+    return FittedWindows(low + span * unknown[:, size:], path, misfit)
 
 
 def _position_error(task: Task, states: Tensor, read: Tensor) -> Tensor:
@@ -191,7 +191,7 @@ def _jacobian(function, at: Tensor, value: Tensor) -> Tensor:  # type: ignore[no
     return ((shifted - value) / _STEP).permute(1, 2, 0)
 
 
-def calibrated(task: Task, data: Split) -> Reading:
+def calibrated(task: Task, data: Split) -> PositionReading:
     """A reading that agrees with the simulator: opened, then fitted windows and regression by turns."""
     reading = opened(task, data)
     count = min(CALIBRATION_WINDOWS, len(data.embeddings))
