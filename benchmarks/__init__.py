@@ -28,6 +28,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.setups",
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions",
     ),
+    "sensitivity": (
+        "sprung.benchmarks.sensitivity",
+        "what a diagnosis says when one of its deciding numbers is another",
+    ),
     "emps": ("sprung.benchmarks.emps", "missing physics in the EMPS record (--data DIR)"),
     "paper": ("sprung.benchmarks.paper", "the paper's systems, baselines and ablations"),
     "physics-overhead": ("sprung.benchmarks.physics_overhead", "what physics in the loop costs a training update"),

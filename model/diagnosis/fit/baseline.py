@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.jacobian import linearise
+from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.noise import force_noise, input_noise, sensor_noise
 from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
@@ -27,7 +29,12 @@ _DIVERGED = (
 
 
 def baseline(
-    system: System, signals: Signals, declared: Noise, split: int, rules: Rules = RULES
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    rules: Rules = RULES,
+    memory: FitMemory[Any] | None = None,
 ) -> tuple[Problem, Fit]:
     """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
 
@@ -35,7 +42,7 @@ def baseline(
     """
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
-            problem, fit = _baseline(system, signals, declared, split, rules)
+            problem, fit = _baseline(system, signals, declared, split, rules, memory)
     except (np.linalg.LinAlgError, FloatingPointError):
         raise DiagnosisError(_DIVERGED) from None
     if not np.isfinite(fit.chi_square):
@@ -43,11 +50,13 @@ def baseline(
     return problem, fit
 
 
-def _baseline(system: System, signals: Signals, declared: Noise, split: int, rules: Rules) -> tuple[Problem, Fit]:
+def _baseline(
+    system: System, signals: Signals, declared: Noise, split: int, rules: Rules, memory: FitMemory[Any] | None
+) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
-    problem = Problem(system, part, signals.sensor_index, noise, rules)
+    problem = Problem(system, part, signals.sensor_index, noise, rules, memory)
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):

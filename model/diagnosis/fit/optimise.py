@@ -18,6 +18,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
 from sprung.model.diagnosis.fit.linear_equivalent import with_equivalents
+from sprung.model.diagnosis.fit.memory import key_of
 from sprung.model.diagnosis.fit.problem import Problem, law_forces
 from sprung.model.diagnosis.fit.smoothing import Working, along_measured_motion, opened, scale_of, smoothed
 from sprung.model.diagnosis.fit.whitening import Whitener
@@ -139,6 +140,15 @@ def optimise(
     and loops solved again in every step, a rise counts only against the present point under the same new inputs.
     `whitener`: that of a fit whose chi-square this one is compared with; by default, of the model at the start.
     """
+    if problem.memory is None:
+        return _optimised(problem, start, iterations, tolerance, whitener)
+    others = (iterations, tolerance, None if whitener is None else whitener.factor)
+    key = key_of(problem.system, problem.part, problem.noise, start, *others)
+    known: Fit = problem.memory.recall(key, lambda: _optimised(problem, start, iterations, tolerance, whitener))
+    return known
+
+
+def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float, whitener: Whitener | None) -> Fit:
     state = _state(problem, *_begun(problem, start, whitener))
     damping, left, count = _DAMPING[0], np.inf, 0
     for count in range(1, iterations + 1):

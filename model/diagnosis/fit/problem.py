@@ -8,9 +8,11 @@ with G from the measured inputs to the sensors and S_u the inputs' noise (`white
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
@@ -41,6 +43,7 @@ class Problem:
     sensors: np.ndarray  # indices of the present sensors
     noise: Noise
     rules: Rules = RULES  # by which fits to it are judged
+    memory: FitMemory[Any] | None = None  # fits that are known already
 
     @property
     def process_noise(self) -> bool:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
+from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.setup import SetupFault
@@ -48,6 +49,7 @@ class Options:
     file: str = ""  # name of the recording, for the report
     catalogue: tuple[Law, ...] = CATALOGUE
     rules: Rules = RULES  # every number that decides
+    memory: FitMemory[Any] | None = None  # of the same recording's earlier diagnoses
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
-from sprung.model.diagnosis.rules import PlausibleRules
+from sprung.model.diagnosis.rules import PlausibleRules, Rules
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
@@ -43,14 +43,23 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
-    state = _begun(system, record, options, tell)
+    return concluded(with_findings(begun(system, record, options, tell), tell), tell)
+
+
+def with_findings(state: Investigation, tell: Progress) -> Investigation:
+    """Finding after finding until the rest is noise."""
     # what a delay, scale or position leaves, estimated as it is, is no physics
     uncertain = any(fault.value is not None for fault in state.setup_faults)
-    for number in range(0 if uncertain else options.most_findings):
+    for number in range(0 if uncertain else state.options.most_findings):
         count = len(state.found)
         state = _next_finding(state, number, tell)
         if len(state.found) == count:
             break
+    return state
+
+
+def concluded(state: Investigation, tell: Progress) -> Outcome:
+    """The model on the whole recording, its errors on the held-out part, and the verdict."""
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
     before, after = state.held.runs(state.base.point, state.fit.point)
@@ -58,7 +67,17 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
     return Outcome(state, final, before, after, noisy, judged(state, before, after, noisy))
 
 
-def _begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
+def under(state: Investigation, rules: Rules) -> Investigation:
+    """An investigation that has begun, to go on under other rules."""
+    return replace(
+        state,
+        options=replace(state.options, rules=rules),
+        problem=replace(state.problem, rules=rules),
+        held=replace(state.held, rules=rules),
+    )
+
+
+def begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
     """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
     tell(0.02, "channels and noise")
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)

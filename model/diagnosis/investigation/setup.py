@@ -128,7 +128,9 @@ def _best(
     for hypothesis in ranked:
         changed, mended = hypothesis.undo(system, signals)
         try:
-            other, again = baseline(changed, mended, declared, fitted_samples(signals, mended, split), problem.rules)
+            other, again = baseline(
+                changed, mended, declared, fitted_samples(signals, mended, split), problem.rules, problem.memory
+            )
         except (ValueError, FloatingPointError):
             continue
         left = float(np.sum(misfit(again)))
@@ -167,7 +169,7 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
             undo = _move_sensor(fault.location, fault.axis, change)
         system, mended = undo(system, signals)
         split, signals = fitted_samples(signals, mended, split), mended
-        problem, fit = baseline(system, signals, declared, split, problem.rules)
+        problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory)
     left = float(np.sum(misfit(fit)))
     std = shown.value_deviation(fault.effect, at, fit) * (value if fault.effect == "wrong_scale" else 1.0)
     if fault.effect == "wrong_position":
