@@ -40,7 +40,9 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "row_minimum",
     ),
     "phase": ("magnitude", "phase", "balance", "guess"),
-    "features": ("PE_magnitudes", "PE_raw", "PE_unseen_magnitudes", "PE_unseen_raw"),
+    "features": (
+        "PE_training_magnitudes", "PE_magnitudes", "PE_unseen_magnitudes", "PE_training_raw", "PE_raw", "PE_unseen_raw",
+    ),
 }  # fmt: skip
 
 

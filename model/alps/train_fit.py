@@ -147,11 +147,16 @@ class SensorAutoencoder(nn.Module):
         log_ratio = self.estimator(torch.log1p(magnitudes(chart))).double()
         if nominal:
             log_ratio = torch.zeros_like(log_ratio)
-        measured, simulated = self.simulator.simulate(log_ratio, knots, states[:, 0].double())
+        measured, simulated = self.follow(log_ratio, knots, states)
         if self.decoder is None:
+            assert measured is not None
             return encoded, log_ratio, simulated, measured / self.scale
         seen = torch.cat([self.task.to_chart(simulated), drive], dim=-1)
         return encoded, log_ratio, simulated, self.decoder(seen, observations / self.scale)
+
+    def follow(self, log_ratio: Tensor, knots: Tensor, states: Tensor) -> tuple[Tensor | None, Tensor]:
+        """What the sensors show (B, T, 12) and the states (B, T, 18) from the first of the encoded states."""
+        return self.simulator.simulate(log_ratio, knots, states[:, 0].double())
 
 
 def halves(data: TrainData) -> tuple[Tensor, Tensor]:
@@ -191,14 +196,15 @@ def fit(
         starts = torch.from_numpy(rng.integers(STEPS - WINDOW + 1, size=config.batch))
         torch.manual_seed(config.seed * 1_000_003 + run.step)
         run.rate(config.updates)
-        run.update(_loss(model, data, rows, starts, config, run.step), config.longest_gradient)
+        run.update(loss_of(model, data, rows, starts, config, run.step), config.longest_gradient)
         _shrink(model, run.optimiser.param_groups[0]["lr"] * config.decay)
         if run.step == config.updates:
             run.save()
     return model.eval()
 
 
-def _loss(model: nn.Module, data: TrainData, rows: Tensor, starts: Tensor, config: TrainConfig, step: int) -> Tensor:
+def loss_of(model: nn.Module, data: TrainData, rows: Tensor, starts: Tensor, config: TrainConfig, step: int) -> Tensor:
+    """The method's loss on windows (rows, starts), both (B,), at an update."""
     measured, known = windows(data.measured, starts, rows), windows(data.known, starts, rows)
     if isinstance(model, StateEstimator):
         _, simulated = model(measured, known)

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import torch
 
-from sprung.benchmarks import paper
+from sprung.benchmarks import paper, physics_overhead
 from sprung.benchmarks.bounds import shared_bound
-from sprung.benchmarks.physics_overhead import _stepwise
-from sprung.model.alps import fit, mass_spring_damper, train_fit, two_body
+from sprung.benchmarks.physics_overhead import stepwise
+from sprung.model.alps import fit, mass_spring_damper, pendulum, train_fit, two_body
 from sprung.model.alps.config import NetworkConfig, Phase, TrainingConfig, training_config
 from sprung.model.alps.evaluate import every_window, predict, state_figures, symmetry
 from sprung.model.alps.fit import OutOfTime, Split, TimeLimit
 from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import tempered
-from sprung.model.alps.task import WINDOW
+from sprung.model.alps.task import WINDOW, Task
 from sprung.model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
 from sprung.model.identification.refine import Refiner
 from sprung.model.simulate.linear import LinearSimulator
@@ -251,14 +251,27 @@ def test_the_readout_is_the_best_map_and_its_gradient_that_of_what_no_map_explai
     torch.testing.assert_close(kept[0], torch.from_numpy(best[0]), rtol=1e-4, atol=1e-6)
 
 
-def test_torchdiffeq_and_the_exact_solution_agree() -> None:
-    task = mass_spring_damper.TASK
+@pytest.mark.parametrize("task", [mass_spring_damper.TASK, pendulum.TASK, two_body.TASK], ids=lambda task: task.name)
+def test_torchdiffeq_and_our_solutions_agree(task: Task) -> None:
     drawn = task.sample(2, np.random.default_rng(0), task.seen)
     args = drawn.states[:, 0], drawn.parameters, drawn.inputs[:, :30]
-    exact = task.simulate(*args)
+    ours = task.simulate(*args)
     for method, tolerance in (("dopri5", 1e-3), ("rk4", 0.03)):
-        error = (_stepwise(method).simulate(*args) - exact) / torch.tensor(task.state_scale)
+        error = task.difference(stepwise(task, method).simulate(*args), ours) / torch.tensor(task.state_scale)
         assert float(error.abs().max()) < tolerance
+
+
+def test_what_physics_costs_is_measured_for_the_train_too() -> None:
+    rows = list(physics_overhead.run("quick", system="train", batch=2))
+    assert [row["method"] for row in rows] == [
+        "autoencoder",
+        "alps_torchdiffeq_dopri5",
+        "alps_torchdiffeq_rk4",
+        "alps_ours",
+    ]
+    assert rows[0]["over_autoencoder"] == 0 and all(row["seconds_per_update"] > 0 for row in rows)
+    with pytest.raises(UserError, match="trian"):
+        next(physics_overhead.run("quick", system="trian"))
 
 
 def test_the_bench_says_what_it_does_not_know() -> None:
