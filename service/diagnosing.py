@@ -6,8 +6,10 @@ stop can interrupt it.
 
 from __future__ import annotations
 
+import math
 import threading
-from dataclasses import dataclass
+import time
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +23,8 @@ from sprung.service.ring import Excerpt
 from sprung.service.threads import hand_over_often, one_thread_each
 from sprung.service.worker import Emit
 
-SIGN_OF_LIFE_SECONDS = 10.0  # a stage may take longer
+SIGN_OF_LIFE_SECONDS = 2.0  # a stage may take longer
+STAGE_SHARE, STAGE_SECONDS = 0.1, 20.0  # a stage's usual part of the whole, and how soon most of it is done
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +61,11 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     from sprung.model.diagnosis.api import Options, diagnose
     from sprung.service.report import write_report
 
-    latest = Stage(0.0, "reading")
+    latest, begun = Stage(0.0, "reading"), time.monotonic()
 
     def show(share: float, text: str) -> None:
-        nonlocal latest
+        nonlocal latest, begun
+        begun = time.monotonic()
         latest = Stage(share, text)
         emit(latest)
 
@@ -69,7 +73,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
 
     def live() -> None:
         while not done.wait(SIGN_OF_LIFE_SECONDS):
-            emit(latest)
+            emit(within(latest, time.monotonic() - begun))
 
     threading.Thread(target=live, daemon=True).start()
     try:
@@ -82,6 +86,11 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
         raise ValueError(str(error).replace(str(request.path), request.name)) from error
     finally:
         done.set()
+
+
+def within(stage: Stage, seconds: float) -> Stage:
+    """How far a stage probably is after so many seconds: how long stages take is not known, only that they move."""
+    return replace(stage, share=min(0.99, stage.share + STAGE_SHARE * (1 - math.exp(-seconds / STAGE_SECONDS))))
 
 
 def _load(request: DiagnosisRequest) -> Record:

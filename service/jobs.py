@@ -49,6 +49,7 @@ class Progress:
         self._deadline = time.monotonic() + seconds
         self._noted = -PROGRESS_SECONDS
         self._shown = 0.0
+        self._reached = 0.0
 
     def cancel(self) -> None:
         """Make the next `check` raise."""
@@ -62,14 +63,15 @@ class Progress:
             raise Cancelled
         if time.monotonic() > self._deadline:
             raise UserError(f"the job took longer than {self._seconds:.0f} s")
+        now = time.monotonic()
+        if self._reached >= self._shown + 0.01 and now - self._noted >= PROGRESS_SECONDS:
+            self._shown, self._noted = self._reached, now
+            self._note(self._shown)
 
     def step(self, share: float) -> None:
-        """`share` of the work is done, 0..1; checks as `check` does."""
+        """`share` of the work is done, 0..1; it is noted now or, when the last note is young, by a later check."""
+        self._reached = max(self._reached, min(share, 1.0))
         self.check()
-        now = time.monotonic()
-        if share >= self._shown + 0.01 and now - self._noted >= PROGRESS_SECONDS:
-            self._shown, self._noted = share, now
-            self._note(min(share, 1.0))
 
 
 Handler = Callable[[work.JobRow, Progress], dict[str, Any]]

@@ -27,6 +27,7 @@ from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
 from sprung.service.live import LiveFeed
+from sprung.service.lock import held
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
 from sprung.service.store.work import add_recording
@@ -59,6 +60,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     """
     engine = load_engine(settings)
     with ExitStack() as stack:
+        stack.enter_context(held(settings.data_dir))
         listening = stack.enter_context(_listen(settings))
         core = build_core(settings, engine)
         stack.callback(core.close)

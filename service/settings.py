@@ -67,6 +67,7 @@ class Settings(BaseSettings):
     recording_seconds: float = Field(default=7200.0, gt=0)  # that reading an upload may take in all
     reading_silence_seconds: float = Field(default=60.0, gt=0)  # that it may go on without any sample
     diagnosis_seconds: float = Field(default=600.0, gt=0)
+    isolate_reading: bool = True  # commands, too, read recordings in a process of their own
     worker_memory_bytes: int = Field(default=4_000_000_000, gt=0)  # of a process that reads an upload or diagnoses
     batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction
 
@@ -79,6 +80,7 @@ class Settings(BaseSettings):
 
     public_url: str = ""  # where people reach the pages, as in https://sprung.example.org; for links in notifications
     webhooks: str = ""  # URLs that events are posted to, separated by spaces
+    webhook_networks: str = ""  # that receivers may lie in beside public addresses, as in 10.0.0.0/8 127.0.0.0/8
     webhook_secret: str | None = None  # signs them (Standard Webhooks); whsec_... or any text
     mail_to: str = ""  # addresses that events are mailed to, separated by spaces
     mail_from: str = "sprung@localhost"

@@ -49,6 +49,7 @@ class ProcessLimits:
     seconds: float  # in all, waiting for the parent included
     memory_bytes: int | None = None  # private memory; None: as much as there is
     cpu_seconds: int | None = None  # of processor time
+    niceness: int = 10  # how far it stands back behind others
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +202,7 @@ def end_with_parent(lifeline: Connection, parent: int) -> None:
 def be_modest(limits: ProcessLimits) -> None:
     """Low priority, first to go when memory runs out, and bounds of the kernel's where the platform has them."""
     with suppress(OSError, AttributeError):
-        os.nice(10)
+        os.nice(limits.niceness)
     with suppress(OSError), open("/proc/self/oom_score_adj", "w", encoding="ascii") as target:
         target.write("900")
     with suppress(ImportError, ValueError, OSError):

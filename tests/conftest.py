@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from sprung.service.engine import Engine, make_tracker
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
 from tests.service_fakes import FakeIdentifier
+
+# a process for every file that a test reads would cost a second each; tests/service/test_apart.py has them
+os.environ.setdefault("SPRUNG_ISOLATE_READING", "false")
 
 
 @pytest.fixture(scope="session")

@@ -13,11 +13,11 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.laws.own import load_laws
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
 from sprung.replay.record import Record
+from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
 from sprung.service.diagnosing import load_excerpt
 from sprung.service.improved import write_improved
-from sprung.service.opening import open_record
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def load(file: Path, system: System, dbc: Path | None, start: int | None = None)
     """A recording on one even grid; or an excerpt that the service saved."""
     if file.suffix == ".npz":
         return load_excerpt(file)
-    return open_record(file, system, dbc, start)
+    return apart.load(apart.RecordRequest(file, system.channels, system.sample_rate, dbc, system.time, start))
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:

@@ -12,8 +12,9 @@ from rich.table import Table
 from sprung.model.signals import TimeColumn
 from sprung.model.system import load_system
 from sprung.model.units import FACTORS, known
-from sprung.replay.inspection import Inspection, Signal, inspect
+from sprung.replay.inspection import Inspection, Signal
 from sprung.replay.skeleton import skeleton
+from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
 from sprung.service.errors import UserError
 from sprung.service.times import to_iso
@@ -32,7 +33,7 @@ def run(
 ) -> int:
     """Print what is in a recording; 1 when some of it could not be read."""
     time, said = _time(system_file, column, unit, rate)
-    found = inspect(file, dbc, time)
+    found = apart.look(apart.InspectionRequest(file, dbc, time))
     if write_system is not None:
         _write(write_system, skeleton(found, file.stem, said))
     if json_lines:

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+from sprung.service.cli.apart import own_limits
 from sprung.service.cli.console import parameter_table, print_table, progress, width_of_output
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import spooled
@@ -23,6 +24,7 @@ from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.views import VehicleView, alarm_dict, load_parameters, vehicle_view, window_dict
+from sprung.service.worker import Limits
 
 
 def run(
@@ -57,7 +59,17 @@ def run(
         pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
         for named in files:
             path = spooled(named, stack)
-            fed = _replay(pipeline, opened, path, vehicle, speed, settings.batch_windows, began, json_lines)
+            fed = _replay(
+                pipeline,
+                opened,
+                path,
+                vehicle,
+                speed,
+                settings.batch_windows,
+                own_limits(settings, path),
+                began,
+                json_lines,
+            )
             status = max(status, _report(pipeline, path, fed, json_lines))
     return status
 
@@ -75,6 +87,7 @@ def _replay(
     vehicle: str | None,
     speed: float,
     batch_windows: int,
+    limits: Limits | None,
     start: int | None,
     json_lines: bool,
 ) -> Fed:
@@ -103,6 +116,7 @@ def _replay(
             batch_windows=batch_windows,
             speed=speed,
             start=start,
+            limits=limits,
             on_batch=on_batch,
         )
     finish_row(store, row, fed)

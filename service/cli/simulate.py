@@ -12,9 +12,9 @@ from sprung.model.laws import CATALOGUE, Law
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
+from sprung.service.cli import apart
 from sprung.service.comparison import Comparison, compare
 from sprung.service.errors import UserError
-from sprung.service.opening import open_record
 
 
 def simulate(
@@ -34,7 +34,7 @@ def simulate(
         raise UserError(f"{out}: is the file that the inputs come from")
     system = load_system(system_file, catalogue)
     database = dbc or (MANCHESTER_DBC if system_file == MANCHESTER else None)
-    record = open_record(inputs, system, database)
+    record = apart.load(apart.RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
     driven = record.values[:, : len(system.inputs)]
     ride = simulate_ride(
         system, driven, dict(map(_setting, settings)), noise=np.random.default_rng(seed) if noise else None

@@ -5,6 +5,8 @@ An attempt that fails is made again after 5 s, 30 s, 2 min, ... for about two da
 
 from __future__ import annotations
 
+import http.client
+import ipaddress
 import logging
 import smtplib
 import threading
@@ -15,6 +17,7 @@ from typing import Any
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.service import outside
 from sprung.service.errors import UserError
 from sprung.service.live import FeedStatus
 from sprung.service.notify import events, senders
@@ -43,6 +46,7 @@ class Notices:
         self._feeds = feeds
         self._working: dict[str, bool] = {}
         self._targets = receivers(settings)
+        self._allowed = outside.networks(settings.webhook_networks)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-notify", daemon=True)
 
@@ -95,9 +99,9 @@ class Notices:
             if row.target.startswith("mailto:"):
                 senders.mail(self._settings, row.target.removeprefix("mailto:"), row.event)
             else:
-                senders.post(row.target, row.event, self._settings.webhook_secret)
+                senders.post(row.target, row.event, self._settings.webhook_secret, self._allowed)
             values: dict[str, Any] = {"state": "delivered", "error": None}
-        except (OSError, ValueError, smtplib.SMTPException) as error:
+        except (OSError, ValueError, smtplib.SMTPException, http.client.HTTPException) as error:
             line = " ".join(str(error).split())[:300] or type(error).__name__
             dead = row.attempts >= len(PAUSES)
             pause = PAUSES[min(row.attempts, len(PAUSES) - 1)]
@@ -131,8 +135,10 @@ def receivers(settings: Settings) -> tuple[str, ...]:
     """Webhooks, then mail addresses as mailto:.  Raises UserError for one that cannot be."""
     found = []
     for url in settings.webhooks.replace(",", " ").split():
-        if not url.startswith(("http://", "https://")) or len(url) > 300:
-            raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {url[:80]!r} is no http:// or https:// URL")
+        try:
+            _plainly_allowed(outside.safe_url(url).host, outside.networks(settings.webhook_networks))
+        except ValueError as error:
+            raise UserError(f"setting webhooks (SPRUNG_WEBHOOKS): {error}") from None
         found.append(url)
     for address in settings.mail_to.replace(",", " ").split():
         if "@" not in address.strip("@") or len(address) > 250:
@@ -141,3 +147,14 @@ def receivers(settings: Settings) -> tuple[str, ...]:
     if settings.mail_to and not settings.smtp_host:
         raise UserError("setting smtp_host (SPRUNG_SMTP_HOST) is needed to send mail to SPRUNG_MAIL_TO")
     return tuple(found)
+
+
+def _plainly_allowed(host: str, allowed: tuple[outside.Network, ...]) -> None:
+    """A host that is written as an address is judged at the start; names when they are called."""
+    try:
+        address = ipaddress.ip_address(host)
+    except ValueError:
+        return
+    wrong = outside.judged(address, allowed)
+    if wrong is not None:
+        raise outside.ForbiddenAddress(wrong)

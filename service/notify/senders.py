@@ -9,11 +9,11 @@ import json
 import smtplib
 import ssl
 import time
-import urllib.error
-import urllib.request
+from collections.abc import Sequence
 from email.message import EmailMessage
 from typing import Any
 
+from sprung.service import outside
 from sprung.service.notify.events import sentence
 from sprung.service.settings import Settings
 
@@ -21,28 +21,16 @@ SECONDS = 10.0
 SUCCESS = range(200, 300)
 
 
-class _NoRedirects(urllib.request.HTTPRedirectHandler):
-    """A receiver that moved must be told of in the settings: signed events do not follow anybody's pointer."""
+def post(url: str, event: dict[str, Any], secret: str | None, allowed: Sequence[outside.Network] = ()) -> None:
+    """CloudEvents in structured mode, signed as Standard Webhooks (standardwebhooks.com) has it.
 
-    def redirect_request(self, *_: Any, **__: Any) -> None:
-        return None
-
-
-_opener = urllib.request.build_opener(_NoRedirects)
-
-
-def post(url: str, event: dict[str, Any], secret: str | None) -> None:
-    """CloudEvents in structured mode, signed as Standard Webhooks (standardwebhooks.com) has it."""
+    allowed: networks that may be called although they are not public.  A receiver that moved must be told of in the
+    settings: signed events do not follow anybody's pointer.
+    """
     body = json.dumps(event, allow_nan=False).encode()
     headers = {"Content-Type": "application/cloudevents+json", "User-Agent": "sprung"}
     headers |= signature(event["id"], int(time.time()), body, secret)
-    request = urllib.request.Request(url, body, headers, method="POST")
-    try:
-        with _opener.open(request, timeout=SECONDS) as answer:
-            status = answer.status
-    except urllib.error.HTTPError as error:
-        with error:
-            status = error.code
+    status = outside.post(url, body, headers, allowed, SECONDS)
     if status not in SUCCESS:
         raise ValueError(f"the receiver answered {status}")
 

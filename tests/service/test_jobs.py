@@ -14,6 +14,7 @@ from sqlalchemy.exc import OperationalError
 
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
+from sprung.service.diagnosing import Stage, within
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.jobs import Jobs, Kind, Progress
@@ -203,3 +204,28 @@ def test_a_cancelled_reading_ends_with_its_reason(store: Store) -> None:
     progress = Progress(lambda share: None, threading.Event(), seconds=-1.0)
     with pytest.raises(UserError, match="took longer"):
         progress.check()
+
+
+def test_progress_that_comes_too_soon_after_the_last_is_noted_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    noted: list[float] = []
+    progress = Progress(noted.append, threading.Event(), seconds=1000.0)
+    progress.step(0.02)
+    now[0] += 0.01
+    progress.step(0.05)
+    assert noted == [0.02]
+    now[0] += 2
+    progress.check()
+    progress.check()
+    assert noted == [0.02, 0.05]
+    progress.step(0.04)  # never backwards
+    now[0] += 2
+    progress.check()
+    assert noted == [0.02, 0.05]
+
+
+def test_a_long_stage_of_a_diagnosis_moves_and_never_ends_before_it_does() -> None:
+    shares = [within(Stage(0.05, "screening"), seconds).share for seconds in (0, 2, 10, 60, 600)]
+    assert shares == sorted(shares) and shares[0] == 0.05 and shares[1] > 0.055 and shares[-1] <= 0.15
+    assert within(Stage(0.95, "report"), 1e6).share <= 0.99

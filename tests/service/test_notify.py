@@ -71,7 +71,11 @@ def receiver(received: Received) -> Iterator[str]:
 @pytest.fixture
 def core(engine: Engine, tmp_path: Path, receiver: str) -> Core:
     settings = Settings(
-        data_dir=tmp_path, webhooks=receiver, webhook_secret=SECRET, public_url="https://sprung.example.org"
+        data_dir=tmp_path,
+        webhooks=receiver,
+        webhook_networks="127.0.0.0/8",
+        webhook_secret=SECRET,
+        public_url="https://sprung.example.org",
     )
     return build_core(settings, engine)
 
@@ -186,7 +190,7 @@ def test_a_lost_bus_is_told_once_and_told_when_it_is_back(tmp_path: Path, store:
         detail: str = "no such device"
 
     feed = Feed()
-    settings = Settings(data_dir=tmp_path, webhooks="http://127.0.0.1:1/")
+    settings = Settings(data_dir=tmp_path, webhooks="http://127.0.0.1:1/", webhook_networks="127.0.0.0/8")
     notices = Notices(settings, store, lambda: [feed])  # type: ignore[list-item,return-value]
     for works in (True, False, False, True):
         feed.works = works

@@ -1,0 +1,89 @@
+"""Files are read in a process of their own, with bounds: one that was made to do harm costs its own reading."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import TypeVar
+
+from sprung.model.signals import Channel, TimeColumn
+from sprung.replay.inspection import Inspection, inspect
+from sprung.replay.record import Record, load_record
+from sprung.service.recordings import SLOWEST_BYTES_PER_SECOND
+from sprung.service.settings import Settings, settings_with
+from sprung.service.worker import Emit, Limits, Task, Worker
+
+Request = TypeVar("Request")
+Result = TypeVar("Result")
+
+
+@dataclass(frozen=True, slots=True)
+class RecordRequest:
+    """A recording to load in one piece."""
+
+    path: Path
+    channels: tuple[Channel, ...]
+    sample_rate: float
+    dbc: Path | None
+    time: TimeColumn
+    start: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class InspectionRequest:
+    """A file to look into."""
+
+    path: Path
+    dbc: Path | None
+    time: TimeColumn
+
+
+def own_limits(settings: Settings, path: Path) -> Limits | None:
+    """What reading a file that the user names may use; None: it is read here, as the settings say.
+
+    However long it takes: people see that it goes on, and can end it.  Processor time goes with the size.
+    """
+    if not settings.isolate_reading:
+        return None
+    seconds = 60 + path.stat().st_size // SLOWEST_BYTES_PER_SECOND
+    return Limits(inf, inf, settings.worker_memory_bytes, seconds, niceness=0)
+
+
+def load(request: RecordRequest) -> Record:
+    """The record.  Raises UnreadableRecording, or UserError where the bounds are exceeded."""
+    return _apart(load_task, request, request.path)
+
+
+def look(request: InspectionRequest) -> Inspection:
+    """What is in the file.  Raises as `load`."""
+    return _apart(inspect_task, request, request.path)
+
+
+def load_task(request: RecordRequest, _emit: Emit[None]) -> Record:
+    """In the other process."""
+    return load_record(
+        request.path,
+        request.channels,
+        request.sample_rate,
+        dbc=request.dbc,
+        time=request.time,
+        start=request.start,
+    )
+
+
+def inspect_task(request: InspectionRequest, _emit: Emit[None]) -> Inspection:
+    """In the other process."""
+    return inspect(request.path, request.dbc, request.time)
+
+
+def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:
+    with open(path, "rb"):  # an absent file is told without a process
+        pass
+    limits = own_limits(settings_with({}), path)
+    if limits is None:
+        return task(request, lambda _message: None)
+    worker: Worker[None, Result] = Worker(task, request, limits, f"the reading of {path.name}")
+    for _ in worker.messages():
+        pass
+    return worker.result
