@@ -12,6 +12,7 @@ from typing import Any
 from sqlalchemy import Connection
 
 from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
+from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.engine import Engine
 from sprung.service.errors import Busy, UserError
 from sprung.service.jobs import Jobs, Progress
@@ -141,7 +142,9 @@ class DiagnosisJobs:
             for stage in worker.messages(progress.check):
                 progress.step(0.99 * stage.share)
             shutil.rmtree(final, ignore_errors=True)
+            sync_tree(part)  # the report is announced by the store: a power cut must not leave it without its page
             part.rename(final)
+            sync_folder(final.parent)
         finally:
             shutil.rmtree(part, ignore_errors=True)
         return worker.result

@@ -18,6 +18,7 @@ import numpy as np
 from sprung.model.system import System
 from sprung.replay.account import Account
 from sprung.replay.record import Record
+from sprung.service.durable import sync_file, sync_folder
 from sprung.service.opening import open_record
 from sprung.service.ring import Excerpt
 from sprung.service.threads import hand_over_often, one_thread_each
@@ -105,7 +106,9 @@ def save_excerpt(path: Path, excerpt: Excerpt) -> None:
     part = path.with_name(f"{path.name}.part")
     with open(part, "wb") as target:
         np.savez_compressed(target, start=excerpt.start, sample_rate=excerpt.sample_rate, values=excerpt.values)
+    sync_file(part)
     part.replace(path)
+    sync_folder(path.parent)
 
 
 def load_excerpt(path: Path) -> Record:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,6 +17,7 @@ from sprung.replay.recording import EXTENSIONS
 from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.condition import free_bytes
+from sprung.service.durable import sync_folder
 from sprung.service.errors import NoSpace
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
@@ -216,16 +216,6 @@ def known_extension(label: str) -> str:
         detail = f"has no known extension; known are {' '.join(EXTENSIONS)}"
         raise ApiProblem(415, f"file {detail}", [{"field": "file", "detail": detail}], {"Connection": "close"})
     return extension
-
-
-def sync_folder(folder: Path) -> None:
-    """Make the names in a folder last through a power cut, where the platform can."""
-    with suppress(OSError):
-        number = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 def discard(settings: Settings, row: RecordingRow) -> None:

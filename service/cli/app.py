@@ -365,6 +365,33 @@ def retention(
     return run(dry_run, store)
 
 
+DataDir = Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As of sprung serve.")]
+
+
+@app.command()
+def backup(
+    target: Annotated[Path, typer.Argument(help="Back-up to write, as in sprung-2026-09-21.tar.", metavar="FILE")],
+    data_dir: DataDir = None,
+    store: StoreUrl = None,
+) -> int:
+    """Back up store, uploads and reports into one file; the service may run meanwhile."""
+    from sprung.service.cli.backup import run
+
+    return run(target, data_dir, store)
+
+
+@app.command()
+def restore(
+    source: Annotated[Path, typer.Argument(help="Back-up that `sprung backup` wrote.", metavar="FILE")],
+    data_dir: DataDir = None,
+    store: StoreUrl = None,
+) -> int:
+    """Put a back-up into a data folder that has no store yet."""
+    from sprung.service.cli.backup import restore as run
+
+    return run(source, data_dir, store)
+
+
 token = typer.Typer(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
 app.add_typer(token, name="token")
 
