@@ -1,4 +1,4 @@
-"""Clients of a service that is killed: each sends, writes down what was acknowledged, and goes on after the next start."""
+"""Clients of a service that is killed: each notes what was acknowledged and goes on after the next start."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.trust_ride import Ride
+from sprung.benchmarks.trust_ride import RestlessRide
 
 UPLOAD_SECONDS = 20.0  # of a recording
 TIMEOUT = 30.0
@@ -30,10 +30,10 @@ class Ledger:
             file.write(json.dumps(entry) + "\n")
 
 
-class Client(threading.Thread):
+class RestlessClient(threading.Thread):
     """Acts again and again against whatever service is at `port`."""
 
-    def __init__(self, ledger: Ledger, ride: Ride) -> None:
+    def __init__(self, ledger: Ledger, ride: RestlessRide) -> None:
         super().__init__(daemon=True)
         self.port: int | None = None
         self.ledger = ledger
@@ -75,7 +75,7 @@ class Client(threading.Thread):
             connection.close()
 
 
-class Windows(Client):
+class Windows(RestlessClient):
     """One window after the other to POST /identify."""
 
     def act(self) -> bool:
@@ -88,10 +88,10 @@ class Windows(Client):
         return status == 200
 
 
-class Files(Client):
+class Files(RestlessClient):
     """One recording after the other, to be read or to be diagnosed; the next when the last one is done with."""
 
-    def __init__(self, ledger: Ledger, ride: Ride, route: str, vehicle: str) -> None:
+    def __init__(self, ledger: Ledger, ride: RestlessRide, route: str, vehicle: str) -> None:
         super().__init__(ledger, ride)
         self._route = route
         self._vehicle = vehicle

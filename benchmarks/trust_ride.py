@@ -17,7 +17,7 @@ START_SECONDS = 1_790_000_000
 ROAD, BAND = 0.004, (0.5, 25.0)  # m, rms of the road; Hz
 
 
-class Ride:
+class RestlessRide:
     """The same drive again and again: a periodic random road, at other times."""
 
     def __init__(self, seconds: float = 20.0, seed: int = 1) -> None:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import ctypes
 import http.client
-import os
-import signal
 import socket
 import sqlite3
 import subprocess
@@ -15,32 +12,36 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.trust_clients import UPLOAD_SECONDS, Client, Files, Ledger, Windows
-from sprung.benchmarks.trust_ride import SYSTEM_FILE, Ride
+from sprung.benchmarks.trust_clients import UPLOAD_SECONDS, Files, Ledger, RestlessClient, Windows
+from sprung.benchmarks.trust_ride import SYSTEM_FILE, RestlessRide
+from sprung.benchmarks.trust_zygote import Forked, Zygote, alive, end_with_parent
 
 READY_SECONDS = 240.0
 SETTLE_SECONDS = 600.0
-PR_SET_PDEATHSIG = 1
-
-
-def end_with_parent() -> None:
-    """In a new process: end when the benchmark does, however that ends."""
-    with suppress(OSError, AttributeError):
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class Served:
-    """A `sprung serve` in a process of its own; `before`: words of a command that runs it, as strace does."""
+    """A `sprung serve` in a process of its own."""
 
-    def __init__(self, folder: Path, before: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, folder: Path, zygote: Zygote | None = None, *, before: tuple[str, ...] = (), system: Path = SYSTEM_FILE
+    ) -> None:
+        """zygote: forks it; else it is started, by `before` where that is given (as strace does)."""
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             self.port: int = probe.getsockname()[1]
-        command = [*before, sys.executable, "-m", "sprung", "serve", "--port", str(self.port)]
-        command += ["--data-dir", str(folder), "--system", str(SYSTEM_FILE)]
-        self.process = subprocess.Popen(
-            command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, preexec_fn=end_with_parent
+        self._traced = bool(before)
+        arguments = ["serve", "--port", str(self.port), "--data-dir", str(folder), "--system", str(system)]
+        if zygote is not None:
+            self.process: Forked = zygote.command(*arguments)
+            return
+        started = subprocess.Popen(
+            [*before, sys.executable, "-m", "sprung", *arguments],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            preexec_fn=end_with_parent,  # noqa: PLW1509 (one system call)
         )
+        self.process = Forked(started.pid)
 
     def __enter__(self) -> Served:
         return self
@@ -51,7 +52,7 @@ class Served:
     def ready(self) -> float:
         """Seconds until it answers."""
         begun = time.monotonic()
-        while time.monotonic() - begun < READY_SECONDS and self.process.poll() is None:
+        while time.monotonic() - begun < READY_SECONDS and self.process.alive:
             try:
                 connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=5)
                 connection.request("GET", "/health/ready")
@@ -64,11 +65,12 @@ class Served:
     def kill(self) -> int:
         """SIGKILL; the number of its children that are still there ten seconds later."""
         children = _children(self.process.pid)
-        if self.process.poll() is None:
-            os.kill(self.process.pid, signal.SIGKILL)
-        self.process.wait()
+        if self._traced and children:  # the service is the tracer's child, and would outlive it
+            Forked(children[0]).kill()
+            self.process.wait(30.0)
+        self.process.kill()
         deadline = time.monotonic() + 10
-        while (left := [pid for pid in children if _alive(pid)]) and time.monotonic() < deadline:
+        while (left := [pid for pid in children if alive(pid)]) and time.monotonic() < deadline:
             time.sleep(0.05)
         return len(left)
 
@@ -81,14 +83,7 @@ def _children(pid: int) -> list[int]:
     return found
 
 
-def _alive(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def clients(folder: Path, ride: Ride) -> list[Client]:
+def clients(folder: Path, ride: RestlessRide) -> list[RestlessClient]:
     """Windows, recordings and diagnoses, with their ledgers in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     return [
@@ -98,7 +93,7 @@ def clients(folder: Path, ride: Ride) -> list[Client]:
     ]
 
 
-def settled(port: int, senders: list[Client]) -> None:
+def settled(port: int, senders: list[RestlessClient]) -> None:
     """Wait until every acknowledged job has ended."""
     deadline = time.monotonic() + SETTLE_SECONDS
     for sender in senders[1:]:
@@ -110,7 +105,7 @@ def settled(port: int, senders: list[Client]) -> None:
             time.sleep(0.3)
 
 
-def audit(data: Path, ledgers: Path, ride: Ride) -> dict[str, Any]:
+def audit(data: Path, ledgers: Path, ride: RestlessRide) -> dict[str, Any]:
     """What became of everything that was acknowledged; the store must be at rest."""
     windows, uploads, diagnoses = (
         Ledger(ledgers / f"{name}.jsonl").entries for name in ("windows", "recordings", "diagnoses")

@@ -12,7 +12,7 @@ from sprung.replay.inspection import Inspection, inspect
 from sprung.replay.record import Record, load_record
 from sprung.service.recordings import SLOWEST_BYTES_PER_SECOND
 from sprung.service.settings import Settings, settings_with
-from sprung.service.worker import Emit, Limits, Task, Worker
+from sprung.service.worker import Emit, ProcessLimits, Task, Worker
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")
@@ -39,7 +39,7 @@ class InspectionRequest:
     time: TimeColumn
 
 
-def own_limits(settings: Settings, path: Path) -> Limits | None:
+def own_limits(settings: Settings, path: Path) -> ProcessLimits | None:
     """What reading a file that the user names may use; None: it is read here, as the settings say.
 
     However long it takes: people see that it goes on, and can end it.  Processor time goes with the size.
@@ -47,7 +47,7 @@ def own_limits(settings: Settings, path: Path) -> Limits | None:
     if not settings.isolate_reading:
         return None
     seconds = 60 + path.stat().st_size // SLOWEST_BYTES_PER_SECOND
-    return Limits(inf, inf, settings.worker_memory_bytes, seconds, niceness=0)
+    return ProcessLimits(inf, inf, settings.worker_memory_bytes, seconds, niceness=0)
 
 
 def load(request: RecordRequest) -> Record:

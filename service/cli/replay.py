@@ -24,7 +24,7 @@ from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.views import VehicleView, alarm_dict, load_parameters, vehicle_view, window_dict
-from sprung.service.worker import Limits
+from sprung.service.worker import ProcessLimits
 
 
 def run(
@@ -87,7 +87,7 @@ def _replay(
     vehicle: str | None,
     speed: float,
     batch_windows: int,
-    limits: Limits | None,
+    limits: ProcessLimits | None,
     start: int | None,
     json_lines: bool,
 ) -> Fed:

@@ -1,0 +1,128 @@
+"""100 vehicles, each a window a second, through HTTP, tracked and stored: latencies, losses, memory."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import sqlite3
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sprung.benchmarks.serve import window_body
+from sprung.benchmarks.trust_service import Served
+from sprung.model.system import MANCHESTER, load_system
+
+VEHICLES, CONNECTIONS = 100, 16
+START_SECONDS = 1_790_000_000
+TARGET_SECONDS = 1.0
+WARM_UP = 0.2  # share of the time after which memory counts
+
+
+@dataclass
+class _Sent:
+    """What the clients saw."""
+
+    seconds: list[float] = field(default_factory=list)  # from when a window was due to its answer
+    late: int = 0  # windows that were sent a second or more after they were due
+    acknowledged: list[tuple[str, int]] = field(default_factory=list)
+    statuses: Counter[int] = field(default_factory=Counter)
+
+
+def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dict[str, Any]]:
+    """Figures of one run; every vehicle sends a window of one second each second."""
+    parts = window_body(load_system()).split(b'"bench"')
+    sent, memory = _Sent(), list[tuple[float, int]]()
+    with Served(folder / "load", system=MANCHESTER) as served:
+        served.ready()
+        begun = time.monotonic() + 1.0
+        ends = begun + 60 * minutes
+        threads = [
+            threading.Thread(
+                target=_drive, args=(served.port, parts, range(n, vehicles, CONNECTIONS), begun, ends, sent)
+            )
+            for n in range(CONNECTIONS)
+        ]
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            memory.append((time.monotonic() - begun, _resident(served.process.pid)))
+            time.sleep(1.0)
+        served.kill()
+    yield from _figures(folder / "load" / "sprung.db", sent, memory, minutes, vehicles)
+
+
+def _drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: _Sent) -> None:
+    """Windows of some vehicles, one after the other, each when it is due."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
+    second = 0
+    while (due := begun + second) < ends:
+        for vehicle in vehicles:
+            moment = due + vehicle / 100
+            time.sleep(max(0.0, moment - time.monotonic()))
+            sent.late += time.monotonic() - moment > 1.0
+            name = f"load-{vehicle}"
+            start = START_SECONDS + second
+            body = parts[0] + json.dumps(name).encode() + parts[1][:-1] + f', "start": "{start}"}}'.encode()
+            for _ in range(20):
+                status = _post(connection, body)
+                sent.statuses[status] += 1
+                if status == 200:
+                    sent.acknowledged.append((name, start * 1_000_000_000))
+                    break
+                time.sleep(0.2)
+            sent.seconds.append(time.monotonic() - moment)
+        second += 1
+    connection.close()
+
+
+def _post(connection: http.client.HTTPConnection, body: bytes) -> int:
+    try:
+        connection.request("POST", "/identify?track=true", body, {"content-type": "application/json"})
+        answer = connection.getresponse()
+        answer.read()
+        return answer.status
+    except (OSError, http.client.HTTPException):
+        connection.close()
+        return 0
+
+
+def _resident(pid: int) -> int:
+    """Bytes."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
+    except OSError:
+        return 0
+
+
+def _figures(
+    store: Path, sent: _Sent, memory: list[tuple[float, int]], minutes: float, vehicles: int
+) -> Iterator[dict[str, Any]]:
+    with closing(sqlite3.connect(store)) as opened:
+        stored = set(opened.execute("SELECT vehicle_id, start_ns FROM windows").fetchall())
+    asked = round(60 * minutes) * vehicles
+    yield {"figure": "windows due", "value": asked, "vehicles": vehicles, "minutes": minutes}
+    yield {"figure": "windows acknowledged", "value": len(sent.acknowledged), "statuses": dict(sent.statuses)}
+    yield {"figure": "acknowledged windows lost", "value": len(set(sent.acknowledged) - stored), "target": "0"}
+    low, high, worst = np.percentile(sent.seconds, [50, 99, 100])
+    yield {
+        "figure": "seconds from due to answered, p99",
+        "value": round(float(high), 3),
+        "p50": round(float(low), 3),
+        "worst": round(float(worst), 3),
+        "sent_a_second_late": sent.late,
+        "target": f"< {TARGET_SECONDS:g}",
+    }
+    warm = [size for second, size in memory if second > WARM_UP * 60 * minutes and size]
+    if len(warm) > 10:
+        tenth = max(1, len(warm) // 10)
+        first, last = np.median(warm[:tenth]), np.median(warm[-tenth:])
+        growth = round(100 * (float(last / first) - 1), 2)
+        yield {"figure": "growth of memory after warm-up", "value": growth, "unit": "%", "mb": round(float(last) / 1e6)}
