@@ -97,7 +97,7 @@ def test_a_name_that_changes_after_it_was_judged_is_not_asked_again(
 def asked() -> Iterator[tuple[int, list[str]]]:
     hosts: list[str] = []
 
-    class Handler(BaseHTTPRequestHandler):
+    class Elsewhere(BaseHTTPRequestHandler):
         def do_POST(self) -> None:
             hosts.append(f"{self.path} {self.headers['host']}")
             self.send_response(302)
@@ -107,7 +107,7 @@ def asked() -> Iterator[tuple[int, list[str]]]:
         def log_message(self, *_: Any) -> None:
             """Quiet."""
 
-    server = HTTPServer(("127.0.0.1", 0), Handler)
+    server = HTTPServer(("127.0.0.1", 0), Elsewhere)
     threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
     yield server.server_port, hosts
     server.shutdown()
