@@ -31,6 +31,7 @@ def test_dry_friction_is_found_named_and_sized():
     assert report.augmented_validation.nrmse < report.baseline_validation.nrmse
     assert report.explained is not None and report.explained > 0.9
     assert "dry friction" in first.sentence
+    assert first.look_alikes["bouc_wen"] > 20  # odds against what similar data may suggest
 
 
 def test_what_a_recording_does_not_tell_apart_is_called_a_family():

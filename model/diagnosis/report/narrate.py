@@ -277,6 +277,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             family=family,
             advice=advice,
             parameter_covariance=block,
+            look_alikes=_beaten(found),
         )
         findings.append(replace(finding, sentence=_sentence(outcome, term, finding)))
     return findings
@@ -297,6 +298,16 @@ def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | No
         return None, None
     names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
     return names, f"{names} fit this recording almost equally well; {_experiment(best.term)} would tell them apart"
+
+
+def _beaten(found: Found) -> dict[str, float]:
+    """Laws that similar data may suggest, as far as they were fitted, with the evidence by which they lost."""
+    best, beaten = found.trial, dict[str, float]()
+    for rival in found.trials:
+        name, margin = rival.term.law.name, best.evidence - rival.evidence
+        if rival.finished and name in best.term.law.confused_with:
+            beaten[name] = min(margin, beaten.get(name, margin))
+    return beaten
 
 
 def _experiment(term: Term) -> str:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -35,15 +35,6 @@ class ReportedParameter:
     nominal: float
     unit: str
 
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "value": _number(self.value),
-            "std": _number(self.std),
-            "nominal": _number(self.nominal),
-            "unit": self.unit,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class LawParameter:
@@ -53,14 +44,6 @@ class LawParameter:
     value: float
     std: float
     unit: str
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "name": self.name,
-            "value": _number(self.value),
-            "std": _number(self.std),
-            "unit": self.unit,
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,10 +56,9 @@ class IdentifiedLaw:
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
 
     def to_dict(self) -> dict[str, Any]:
-        result: dict[str, Any] = {"location": self.location, "effect": self.effect}
-        if self.variant:
-            result["variant"] = self.variant
-        return result | {"parameters": [p.to_dict() for p in self.parameters]}
+        """Without a variant where there is none."""
+        variant = {"variant": self.variant} if self.variant else {}
+        return {"location": self.location, "effect": self.effect} | variant | {"parameters": plain(self.parameters)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +67,6 @@ class FitFigures:
 
     nrmse: float  # sqrt of the mean over sensors of per_sensor^2
     per_sensor: Mapping[str, float]  # rms(error) / rms(measured)
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "nrmse": _number(self.nrmse),
-            "per_sensor": {k: _number(v) for k, v in self.per_sensor.items()},
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,15 +78,6 @@ class CandidateRow:
     score: float  # chi-square of the screening
     p_value: float  # corrected for everything that was tried
     delta_bic: float | None = None  # against the baseline; None: screened only
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "location": self.location,
-            "effect": self.effect,
-            "score": _number(self.score),
-            "p_value": _number(self.p_value),
-            "delta_bic": _number(self.delta_bic),
-        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,31 +96,26 @@ class Finding:
     sentence: str = ""
     parameter_covariance: NDArray[np.float64] | None = None  # of `parameters`, shape (p, p)
     quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
+    # evidence by which it beats each law that similar data may suggest and that was fitted
+    look_alikes: Mapping[str, float] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
+        """Without what there is nothing of."""
         result: dict[str, Any] = {
             "location": self.location,
             "effect": self.effect,
-            "parameters": [p.to_dict() for p in self.parameters],
-            "p_value": _number(self.p_value),
-            "delta_bic": _number(self.delta_bic),
+            "parameters": plain(self.parameters),
+            "p_value": plain(self.p_value),
+            "delta_bic": plain(self.delta_bic),
             "runner_up": None,
             "sentence": self.sentence,
         }
         if self.runner_up is not None:
-            result["runner_up"] = {
-                "effect": self.runner_up[0],
-                "delta_bic": _number(self.runner_up[1]),
-            }
-            if self.runner_up_location is not None:
-                result["runner_up"]["location"] = self.runner_up_location
-        if self.family is not None:
-            result["family"] = self.family
-        if self.advice is not None:
-            result["advice"] = self.advice
-        if self.quoted:
-            result["quoted"] = [q.to_dict() for q in self.quoted]
-        return result
+            effect, delta_bic = self.runner_up
+            place = {} if self.runner_up_location is None else {"location": self.runner_up_location}
+            result["runner_up"] = {"effect": effect, "delta_bic": plain(delta_bic)} | place
+        more = {"family": self.family, "advice": self.advice, "quoted": self.quoted, "look_alikes": self.look_alikes}
+        return result | {name: plain(value) for name, value in more.items() if value}
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +126,6 @@ class Unexplained:
     per_sensor: Mapping[str, float] = field(default_factory=dict)
     where: str = ""  # in words: place, size and frequencies of what is left
 
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "share": _number(self.share),
-            "per_sensor": {k: _number(v) for k, v in self.per_sensor.items()},
-            "where": self.where,
-        }
-
 
 @dataclass(frozen=True, slots=True)
 class RecordingFacts:
@@ -180,9 +135,6 @@ class RecordingFacts:
     seconds: float
     samples: int
     lost: int
-
-    def to_dict(self) -> dict[str, Any]:
-        return {"file": self.file, "seconds": self.seconds, "samples": self.samples, "lost": self.lost}
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +148,7 @@ class TrackPoint:
     adequate: bool  # whether the structure explains the window
 
     def to_dict(self) -> dict[str, Any]:
-        modes = [[_number(f), _number(s)] for f, s in zip(self.frequency, self.deviation, strict=True)]
+        modes = [[plain(f), plain(s)] for f, s in zip(self.frequency, self.deviation, strict=True)]
         return {"begin": self.begin, "end": self.end, "frequencies": modes, "adequate": self.adequate}
 
 
@@ -227,34 +179,29 @@ class Report:
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, with extra keys that readers may ignore."""
-        return {
-            "system": self.system,
-            "recording": self.recording.to_dict(),
-            "verdict": self.verdict,
-            "baseline": {
-                "parameters": [p.to_dict() for p in self.baseline],
-                "validation": self.baseline_validation.to_dict(),
-            },
+        fit = {
+            "baseline": {"parameters": self.baseline, "validation": self.baseline_validation},
             "findings": [f.to_dict() for f in self.findings],
-            "augmented": {
-                "parameters": [p.to_dict() for p in self.augmented],
-                "validation": self.augmented_validation.to_dict(),
-            },
-            "noise_floor": self.noise_floor.to_dict(),
-            "localization": {k: _number(v) for k, v in self.localization.items()},
-            "candidates": [c.to_dict() for c in self.candidates],
-            "changes": list(self.changes),
-            "explained": _number(self.explained),
-            "unexplained": self.unexplained.to_dict(),
-            "laws": [law.to_dict() for law in self.laws],
-            "noise": {name: _number(level) for name, level in self.noise.items()},
-            "summary": self.summary,
-            "advice": list(self.advice),
-        } | ({"track": [point.to_dict() for point in self.track]} if self.track else {})
+            "augmented": {"parameters": self.augmented, "validation": self.augmented_validation},
+        }
+        rest = ("noise_floor", "localization", "candidates", "changes", "explained", "unexplained")
+        more = {"laws": [law.to_dict() for law in self.laws]}
+        more |= {name: getattr(self, name) for name in ("noise", "summary", "advice")}
+        if self.track:
+            more["track"] = [point.to_dict() for point in self.track]
+        head = {"system": self.system, "recording": self.recording, "verdict": self.verdict}
+        whole: dict[str, Any] = plain(head | fit | {name: getattr(self, name) for name in rest} | more)
+        return whole
 
 
-def _number(value: float | None) -> float | None:
-    """A float that JSON can hold: None stands for what is not finite."""
-    if value is None or not math.isfinite(value):
-        return None
-    return float(value)
+def plain(value: Any) -> Any:
+    """A value as JSON can hold it: dataclasses by their fields; None stands for a number that is not finite."""
+    if is_dataclass(value):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {key: plain(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(one) for one in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if math.isfinite(value) else None
+    return value

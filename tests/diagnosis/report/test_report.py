@@ -1,0 +1,48 @@
+"""The public form of a report: what JSON can hold, nothing that is not there."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from sprung.model.diagnosis.report.report import Finding, FitFigures, IdentifiedLaw, LawParameter, plain
+
+
+def test_numbers_that_are_not_finite_are_null() -> None:
+    figures = FitFigures(np.float64(0.5), {"car_1": float("nan"), "car_2": np.inf})  # type: ignore[arg-type]
+    assert plain(figures) == {"nrmse": 0.5, "per_sensor": {"car_1": None, "car_2": None}}
+    assert json.dumps(plain(figures), allow_nan=False)
+
+
+def test_a_finding_says_only_what_is_known_of_it() -> None:
+    force = LawParameter("force", 395.0, 6.0, "N")
+    bare = Finding("k1", "coulomb_friction", (force,), None, None)
+    assert set(bare.to_dict()) == {
+        "location",
+        "effect",
+        "parameters",
+        "p_value",
+        "delta_bic",
+        "runner_up",
+        "sentence",
+    }
+    told = Finding(
+        "k1",
+        "coulomb_friction",
+        (force,),
+        1e-9,
+        -50.0,
+        runner_up=("bouc_wen", -10.0),
+        runner_up_location="k2",
+        family="coulomb_friction or bouc_wen",
+        look_alikes={"bouc_wen": 3.0},
+    ).to_dict()
+    assert told["runner_up"] == {"effect": "bouc_wen", "delta_bic": -10.0, "location": "k2"}
+    assert told["look_alikes"] == {"bouc_wen": 3.0}
+    assert told["parameters"] == [{"name": "force", "value": 395.0, "std": 6.0, "unit": "N"}]
+
+
+def test_a_variant_is_told_where_there_is_one() -> None:
+    assert "variant" not in IdentifiedLaw("k1", "bump_stop", ()).to_dict()
+    assert IdentifiedLaw("car", "flexible_mode", (), "bending").to_dict()["variant"] == "bending"
