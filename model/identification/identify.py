@@ -11,17 +11,16 @@ import numpy as np
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
 from sprung.model.identification.deviations import deviations
+from sprung.model.identification.estimates import estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.faults import Explainer, fit_limit
+from sprung.model.identification.faults import Explainer
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
-from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws, without_laws
+from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.system import System
-
-EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
 
 
 @dataclass(slots=True)
@@ -69,23 +68,23 @@ class Identifier:
         between = time.perf_counter()
         loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
-        estimates = self._estimates(refined, states)
+        found = self._estimates(refined, states)
         if not explain:
             self.times = StageTimes(between - begin, time.perf_counter() - between)
-            return estimates
-        bad = np.array([b for b, e in enumerate(estimates) if self._asks(e, windows.shape[1])], dtype=np.int64)
+            return found
+        bad = np.array([b for b, e in enumerate(found) if self._asks(e, windows.shape[1])], dtype=np.int64)
         if len(bad):
-            for b, found in self._explainer(windows.shape[1]).explain(windows, bad).items():
-                (mended,) = self._estimates(found.refined, False, found.point)
-                estimates[b] = replace(self._averaged(mended), faults=found.faults)
+            for b, cause in self._explainer(windows.shape[1]).explain(windows, bad).items():
+                (mended,) = self._estimates(cause.refined, False, cause.point)
+                found[b] = replace(self._averaged(mended), faults=cause.faults)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
-        return estimates
+        return found
 
     def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
         """point: deviations (H,) that were taken back from the samples before."""
         P = len(self.system.parameters)
         deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
-        return _estimates(refined, P, states, deviating)
+        return estimates(refined, P, states, deviating)
 
     def examine(self, windows: FloatArray, weigh: BoolArray) -> list[Estimate]:
         """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and
@@ -191,8 +190,7 @@ def _with_laws(system: System, workers: int) -> Identifies:
     laws = acting_laws(system)
     if not laws:  # faults of measurements alone
         return Undistorted(system, Identifier(system, None, workers))
-    linear = without_laws(system, laws)
-    return Undistorted(system, IdentifierWithLaws(system, laws, Identifier(linear, None, workers), linear, workers))
+    return Undistorted(system, IdentifierWithLaws(system, laws, workers))
 
 
 def identifiability(system: System, seed: int = 0) -> FloatArray:
@@ -246,35 +244,3 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
         cross, score = cross * scale, score * scale
         information = information * np.outer(scale, scale)
     return Deviating(at, given, cross[:P], information, score, float(refined.freedom[b]), whole)
-
-
-def _estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating | None]) -> list[Estimate]:
-    with np.errstate(divide="ignore", invalid="ignore"):
-        per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
-    fits = refined.chi_square < fit_limit(refined.freedom)
-    # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
-    told = np.where(fits, refined.identifiable.any(axis=1) & refined.converged, True)
-    informative = (refined.excitation > EXCITED) & told
-    return [
-        Estimate(
-            log_ratio=refined.log_ratio[b, :P],
-            covariance=refined.covariance[b, :P, :P],
-            identifiable=refined.identifiable[b, :P],
-            nrmse=pooled_nrmse(per_sensor[b]),
-            per_sensor=per_sensor[b],
-            chi_square=float(refined.chi_square[b]),
-            adequate=bool(fits[b] and refined.converged[b]),
-            converged=bool(refined.converged[b]),
-            iterations=int(refined.iterations[b]),
-            states=refined.states[b] if states else None,
-            informative=bool(informative[b]),
-            deviating=deviating[b],
-        )
-        for b in range(len(refined.log_ratio))
-    ]
-
-
-def pooled_nrmse(per_sensor: FloatArray) -> float:
-    """rms over sensors of each sensor's error divided by its own rms; NaN sensors are absent."""
-    shown = per_sensor[np.isfinite(per_sensor)]
-    return float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")

@@ -150,9 +150,9 @@ class WindowModel:
         residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
         free = s.free_response(discrete, self.samples)
 
-        transfer = self._transfer(values, data)
+        transfer = self.transfer(values, data)
         carried = transfer.drive * self.drive_noise[:, None]
-        whiten = self._whitening(carried)
+        whiten = self.whitening(carried)
         white_residual = whiten @ self.spectra(residual).unsqueeze(3)  # (B, F, R, 1)
         white_free = whiten @ self.spectra(free)  # (B, F, R, N)
         r, basis = as_rows(white_residual), as_rows(white_free)  # (B, 1, K), (B, N, K)
@@ -246,7 +246,7 @@ class WindowModel:
         """
         s, f = self.simulator, self.frequency
         values = s.element_values(at.x)
-        transfer = self._transfer(values, data)
+        transfer = self.transfer(values, data)
         compliance, per_force, carried = (
             transfer.compliance,
             transfer.per_force,
@@ -266,7 +266,7 @@ class WindowModel:
         motion = torch.linalg.pinv(self._sensing(values, data))
         power = deflection.abs().square().sum(dim=3) + (s.H.to(kind) @ motion).abs().square().sum(dim=3)
         power = power * self.samples
-        white = (self._whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
+        white = (self.whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
         by_k = (white * values.stiffness.square().unsqueeze(1)).sum(dim=1)
         by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
         k_at, c_at = s.estimated_elements
@@ -305,7 +305,8 @@ class WindowModel:
         Q, discrete = self.compression(data.present), self._present(discrete, data)
         return replace(discrete, C=Q @ discrete.C, D=Q @ discrete.D)
 
-    def _transfer(self, values: ElementValues, data: WindowBatch) -> Transfer:
+    def transfer(self, values: ElementValues, data: WindowBatch) -> Transfer:
+        """Frequency responses of the compressed signals."""
         s, f = self.simulator, self.frequency
         compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
@@ -325,7 +326,8 @@ class WindowModel:
             per_force = per_force + Q @ forces.to(kind)
         return Transfer(compliance, per_load, per_force, drive)
 
-    def _whitening(self, carried: Tensor) -> Tensor:
+    def whitening(self, carried: Tensor) -> Tensor:
+        """Whitening matrices (B, F, R, R) where the drives' noise brings `carried` (B, F, R, W/2) to the signals."""
         R = carried.shape[2]
         covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
         factor = torch.linalg.cholesky(covariance)

@@ -32,8 +32,8 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
-_WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
-_NOISE_SHARE = 0.15  # of a sensitivity's power, at most
+WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
+NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
 
@@ -122,7 +122,7 @@ class Refiner:
             if len(active) == 0:
                 break
         pieces = self._pieces(present, everything)
-        return _in_order(share(conclude, pieces, self.workers), np.concatenate(pieces))
+        return in_order(share(conclude, pieces, self.workers), np.concatenate(pieces))
 
     def _pieces(self, present: BoolArray, of: IntArray) -> list[IntArray]:
         return [piece for group in alike(present, of) for piece in chunks(group)]
@@ -179,11 +179,11 @@ class Refiner:
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
-        weak = (std > _WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        weak = (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
         if len(weak):
             chosen = data.take(weak)
             share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
-            identifiable[weak] &= share < _NOISE_SHARE
+            identifiable[weak] &= share < NOISE_SHARE
         signals = len(self.model.compression(data.present))
         freedom = 2 * self.model.bins * signals - x0.shape[1] - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
@@ -256,7 +256,8 @@ def _limited(step: Tensor) -> Tensor:
     return step * (_STEP_LIMIT / step.abs().amax(dim=1, keepdim=True).clamp_min(_STEP_LIMIT))
 
 
-def _in_order(parts: list[Refined], order: np.ndarray) -> Refined:
+def in_order(parts: list[Refined], order: np.ndarray) -> Refined:
+    """One batch of pieces whose windows are `order`, each in its place."""
     back = np.argsort(order)
     fields: dict[str, Any] = {
         name: np.concatenate([getattr(part, name) for part in parts])[back] for name in Refined.__slots__

@@ -54,11 +54,19 @@ def along(
 
 
 def recall(
-    law: ElementLaw, p: Values, deflection: FloatArray, rate: FloatArray, *, time: FloatArray, element: SpringDamper
+    law: ElementLaw,
+    p: Values,
+    deflection: FloatArray,
+    rate: FloatArray,
+    *,
+    time: FloatArray,
+    element: SpringDamper,
+    first: FloatArray | None = None,
 ) -> FloatArray:
     """The law's own states, shape (memory, ..., T): ETDRK4 (Cox and Matthews 2002), one step per sample.
 
-    Between samples the deflection is the cubic through its values and rates.
+    Between samples the deflection is the cubic through its values and rates.  first: states at the first sample,
+    (memory, ...), as the law says if left out.
     """
     h = time[1] - time[0]
     p = tuple(_column(value) for value in p)
@@ -70,7 +78,7 @@ def recall(
     v_half = 1.5 / h * (d[1:] - d[:-1]) - 0.25 * (v[:-1] + v[1:])
     step = MemoryStep(law, p, element, h)
     path = np.zeros((len(time), law.memory, *shape))
-    path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element)
+    path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element) if first is None else first
     for i in range(len(time) - 1):
         z = path[i]
         t = float(time[i])

@@ -1,0 +1,44 @@
+"""What refined windows become: estimates that say whether they fit, and whether they tell anything."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.identification.faults import fit_limit
+from sprung.model.identification.refine import Refined
+from sprung.model.signals import Deviating, Estimate, FloatArray
+
+EXCITED = 20.0  # power of an input over its noise; below, what sensors show is not the response to the inputs
+
+
+def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating | None]) -> list[Estimate]:
+    """One `Estimate` per window of a refined batch; the first P of what was refined are its parameters."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
+    fits = refined.chi_square < fit_limit(refined.freedom)
+    # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
+    told = np.where(fits, refined.identifiable.any(axis=1) & refined.converged, True)
+    informative = (refined.excitation > EXCITED) & told
+    return [
+        Estimate(
+            log_ratio=refined.log_ratio[b, :P],
+            covariance=refined.covariance[b, :P, :P],
+            identifiable=refined.identifiable[b, :P],
+            nrmse=pooled_nrmse(per_sensor[b]),
+            per_sensor=per_sensor[b],
+            chi_square=float(refined.chi_square[b]),
+            adequate=bool(fits[b] and refined.converged[b]),
+            converged=bool(refined.converged[b]),
+            iterations=int(refined.iterations[b]),
+            states=refined.states[b] if states else None,
+            informative=bool(informative[b]),
+            deviating=deviating[b],
+        )
+        for b in range(len(refined.log_ratio))
+    ]
+
+
+def pooled_nrmse(per_sensor: FloatArray) -> float:
+    """rms over sensors of each sensor's error divided by its own rms; NaN sensors are absent."""
+    shown = per_sensor[np.isfinite(per_sensor)]
+    return float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")

@@ -1,0 +1,197 @@
+"""Forces of laws along the motion of windows, at the samples, and what they change with.
+
+Deflections and rates are continued between samples by cubics on a grid `FINE` times finer; forces are brought back to
+the samples behind a band-limiting filter.  Slopes by the motion are means over the samples' surroundings, weighed as a
+straight line between samples would be; the one state z of a law with memory is carried from sample to sample by
+
+    dz_{k+1} = keep_k dz_k + by_d0_k dd_k + by_d1_k dd_{k+1} + by_v0_k dv_k + by_v1_k dv_{k+1}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import firwin, upfirdn
+
+from sprung.model.laws import ElementLaw, Motion, SpringDamper
+from sprung.model.laws.placed import PlacedLaw
+from sprung.model.laws.trajectory import recall
+from sprung.model.signals import FloatArray
+
+FINE = 16  # steps per sample of laws without memory
+_FINE_MEMORY = 2  # of those with, whose steps are of fourth order
+_REACH = 8  # samples of the filter to each side
+_NEAR = 1e-4  # of the rms motion, for slopes
+_STEP = 1e-3  # of a value's logarithm, for derivatives
+
+
+@dataclass(frozen=True, slots=True)
+class Acting:
+    """One law with the elements that it acts on."""
+
+    placed: PlacedLaw
+    law: ElementLaw
+    weights: FloatArray  # over the elements, (E,)
+    element: int  # whose stiffness and damping it sees
+    free: tuple[int, ...]  # parameters that are estimated
+
+
+@dataclass(frozen=True, slots=True)
+class Slopes:
+    """One law's force by the motion, (B, T), and its memory from sample to sample, (B, T-1); zeros without memory."""
+
+    by_deflection: FloatArray
+    by_rate: FloatArray
+    by_memory: FloatArray
+    keep: FloatArray
+    by_d0: FloatArray
+    by_d1: FloatArray
+    by_v0: FloatArray
+    by_v1: FloatArray
+
+
+class Along:
+    """One law along the motion of B windows of T samples."""
+
+    def __init__(self, law: ElementLaw, deflection: FloatArray, rate: FloatArray, sample_rate: float) -> None:
+        """deflection, rate: (B, T)."""
+        self.law, self.parts = law, _FINE_MEMORY if law.memory else FINE
+        self.samples, self.step = deflection.shape[1], 1 / (sample_rate * self.parts)
+        slope = rate @ slopes_of(self.samples).T * sample_rate
+        self.d = _continued(deflection, rate / sample_rate, self.parts)
+        self.v = _continued(rate, slope / sample_rate, self.parts)
+        self.time: FloatArray = np.arange(self.d.shape[1], dtype=np.float64) * self.step
+        self.size_d = np.sqrt(np.mean(deflection**2, axis=1, keepdims=True)) + 1e-12
+        self.size_v = np.sqrt(np.mean(rate**2, axis=1, keepdims=True)) + 1e-12
+
+    def memory(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """The law's state on the fine grid, (1, ..., fine), from `first` (...,); values broadcast with (..., 1)."""
+        return recall(self.law, p, self.d, self.v, time=self.time, element=element, first=first[None])
+
+    def fine(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """The force on the fine grid, (..., B, fine)."""
+        memory = self.memory(p, element, first) if self.law.memory else ()
+        return np.asarray(self.law.force(Motion(self.d, self.v, 0.0, memory), p, element), dtype=np.float64)
+
+    def force(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """The force at the samples, (..., B, T)."""
+        return band_limited(self.fine(p, element, first), self.parts)
+
+    def changes(self, p: FloatArray, free: Sequence[int], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """What the force changes per log of the free values, then of stiffness and damping, (X, B, T).
+
+        p: (B, values); stiffness, damping and first: (B,).
+        """
+        count = len(free) + 2
+        values = np.tile(p.T[:, None, :, None], (1, 2 * count, 1, 1))  # (values, variants, B, 1)
+        k, c = (np.tile(np.asarray(x)[None, :, None], (2 * count, 1, 1)) for x in element)
+        for i, sign in ((i, sign) for i in range(count) for sign in (0, 1)):
+            at, factor = 2 * i + sign, np.exp(_STEP if sign == 0 else -_STEP)
+            target = values[free[i]] if i < len(free) else (k if i == len(free) else c)
+            target[at] *= factor
+        shown = self.force(list(values), SpringDamper(k, c), np.broadcast_to(first, values.shape[1:3]))
+        shown = np.broadcast_to(shown, (2 * count, *shown.shape[-2:]))
+        return np.asarray((shown[0::2] - shown[1::2]) / (2 * _STEP))
+
+    def by_first_memory(
+        self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray, scale: FloatArray
+    ) -> FloatArray:
+        """What the force changes per unit of the first memory, of size `scale` (B,), along the same motion, (B, T)."""
+        near = _STEP * scale
+        up, down = (self.force(p, element, first + sign * near) for sign in (1, -1))
+        return np.asarray((up - down) / (2 * near[:, None]))
+
+    def slopes(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> Slopes:
+        """Slopes by the motion; values and element (B, 1)."""
+        law, memory = self.law, self.memory(p, element, first) if self.law.memory else np.zeros((0, *self.d.shape))
+        near = {"d": _NEAR * self.size_d, "v": _NEAR * self.size_v}
+        if law.memory:
+            near["z"] = _NEAR * (np.sqrt(np.mean(memory[0] ** 2, axis=1, keepdims=True)) + 1e-12)
+
+        def slope(of: str, function: object) -> FloatArray:
+            up, down = (
+                np.asarray(
+                    function(  # type: ignore[operator]
+                        Motion(
+                            self.d + (sign * near["d"] if of == "d" else 0.0),
+                            self.v + (sign * near["v"] if of == "v" else 0.0),
+                            0.0,
+                            memory + (sign * near["z"] if of == "z" else 0.0),
+                        ),
+                        p,
+                        element,
+                    )
+                )
+                for sign in (1.0, -1.0)
+            )
+            found = np.asarray((up - down) / (2 * near[of]), dtype=np.float64)
+            return np.broadcast_to(found.reshape(found.shape[-2:]), self.d.shape)
+
+        by_d, by_v = (self._around(slope(of, law.force)) for of in "dv")
+        zero = np.zeros((len(self.d), self.samples - 1))
+        if not law.memory:
+            return Slopes(by_d, by_v, np.zeros_like(by_d), zero, zero, zero, zero, zero)
+        by_z = self._around(slope("z", law.force))
+        return Slopes(by_d, by_v, by_z, *self._carried(*(slope(of, law.memory_rate) for of in "zdv")))
+
+    def _around(self, fine: FloatArray) -> FloatArray:
+        """Means (B, T) around the samples, weighed by hats that reach to the neighbours."""
+        M = self.parts
+        part = (np.arange(M) + 0.5) / M
+        middle = 0.5 * (fine[:, 1:] + fine[:, :-1]).reshape(len(fine), self.samples - 1, M)
+        found = np.zeros((len(fine), self.samples))
+        weight = np.zeros(self.samples)
+        found[:, :-1] += middle @ (1 - part)
+        found[:, 1:] += middle @ part
+        weight[:-1] += (1 - part).sum()
+        weight[1:] += part.sum()
+        return found / weight
+
+    def _carried(
+        self, by_z: FloatArray, by_d: FloatArray, by_v: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """How the memory goes on over a sample, from the slopes of its rate on the fine grid."""
+        M = self.parts
+        z, d, v = (0.5 * (x[:, 1:] + x[:, :-1]).reshape(len(x), self.samples - 1, M) for x in (by_z, by_d, by_v))
+        keep = np.ones(z.shape[:2])
+        found = np.zeros((4, *keep.shape))
+        for j in reversed(range(M)):
+            half = np.exp(np.clip(0.5 * self.step * z[:, :, j], -50.0, 0.0))
+            late = (j + 0.5) / M
+            for i, (rate, share) in enumerate(((d, 1 - late), (d, late), (v, 1 - late), (v, late))):
+                found[i] += keep * half * self.step * rate[:, :, j] * share
+            keep = keep * half**2
+        return keep, *found
+
+
+@lru_cache(maxsize=8)
+def slopes_of(samples: int) -> FloatArray:
+    """Matrix (T, T) from samples to the slopes, per sample, of the cubic spline through them."""
+    time = np.arange(samples)
+    matrix = np.asarray(CubicSpline(time, np.eye(samples))(time, 1))
+    matrix.setflags(write=False)
+    return matrix
+
+
+def _continued(value: FloatArray, slope: FloatArray, parts: int) -> FloatArray:
+    """Cubics through values and slopes per sample (B, T), on the fine grid (B, (T-1) parts + 1)."""
+    u = np.arange(parts) / parts
+    first, last, begin, end = (x[:, :, None] for x in (value[:, :-1], value[:, 1:], slope[:, :-1], slope[:, 1:]))
+    rise = last - first
+    inner = first + u * (begin + u * (3 * rise - 2 * begin - end + u * (begin + end - 2 * rise)))
+    return np.concatenate([inner.reshape(len(value), -1), value[:, -1:]], axis=1)
+
+
+def band_limited(fine: FloatArray, parts: int) -> FloatArray:
+    """Signals (..., fine grid) behind a filter at half the sample rate, at the samples (..., T)."""
+    reach = _REACH * parts
+    taps = firwin(2 * reach + 1, 1 / parts, window=("kaiser", 6.0))
+    padded = np.concatenate(
+        [2 * fine[..., :1] - fine[..., reach:0:-1], fine, 2 * fine[..., -1:] - fine[..., -2 : -reach - 2 : -1]], -1
+    )
+    shown = upfirdn(taps, padded, down=parts, axis=-1)[..., 2 * _REACH :]
+    return np.asarray(shown[..., : (fine.shape[-1] - 1) // parts + 1])

@@ -1,0 +1,480 @@
+"""Windows of a system with laws, linearised along their own non-linear motion.
+
+The laws' forces f load the linear system of the other parts as generalised forces q = -H^T f.  Between samples they are
+cubics like every drive, so that a step is exact for given forces,
+
+    x_{k+1} = Ad x_k + G0 w_k + G1 w_{k+1} + P0 q_k + S0 q'_k + P1 q_{k+1} + S1 q'_{k+1}.
+
+Forces and motion are brought together by Newton's method on the forces at the samples.  Sensitivities follow from the
+same step along that motion: a change of the motion changes the forces by the laws' slopes, these the motion, and the
+memories of the laws are states like the others (forward sensitivity analysis).  Whitened over bins of the DFT they take
+the place of the linear model's columns in Gauss-Newton; the memories at the first sample are unknowns beside the
+parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.law_forces import Acting, Along, Slopes, slopes_of
+from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel, as_rows
+from sprung.model.laws import SpringDamper
+from sprung.model.mechanics import ACCELERATION, FORCE
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.linear import Discrete, ElementValues, phi_functions
+from sprung.model.system import System
+
+_SWEEPS = 4  # of Newton's method on the forces, at most
+_SETTLED = 0.05  # rms change of the outputs by a sweep, in the sensors' noise
+_RIDGE = 1e-11  # relative, on the normalised free responses
+_MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """Where B windows stand."""
+
+    unknowns: Tensor  # log-ratios of the linear parameters and of laws' values, then first memories, (B, U)
+    x0: Tensor  # states at the first sample, (B, N)
+    force: Tensor  # of the laws at the samples, (B, T, L)
+
+    def take(self, at: Tensor) -> Point:
+        """Some of the windows."""
+        return Point(self.unknowns[at], self.x0[at], self.force[at])
+
+    def moved(self, step: Tensor, dx0: Tensor) -> Point:
+        """After steps of the unknowns and of the first state."""
+        return Point(self.unknowns + step, self.x0 + dx0, self.force)
+
+    def towards(self, other: Point, share: float) -> Point:
+        """Between this and another one."""
+        pairs = ((self.unknowns, other.unknowns), (self.x0, other.x0), (self.force, other.force))
+        return Point(*(a + share * (b - a) for a, b in pairs))
+
+    def where(self, mask: Tensor, other: Point) -> Point:
+        """This one for windows of the mask (B,), the other one for the rest."""
+        return Point(
+            torch.where(mask[:, None], self.unknowns, other.unknowns),
+            torch.where(mask[:, None], self.x0, other.x0),
+            torch.where(mask[:, None, None], self.force, other.force),
+        )
+
+    def put(self, at: Tensor, some: Point) -> None:
+        """Replace some of the windows."""
+        self.unknowns[at], self.x0[at], self.force[at] = some.unknowns, some.x0, some.force
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """The linear system over one sample at the point's values."""
+
+    values: ElementValues
+    discrete: Discrete  # outputs not compressed, absent sensors left out
+    push: tuple[Tensor, Tensor, Tensor, Tensor]  # P0, S0, P1, S1, (B, N, n)
+    direct: Tensor  # what sensors show of generalised forces at once, (B, S', n)
+    shown: Tensor  # and of forces of elements, (S', E)
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What a point's window does."""
+
+    states: Tensor  # (B, T, N)
+    outputs: Tensor  # (B, T, S')
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """Gauss-Newton's products at one point; U unknowns: linear parameters, laws' values, memories."""
+
+    whiten: Tensor  # (B, F, R, R)
+    carried: Tensor  # noise of the drives in the compressed signals, (B, F, R, W/2)
+    compliance: Tensor  # (B, F, n, n)
+    free: Tensor  # whitened responses to the first state, normalised, (B, N, K)
+    free_scale: Tensor  # (B, N)
+    sensitivities: Tensor  # whitened, (B, U, K)
+    factor: Tensor  # Cholesky factor of the free responses' products, (B, N, N)
+    across: Tensor  # free responses solved for the sensitivities, (B, N, U)
+    information: Tensor  # on the unknowns, (B, U, U)
+    covariance: Tensor  # of the unknowns, weak prior included, (B, U, U)
+    precision: Tensor  # of the prior, (B, U)
+
+    def solve(self, residual: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Cost with the best first state (B,), step of the unknowns (B, U), step of the first state without it (B, N).
+
+        residual: whitened, (B, K, 1); unknowns: where they are, (B, U), the prior being around 0.  Far from a fit the
+        residual counts as so much more noise, so that the prior holds what is only weakly told.
+        """
+        along = self.free @ residual
+        part = torch.cholesky_solve(along, self.factor)
+        gradient = self.sensitivities @ residual - self.across.mT @ along
+        cost = residual.square().sum(dim=(1, 2)) - (along * part).sum(dim=(1, 2))
+        noise = (cost / residual.shape[1]).clamp_min(1.0)[:, None]
+        held = torch.linalg.inv(self.information + torch.diag_embed(noise * self.precision))
+        step = held @ (gradient - (noise * self.precision * unknowns).unsqueeze(2))
+        return cost, step.squeeze(2), part.squeeze(2) / self.free_scale
+
+    def state_step(self, alone: Tensor, step: Tensor) -> Tensor:
+        """Step of the first state (B, N) beside a step of the unknowns (B, U)."""
+        return alone - (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
+
+
+class LawWindows:
+    """Windows of one length of a system, `bare` of its laws, with the laws `acting`."""
+
+    def __init__(self, bare: System, acting: Sequence[Acting], model: WindowModel) -> None:
+        self.system, self.acting, self.model = bare, acting, model
+        m = bare.mechanics
+        self.rows = np.array([a.weights for a in acting]) @ m.H  # deflections of the sites by the coordinates, (L, n)
+        self.pull = torch.as_tensor(self.rows)
+        self.weights = torch.as_tensor(np.array([a.weights for a in acting]))  # (L, E)
+        self.free = [(law, i) for law, a in enumerate(acting) for i in a.free]
+        self.memories = [i for i, a in enumerate(acting) if a.law.memory]
+        noise = bare.sensor_noise
+        self.noise = torch.as_tensor(noise)
+        moving = m.sensor_kind == ACCELERATION
+        # of a rate over one sample, by the least noise of an accelerometer; where there is none by that of a sensor
+        self.rate_noise = float(noise[moving].min() if moving.any() else noise.min()) / bare.sample_rate
+        self.slope = torch.tensor(slopes_of(model.samples)) / model.simulator.dt
+
+    @property
+    def unknowns(self) -> int:
+        return len(self.system.parameters) + len(self.free) + len(self.memories)
+
+    def values(self, point: Point, law: int) -> FloatArray:
+        """Values of one law, (B, values)."""
+        found = np.tile(np.array(self.acting[law].placed.values), (len(point.unknowns), 1))
+        for at, (of, i) in enumerate(self.free):
+            if of == law:
+                found[:, i] *= np.exp(point.unknowns[:, len(self.system.parameters) + at].numpy())
+        return found
+
+    def first_memory(self, point: Point, law: int) -> FloatArray:
+        """Memory of one law at the first sample, (B,)."""
+        if law not in self.memories:
+            return np.zeros(len(point.unknowns))
+        at = len(self.system.parameters) + len(self.free) + self.memories.index(law)
+        found: FloatArray = point.unknowns[:, at].numpy()
+        return found
+
+    def steps(self, point: Point, data: WindowBatch) -> Steps:
+        """The linear step at a point."""
+        s, x = self.model.simulator, point.unknowns[:, : len(self.system.parameters)]
+        values = s.element_values(x)
+        discrete = s.discretise(values)
+        at = torch.as_tensor(np.flatnonzero(data.present))
+        A, *_ = s.continuous(values)
+        N, n = A.shape[1], A.shape[1] // 2
+        phi = phi_functions(A * s.normalised_step)  # (B, 5, N, N)
+        inverse = torch.diag_embed(1 / values.mass)  # (B, n, n)
+        load = torch.cat([torch.zeros_like(inverse), inverse], dim=1) / s.scale[:, None]
+        psi = (phi.flatten(1, 2) @ load).reshape(len(x), 5, N, n)[:, 1:] * s.dt
+        G = (s.hermite @ psi.flatten(2)).reshape(len(x), 2, 2, N, n) * s.scale[:, None]
+        push = (G[:, 0, 0], G[:, 0, 1], G[:, 1, 0], G[:, 1, 1])
+        kind = torch.as_tensor(self.system.mechanics.sensor_kind)
+        direct = torch.where((kind == ACCELERATION)[:, None], s.S, 0.0)[at] / values.mass[:, None, :]
+        shown = torch.where((kind == FORCE)[:, None], s.L, 0.0)[at]
+        present = replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
+        return Steps(values, present, push, direct, shown)
+
+    def simulate(self, steps: Steps, force: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
+        """States (B, T, N) and outputs (B, T, S') under given forces of the laws (B, T, L)."""
+        s, q = self.model.simulator, -force @ self.pull
+        slope = self.slope @ q
+        P0, S0, P1, S1 = steps.push
+        discrete = replace(
+            steps.discrete,
+            G0=torch.cat([steps.discrete.G0, P0, S0], dim=2),
+            G1=torch.cat([steps.discrete.G1, P1, S1], dim=2),
+        )
+        states = s.states(discrete, torch.cat([data.w, q, slope], dim=2), x0)
+        outputs = states @ steps.discrete.C.mT + data.w @ steps.discrete.D.mT + q @ steps.direct.mT
+        return states, outputs + force @ (self.weights @ steps.shown.T)
+
+    def site_motion(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Deflections and rates of the sites, each (B, T, L).
+
+        smooth: what the noise of the drives adds to those of the elements, (2, B, T, E).
+        """
+        d, v = self.element_motion(states, data, smooth)
+        weights = self.weights.numpy().T
+        return d @ weights, v @ weights
+
+    def element_motion(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The same of all elements, (B, T, E)."""
+        s = self.model.simulator
+        n = s.H.shape[1]
+        d = (states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T).numpy()
+        v = (states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T).numpy()
+        return d + smooth[0], v + smooth[1]
+
+    def _element(self, steps: Steps, law: int) -> SpringDamper:
+        """Stiffness and damping that a law sees, each (B,)."""
+        at = self.acting[law].element
+        return SpringDamper(steps.values.stiffness[:, at].numpy(), steps.values.damping[:, at].numpy())
+
+    def settle(
+        self, point: Point, steps: Steps, data: WindowBatch, smooth: FloatArray, flow: Flow | None = None
+    ) -> tuple[Point, Motion]:
+        """Bring forces and motion together; flow: of a motion nearby."""
+        force = point.force
+        for _ in range(_SWEEPS):
+            states, _ = self.simulate(steps, force, point.x0, data)
+            along = self._along(states, data, smooth)
+            wanted = self._forces(along, point, steps)
+            flow = self._flow(along, point, steps) if flow is None else flow
+            change = flow.answer(wanted - force)
+            force = force + change
+            if bool((self._shown_at_once(change, steps, data) < _SETTLED).all()):
+                break
+        states, outputs = self.simulate(steps, force, point.x0, data)
+        return replace(point, force=force), Motion(states, outputs)
+
+    def _shown_at_once(self, change: Tensor, steps: Steps, data: WindowBatch) -> Tensor:
+        """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
+        load = change @ self.pull
+        shown = change @ (self.weights @ steps.shown.T) - load @ steps.direct.mT
+        carried = (load / steps.values.mass[:, None] * self.model.simulator.dt) / self.rate_noise
+        at_once = torch.cat([shown / self.noise[torch.as_tensor(data.present)], carried], dim=2)
+        return at_once.square().mean(dim=1).amax(dim=1).sqrt()
+
+    def _along(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> list[Along]:
+        d, v = self.site_motion(states, data, smooth)
+        rate = self.system.sample_rate
+        return [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
+
+    def forces(self, point: Point, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
+        """The laws' forces along given states, (B, T, L)."""
+        return self._forces(self._along(states, data, smooth), point, steps)
+
+    def _forces(self, along: list[Along], point: Point, steps: Steps) -> Tensor:
+        shape = point.force.shape[:2]
+        found = [path.force(*self._at(i, point, steps)) for i, path in enumerate(along)]
+        return torch.as_tensor(np.stack([np.broadcast_to(f, shape) for f in found], axis=2))
+
+    def _at(self, law: int, point: Point, steps: Steps) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
+        """Values of a law and of its element, that broadcast with (B, fine), and its memory at the first sample."""
+        k, c = self._element(steps, law)
+        values = list(self.values(point, law).T[:, :, None])
+        return values, SpringDamper(k[:, None], c[:, None]), self.first_memory(point, law)
+
+    def _flow(self, along: list[Along], point: Point, steps: Steps) -> Flow:
+        slopes = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
+        return Flow(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
+
+    def residual(self, motion: Motion, data: WindowBatch, whiten: Tensor) -> Tensor:
+        """Whitened residual, (B, K, 1)."""
+        compressed = (data.measured - motion.outputs) @ self.model.compression(data.present).mT
+        return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
+
+    def flow(self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray) -> Flow:
+        """What a motion does with changes."""
+        return self._flow(self._along(motion.states, data, smooth), point, steps)
+
+    def columns(
+        self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray, flow: Flow
+    ) -> Columns:
+        """Everything that Gauss-Newton needs at a settled point."""
+        transfer = self.model.transfer(steps.values, data)
+        carried = transfer.drive * self.model.drive_noise[:, None]
+        whiten = self.model.whitening(carried)
+        shown, scale = self._shown(point, steps, motion, data, smooth, flow)
+        spectra = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
+        white = as_rows(whiten @ spectra)
+        N = point.x0.shape[1]
+        free, J = white[:, :N], white[:, N:]
+        free_scale = free.square().sum(dim=2).sqrt().clamp_min(1e-300)
+        free = free / free_scale.unsqueeze(2)
+        products = free @ free.mT
+        factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(N, dtype=torch.float64))
+        across_products = free @ J.mT
+        across = torch.cholesky_solve(across_products, factor)
+        information = J @ J.mT - across_products.mT @ across
+        precision = torch.full((len(J), self.unknowns), 1 / PRIOR_STD**2, dtype=torch.float64)
+        if self.memories:
+            precision[:, -len(self.memories) :] = torch.as_tensor(1 / (_MEMORY_STD * scale) ** 2)
+        covariance = torch.linalg.inv(information + torch.diag_embed(precision))
+        told = (information, covariance, precision)
+        return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told)
+
+    def _shown(
+        self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray, flow: Flow
+    ) -> tuple[Tensor, FloatArray]:
+        """What the compressed signals show, (B, R, T, N + U), of the first state and of the unknowns; and the rms of
+        the memories, (B, Z)."""
+        B, T, N = motion.states.shape
+        Q = self.model.compression(data.present)
+        along = self._along(motion.states, data, smooth)
+        columns = self.unknowns
+        load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
+        P0, S0, P1, S1 = (-(push @ self.model.simulator.H[which].T).unsqueeze(2) for push in steps.push)
+        linear = slice(N, N + len(which))
+        push = load.new_zeros(B, N, T - 1, N + columns)
+        push[..., linear] = P0 * load[:, None, :-1]
+        push[..., linear] += S0 * slope[:, None, :-1]
+        push[..., linear] += P1 * load[:, None, 1:]
+        push[..., linear] += S1 * slope[:, None, 1:]
+        by_mass = self._mass_loads(point, steps, motion, data)  # (B, n, T, M)
+        masses = slice(N + len(which), N + len(which) + by_mass.shape[3])
+        if by_mass.shape[3]:
+            by_slope = self.slope @ by_mass
+            series = (by_mass[:, :, :-1], by_slope[:, :, :-1], by_mass[:, :, 1:], by_slope[:, :, 1:])
+            for gain, values in zip(steps.push, series, strict=True):
+                push[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1)
+        source, scale = self._force_sources(along, point, steps, N)
+        first = load.new_zeros(B, N, N + columns)
+        first[:, :, :N] = torch.eye(N, dtype=torch.float64)
+        path, forces = flow.run(push, source, first)  # (B, N, T, X), (B, L, T, X)
+        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
+        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
+        found = (rows @ torch.cat([path, forces], dim=1).flatten(2)).view(B, len(Q), T, -1)
+        direct = Q @ (steps.shown[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
+        found[..., linear] += direct.unsqueeze(2) * load.unsqueeze(1)
+        if by_mass.shape[3]:
+            found[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1)
+        return found, scale
+
+    def _element_loads(
+        self, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Forces of elements by the logarithms of stiffnesses, then dampings: values, slopes (B, T, P'), elements."""
+        s = self.model.simulator
+        d, v = (torch.as_tensor(x) for x in self.element_motion(motion.states, data, smooth))
+        k_at, c_at = s.estimated_elements
+        K, C = steps.values.stiffness[:, None, k_at], steps.values.damping[:, None, c_at]
+        load = torch.cat([d[:, :, k_at] * K, v[:, :, c_at] * C], dim=2)
+        slope = torch.cat([v[:, :, k_at] * K, (self.slope @ v)[:, :, c_at] * C], dim=2)
+        return load, slope, torch.cat([k_at, c_at])
+
+    def _mass_loads(self, point: Point, steps: Steps, motion: Motion, data: WindowBatch) -> Tensor:
+        """Generalised forces by the logarithms of masses, (B, n, T, M)."""
+        s = self.model.simulator
+        masses = s.m_of[s.m_of.any(dim=1)]
+        A, b_value, b_rate = s.continuous(steps.values)
+        n = A.shape[1] // 2
+        moved = motion.states @ A[:, n:].mT
+        moved = moved + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
+        inertia = moved * steps.values.mass[:, None] - point.force @ self.pull
+        return -(inertia.unsqueeze(3) * masses.T).permute(0, 2, 1, 3)
+
+    def _force_sources(self, along: list[Along], point: Point, steps: Steps, before: int) -> tuple[Tensor, FloatArray]:
+        """Laws' forces by the unknowns along the given motion, (B, L, T, before + U); rms of the memories, (B, Z)."""
+        names = [(p.element, p.quantity) for p in self.system.parameters]
+        B, T = point.force.shape[:2]
+        found = torch.zeros((B, len(along), T, before + self.unknowns), dtype=torch.float64)
+        scale = np.ones((B, len(self.memories)))
+        at = before + len(names)
+        first_of_memories = at + len(self.free)
+        for i, (acting, path) in enumerate(zip(self.acting, along, strict=True)):
+            start = self.first_memory(point, i)
+            changes = path.changes(self.values(point, i), acting.free, self._element(steps, i), start)
+            for change in changes[:-2]:
+                found[:, i, :, at] = torch.as_tensor(change)
+                at += 1
+            element = self.system.elements[acting.element]
+            for quantity, change in zip(("stiffness", "damping"), changes[-2:], strict=True):
+                if (element, quantity) in names:
+                    found[:, i, :, before + names.index((element, quantity))] = torch.as_tensor(change)
+            if acting.law.memory:
+                at_memory = self.memories.index(i)
+                z = path.memory(*self._at(i, point, steps))[0]
+                scale[:, at_memory] = np.sqrt(np.mean(z**2, axis=1)) + 1e-9
+                shown = path.by_first_memory(*self._at(i, point, steps), scale[:, at_memory])
+                found[:, i, :, first_of_memories + at_memory] = torch.as_tensor(shown)
+        return found, scale
+
+    def smoothed(self, columns: Columns, residual: Tensor, step: Tensor, dx0: Tensor, steps: Steps) -> FloatArray:
+        """What the residual after a step says of the drives' noise, as motion of the elements: (2, B, T, E)."""
+        model, s = self.model, self.model.simulator
+        left = residual - columns.free.mT @ (columns.free_scale * dx0).unsqueeze(2)  # (B, K, 1)
+        left = left - columns.sensitivities.mT @ step.unsqueeze(2)
+        B, F, R, _ = columns.whiten.shape
+        spectra = torch.view_as_complex(left.reshape(B, F, R, 2).contiguous()).unsqueeze(3)
+        noise = ((columns.whiten @ columns.carried).mH @ spectra).squeeze(3) / model.weight[:, None] ** 2
+        noise = noise * model.drive_noise  # (B, F, W/2)
+        kind = noise.dtype
+        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)
+        load = -(model.frequency.dynamic(steps.values) * support) @ s.H.to(kind)
+        if len(s.forces):
+            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
+        moved = (columns.compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support  # (B, F, E)
+        whole = moved.new_zeros(2, B, model.samples // 2 + 1, moved.shape[2])
+        whole[0, :, 1 : model.bins + 1] = moved
+        whole[1, :, 1 : model.bins + 1] = model.frequency.jw[:, None] * moved
+        found: FloatArray = torch.fft.irfft(whole, n=model.samples, dim=2).numpy()
+        return found
+
+
+class Flow:
+    """The linear system with the laws' slopes and memories around it, from sample to sample along a motion.
+
+    With the total change of the forces f_k = K_k [x_k; z_k] + given_k and of the memories
+    z_{k+1} = ahead_k [x_k; z_k] + beyond_k x_{k+1}, forces straight between samples:
+
+        x_{k+1} = Ad x_k + g0 f_k + g1 f_{k+1} + push_k.
+    """
+
+    def __init__(self, slopes: list[Slopes], memories: list[int], pull: Tensor, steps: Steps, dt: float) -> None:
+        """memories: which laws have one; pull: deflections by the coordinates, (L, n); dt: s."""
+
+        def stacked(name: str) -> Tensor:
+            return torch.as_tensor(np.stack([getattr(s, name) for s in slopes], axis=2))
+
+        N, (L, n) = steps.discrete.Ad.shape[1], pull.shape
+        self.memories, self.N = memories, N
+        rows = torch.zeros(2, L, N, dtype=torch.float64)  # deflections and rates by the state
+        rows[0, :, :n], rows[1, :, n:] = pull, pull
+        P0, S0, P1, S1 = steps.push
+        g0, g1 = -(P0 - (S0 + S1) / dt) @ pull.T, -(P1 + (S0 + S1) / dt) @ pull.T  # (B, N, L)
+        K = stacked("by_deflection").unsqueeze(3) * rows[0] + stacked("by_rate").unsqueeze(3) * rows[1]  # (B, T, L, N)
+        self.at_first = K[:, 0]
+        after = K[:, 1:]
+        if memories:
+            by_memory = stacked("by_memory")[:, 1:, memories]  # (B, T-1, Z)
+            d0, d1, v0, v1, keep = (
+                stacked(name)[:, :, memories].unsqueeze(3) for name in ("by_d0", "by_d1", "by_v0", "by_v1", "keep")
+            )
+            self.ahead = d0 * rows[0, memories] + v0 * rows[1, memories]  # (B, T-1, Z, N)
+            self.beyond = d1 * rows[0, memories] + v1 * rows[1, memories]
+            self.keep = keep  # (B, T-1, Z, 1)
+            self.by_memory = by_memory.unsqueeze(3)
+            after = after.clone()
+            after[:, :, memories] += self.by_memory * self.beyond
+        small = torch.linalg.inv(torch.eye(L, dtype=torch.float64) - after @ g1.unsqueeze(1))  # (B, T-1, L, L)
+        self.small, self.answers = small, small @ after  # (B, T-1, L, N)
+        self.step, self.g1 = torch.cat([steps.discrete.Ad, g0], dim=2), g1
+
+    def run(self, push: Tensor | None, given: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of states (B, N, T, X) and of the laws' forces (B, L, T, X).
+
+        push: (B, N, T-1, X) or none; given: forces (B, L, T, X) apart from what the motion changes; first (B, N, X).
+        """
+        B, L, T, X = given.shape
+        path = given.new_empty(B, self.N + L, T, X)
+        path[:, : self.N, 0] = first
+        path[:, self.N :, 0] = self.at_first @ first + given[:, :, 0]
+        z = given.new_zeros(B, len(self.memories), X)
+        for k in range(T - 1):
+            now = path[:, :, k]
+            u = self.step @ now if push is None else torch.baddbmm(push[:, :, k], self.step, now)
+            known = given[:, :, k + 1]
+            if self.memories:
+                z = torch.baddbmm(self.keep[:, k] * z, self.ahead[:, k], now[:, : self.N])
+                known = known.clone()
+                known[:, self.memories] += self.by_memory[:, k] * z
+            force = torch.baddbmm(self.small[:, k] @ known, self.answers[:, k], u)
+            state = torch.baddbmm(u, self.g1, force)
+            if self.memories:
+                z = torch.baddbmm(z, self.beyond[:, k], state)
+            path[:, : self.N, k + 1], path[:, self.N :, k + 1] = state, force
+        return path[:, : self.N], path[:, self.N :]
+
+    def answer(self, given: Tensor) -> Tensor:
+        """Change of the forces (B, T, L) where they are off by `given`, the motion's answer included."""
+        first = given.new_zeros(len(given), self.N, 1)
+        return self.run(None, given.mT.unsqueeze(3), first)[1].squeeze(3).mT
