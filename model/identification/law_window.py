@@ -36,35 +36,35 @@ _MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
 
 
 @dataclass(frozen=True, slots=True)
-class Point:
+class WindowPoint:
     """Where B windows stand."""
 
     unknowns: Tensor  # log-ratios of the linear parameters and of laws' values, then first memories, (B, U)
     x0: Tensor  # states at the first sample, (B, N)
     force: Tensor  # of the laws at the samples, (B, T, L)
 
-    def take(self, at: Tensor) -> Point:
+    def take(self, at: Tensor) -> WindowPoint:
         """Some of the windows."""
-        return Point(self.unknowns[at], self.x0[at], self.force[at])
+        return WindowPoint(self.unknowns[at], self.x0[at], self.force[at])
 
-    def moved(self, step: Tensor, dx0: Tensor) -> Point:
+    def moved(self, step: Tensor, dx0: Tensor) -> WindowPoint:
         """After steps of the unknowns and of the first state."""
-        return Point(self.unknowns + step, self.x0 + dx0, self.force)
+        return WindowPoint(self.unknowns + step, self.x0 + dx0, self.force)
 
-    def towards(self, other: Point, share: float) -> Point:
+    def towards(self, other: WindowPoint, share: float) -> WindowPoint:
         """Between this and another one."""
         pairs = ((self.unknowns, other.unknowns), (self.x0, other.x0), (self.force, other.force))
-        return Point(*(a + share * (b - a) for a, b in pairs))
+        return WindowPoint(*(a + share * (b - a) for a, b in pairs))
 
-    def where(self, mask: Tensor, other: Point) -> Point:
+    def where(self, mask: Tensor, other: WindowPoint) -> WindowPoint:
         """This one for windows of the mask (B,), the other one for the rest."""
-        return Point(
+        return WindowPoint(
             torch.where(mask[:, None], self.unknowns, other.unknowns),
             torch.where(mask[:, None], self.x0, other.x0),
             torch.where(mask[:, None, None], self.force, other.force),
         )
 
-    def put(self, at: Tensor, some: Point) -> None:
+    def put(self, at: Tensor, some: WindowPoint) -> None:
         """Replace some of the windows."""
         self.unknowns[at], self.x0[at], self.force[at] = some.unknowns, some.x0, some.force
 
@@ -81,7 +81,7 @@ class Steps:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class Moved:
     """What a point's window does."""
 
     states: Tensor  # (B, T, N)
@@ -146,7 +146,7 @@ class LawWindows:
     def unknowns(self) -> int:
         return len(self.system.parameters) + len(self.free) + len(self.memories)
 
-    def values(self, point: Point, law: int) -> FloatArray:
+    def values(self, point: WindowPoint, law: int) -> FloatArray:
         """Values of one law, (B, values)."""
         found = np.tile(np.array(self.acting[law].placed.values), (len(point.unknowns), 1))
         for at, (of, i) in enumerate(self.free):
@@ -154,7 +154,7 @@ class LawWindows:
                 found[:, i] *= np.exp(point.unknowns[:, len(self.system.parameters) + at].numpy())
         return found
 
-    def first_memory(self, point: Point, law: int) -> FloatArray:
+    def first_memory(self, point: WindowPoint, law: int) -> FloatArray:
         """Memory of one law at the first sample, (B,)."""
         if law not in self.memories:
             return np.zeros(len(point.unknowns))
@@ -162,7 +162,7 @@ class LawWindows:
         found: FloatArray = point.unknowns[:, at].numpy()
         return found
 
-    def steps(self, point: Point, data: WindowBatch) -> Steps:
+    def steps(self, point: WindowPoint, data: WindowBatch) -> Steps:
         """The linear step at a point."""
         s, x = self.model.simulator, point.unknowns[:, : len(self.system.parameters)]
         values = s.element_values(x)
@@ -219,8 +219,8 @@ class LawWindows:
         return SpringDamper(steps.values.stiffness[:, at].numpy(), steps.values.damping[:, at].numpy())
 
     def settle(
-        self, point: Point, steps: Steps, data: WindowBatch, smooth: FloatArray, flow: Flow | None = None
-    ) -> tuple[Point, Motion]:
+        self, point: WindowPoint, steps: Steps, data: WindowBatch, smooth: FloatArray, flow: Flow | None = None
+    ) -> tuple[WindowPoint, Moved]:
         """Bring forces and motion together; flow: of a motion nearby."""
         force = point.force
         for _ in range(_SWEEPS):
@@ -233,7 +233,7 @@ class LawWindows:
             if bool((self._shown_at_once(change, steps, data) < _SETTLED).all()):
                 break
         states, outputs = self.simulate(steps, force, point.x0, data)
-        return replace(point, force=force), Motion(states, outputs)
+        return replace(point, force=force), Moved(states, outputs)
 
     def _shown_at_once(self, change: Tensor, steps: Steps, data: WindowBatch) -> Tensor:
         """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
@@ -248,36 +248,36 @@ class LawWindows:
         rate = self.system.sample_rate
         return [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
 
-    def forces(self, point: Point, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
+    def forces(self, point: WindowPoint, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
         """The laws' forces along given states, (B, T, L)."""
         return self._forces(self._along(states, data, smooth), point, steps)
 
-    def _forces(self, along: list[Along], point: Point, steps: Steps) -> Tensor:
+    def _forces(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
         shape = point.force.shape[:2]
         found = [path.force(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return torch.as_tensor(np.stack([np.broadcast_to(f, shape) for f in found], axis=2))
 
-    def _at(self, law: int, point: Point, steps: Steps) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
+    def _at(self, law: int, point: WindowPoint, steps: Steps) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
         """Values of a law and of its element, that broadcast with (B, fine), and its memory at the first sample."""
         k, c = self._element(steps, law)
         values = list(self.values(point, law).T[:, :, None])
         return values, SpringDamper(k[:, None], c[:, None]), self.first_memory(point, law)
 
-    def _flow(self, along: list[Along], point: Point, steps: Steps) -> Flow:
+    def _flow(self, along: list[Along], point: WindowPoint, steps: Steps) -> Flow:
         slopes = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return Flow(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
 
-    def residual(self, motion: Motion, data: WindowBatch, whiten: Tensor) -> Tensor:
+    def residual(self, motion: Moved, data: WindowBatch, whiten: Tensor) -> Tensor:
         """Whitened residual, (B, K, 1)."""
         compressed = (data.measured - motion.outputs) @ self.model.compression(data.present).mT
         return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
 
-    def flow(self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray) -> Flow:
+    def flow(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Flow:
         """What a motion does with changes."""
         return self._flow(self._along(motion.states, data, smooth), point, steps)
 
     def columns(
-        self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray, flow: Flow
+        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray, flow: Flow
     ) -> Columns:
         """Everything that Gauss-Newton needs at a settled point."""
         transfer = self.model.transfer(steps.values, data)
@@ -303,7 +303,7 @@ class LawWindows:
         return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told)
 
     def _shown(
-        self, point: Point, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray, flow: Flow
+        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray, flow: Flow
     ) -> tuple[Tensor, FloatArray]:
         """What the compressed signals show, (B, R, T, N + U), of the first state and of the unknowns; and the rms of
         the memories, (B, Z)."""
@@ -340,7 +340,7 @@ class LawWindows:
         return found, scale
 
     def _element_loads(
-        self, steps: Steps, motion: Motion, data: WindowBatch, smooth: FloatArray
+        self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Forces of elements by the logarithms of stiffnesses, then dampings: values, slopes (B, T, P'), elements."""
         s = self.model.simulator
@@ -351,7 +351,7 @@ class LawWindows:
         slope = torch.cat([v[:, :, k_at] * K, (self.slope @ v)[:, :, c_at] * C], dim=2)
         return load, slope, torch.cat([k_at, c_at])
 
-    def _mass_loads(self, point: Point, steps: Steps, motion: Motion, data: WindowBatch) -> Tensor:
+    def _mass_loads(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch) -> Tensor:
         """Generalised forces by the logarithms of masses, (B, n, T, M)."""
         s = self.model.simulator
         masses = s.m_of[s.m_of.any(dim=1)]
@@ -362,7 +362,9 @@ class LawWindows:
         inertia = moved * steps.values.mass[:, None] - point.force @ self.pull
         return -(inertia.unsqueeze(3) * masses.T).permute(0, 2, 1, 3)
 
-    def _force_sources(self, along: list[Along], point: Point, steps: Steps, before: int) -> tuple[Tensor, FloatArray]:
+    def _force_sources(
+        self, along: list[Along], point: WindowPoint, steps: Steps, before: int
+    ) -> tuple[Tensor, FloatArray]:
         """Laws' forces by the unknowns along the given motion, (B, L, T, before + U); rms of the memories, (B, Z)."""
         names = [(p.element, p.quantity) for p in self.system.parameters]
         B, T = point.force.shape[:2]

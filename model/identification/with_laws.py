@@ -19,7 +19,7 @@ from torch import Tensor
 from sprung.model.chunks import alike, share
 from sprung.model.identification.estimates import estimates
 from sprung.model.identification.law_forces import Acting
-from sprung.model.identification.law_window import LawWindows, Motion, Point
+from sprung.model.identification.law_window import LawWindows, Moved, WindowPoint
 from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel
 from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined, in_order
 from sprung.model.identifier import StageTimes, UnusableWindow
@@ -140,7 +140,7 @@ class _Search:
         unknowns = torch.zeros(B, U, dtype=torch.float64)
         unknowns[:, : self.told] = torch.as_tensor(start)
         zero = torch.zeros(B, N, dtype=torch.float64)
-        self.point = Point(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
+        self.point = WindowPoint(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
         self.best = self.point.take(torch.arange(B))
         self.cost = torch.full((B,), torch.inf, dtype=torch.float64)
         self.covariance = torch.eye(U, dtype=torch.float64).repeat(B, 1, 1)
@@ -171,7 +171,7 @@ class _Search:
             steps = w.steps(point, data)
             states, _ = w.simulate(steps, point.force, point.x0, data)
             point = replace(point, force=w.forces(point, steps, states, data, self.smooth))
-            residual = w.residual(Motion(*w.simulate(steps, point.force, point.x0, data)), data, at.whiten)
+            residual = w.residual(Moved(*w.simulate(steps, point.force, point.x0, data)), data, at.whiten)
             along = at.free @ residual
             alone = torch.cholesky_solve(along, at.factor)
             gradient = at.sensitivities @ residual - at.across.mT @ along
@@ -180,7 +180,7 @@ class _Search:
             point = self._linear_step(point, step, point.x0 + dx0)
         self.point = point
 
-    def _linear_step(self, point: Point, step: Tensor, x0: Tensor) -> Point:
+    def _linear_step(self, point: WindowPoint, step: Tensor, x0: Tensor) -> WindowPoint:
         unknowns = point.unknowns.clone()
         unknowns[:, : step.shape[1]] += step
         return replace(point, unknowns=unknowns, x0=x0)

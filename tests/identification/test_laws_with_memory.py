@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from sprung.model.identification.identify import load_identifier
-from sprung.model.identification.law_window import LawWindows, Point
+from sprung.model.identification.law_window import LawWindows, WindowPoint
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
 from sprung.model.system import System, parse_system
@@ -100,9 +100,11 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
     data = model.model.batch(model.model.knots(values), values, np.ones(3, dtype=bool))
     still = np.zeros((2, 1, 200, 2))
     unknowns = torch.zeros(1, model.unknowns, dtype=torch.float64)
-    start = Point(unknowns, torch.full((1, 4), 1e-3, dtype=torch.float64), torch.zeros(1, 200, 1, dtype=torch.float64))
+    start = WindowPoint(
+        unknowns, torch.full((1, 4), 1e-3, dtype=torch.float64), torch.zeros(1, 200, 1, dtype=torch.float64)
+    )
 
-    def shown(point: Point) -> torch.Tensor:
+    def shown(point: WindowPoint) -> torch.Tensor:
         for _ in range(2):  # each call takes a few steps of Newton's method
             point, motion = model.settle(point, model.steps(point, data), data, still)
         return motion.outputs / torch.as_tensor(bare.sensor_noise)
@@ -116,7 +118,7 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
         size = 1e-3 if at < len(vehicle.tracked) else 1e-5
         moved = torch.zeros_like(unknowns)
         moved[:, at] = size
-        up, down = (shown(Point(unknowns + sign * moved, start.x0, start.force)) for sign in (1, -1))
+        up, down = (shown(WindowPoint(unknowns + sign * moved, start.x0, start.force)) for sign in (1, -1))
         expected = (up - down) / (2 * size)
         found = (whitened @ columns[..., 4 + at]).mT
         assert (found - expected).square().mean().sqrt() < 0.08 * expected.square().mean().sqrt()
