@@ -10,16 +10,20 @@ import numpy as np
 import torch
 
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.fusion import fuse
-from sprung.model.simulate.linear import LinearSimulator, knot_columns
+from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.fusion import motion
+from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import System
 
 
-def time_domain_bound(system: System, clean: FloatArray, log_ratio: FloatArray, *, fused: bool) -> FloatArray:
+def time_domain_bound(
+    system: System, clean: FloatArray, log_ratio: FloatArray, *, fused: bool, offsets: bool = False
+) -> FloatArray:
     """Standard deviations (P,) that no unbiased estimator of one window (T, C) can beat; initial state unknown.
 
     fused: displacement and velocity of a support are known to belong to one motion; otherwise each is an input of
     its own with its own noise.
+    offsets: every sensor has one that nobody knows.
     """
     simulator = LinearSimulator(system)
     T, S = len(clean), len(system.sensors)
@@ -28,10 +32,12 @@ def time_domain_bound(system: System, clean: FloatArray, log_ratio: FloatArray, 
     values = simulator.element_values(x)
     discrete = simulator.discretise(values)
     free = simulator.free_response(discrete, T)[0].numpy().reshape(T * S, -1)
+    if offsets:
+        free = np.concatenate([free, np.tile(np.eye(S), (T, 1))], axis=1)
     measured = clean[:, len(system.inputs) :].reshape(-1)
-    none = torch.zeros(1, free.shape[1], dtype=torch.float64)
+    none = torch.zeros(1, discrete.Ad.shape[1], dtype=torch.float64)
     forced = simulator.simulate(x, w, none)[0].numpy().reshape(-1)
-    x0 = torch.as_tensor(np.linalg.lstsq(free, measured - forced, rcond=None)[0])[None]
+    x0 = torch.as_tensor(np.linalg.lstsq(free, measured - forced, rcond=None)[0][: none.shape[1]])[None]
     step = 1e-5
     offsets = torch.cat([torch.eye(x.shape[1]), -torch.eye(x.shape[1])]).double() * step
     moved = simulator.simulate(x + offsets, w.expand(len(offsets), -1, -1), x0.expand(len(offsets), -1))[0]
@@ -49,18 +55,20 @@ def _input_covariance(system: System, simulator: LinearSimulator, x: torch.Tenso
     """Covariance (T S, T S) of outputs from noise of the inputs, each a linear map of its samples' noise."""
     S = len(system.sensors)
     total = np.zeros((T * S, T * S))
-    for drive, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
-        noise = system.inputs[value].noise, 0.0 if slope is None else system.inputs[slope].noise
-        if max(noise) == 0:
+    for drive, measured in enumerate(drives_of(system)):
+        orders = list(measured.noise)
+        if max(measured.noise.values()) == 0:
             continue
-        samples = np.diag([noise[0]] * T + [noise[1]] * T)  # unit noises to [displacements, velocities]
-        d, v = samples[:, :T], samples[:, T:]
-        if fused and min(noise) > 0:
-            d, v = fuse(d, v, simulator.dt, noise)
-        knots = torch.zeros(2 * T, T, simulator.W, dtype=torch.float64)
+        samples = np.diag(np.repeat([measured.noise[order] for order in orders], T))  # of unit noises
+        parts = {order: samples[:, i * T : (i + 1) * T] for i, order in enumerate(orders)}
+        if fused:
+            d, v = motion(parts, simulator.dt, measured.noise)
+        else:
+            d, v = motion(parts, simulator.dt, dict.fromkeys(orders, 0.0))
+        knots = torch.zeros(len(samples), T, simulator.W, dtype=torch.float64)
         knots[:, :, 2 * drive], knots[:, :, 2 * drive + 1] = torch.as_tensor(d), torch.as_tensor(v)
-        still = torch.zeros(2 * T, 2 * simulator.H.shape[1], dtype=torch.float64)
-        outputs = simulator.simulate(x.expand(2 * T, -1), knots, still)[0].flatten(1).numpy()
+        still = torch.zeros(len(samples), 2 * simulator.H.shape[1], dtype=torch.float64)
+        outputs = simulator.simulate(x.expand(len(samples), -1), knots, still)[0].flatten(1).numpy()
         total += outputs.T @ outputs
     return total
 

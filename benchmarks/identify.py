@@ -16,8 +16,8 @@ import numpy as np
 import torch
 
 from sprung.benchmarks.bounds import time_domain_bound
+from sprung.benchmarks.full_state import full_state_system
 from sprung.benchmarks.peers import ScipyPeer, ukf_peer
-from sprung.benchmarks.sensing import full_state_system
 from sprung.model.identification.estimator import bundled_estimator
 from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
 from sprung.model.identification.features import magnitudes

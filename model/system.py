@@ -182,20 +182,6 @@ class System:
         return self.file.time.as_column()
 
     @cached_property
-    def drive_channels(self) -> tuple[int | None, ...]:
-        """For each entry of the drive vector u (a support's displacement and velocity, a force) its column in a
-        window; None: not measured."""
-        columns: list[int | None] = []
-        at = 0
-        for source in self.file.inputs.values():
-            measured = {"force": source} if isinstance(source, ForceInput) else getattr(source, "measured", {})
-            column = {quantity: at + i for i, quantity in enumerate(measured)}
-            at += len(column)
-            wanted = ("force",) if isinstance(source, ForceInput) else ("displacement", "velocity")
-            columns += [column.get(quantity) for quantity in wanted]
-        return tuple(columns)
-
-    @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
         found = []
         for quantity in ("stiffness", "damping"):
@@ -348,11 +334,6 @@ def checked(system: System, source: str) -> System:
 def unsupported(file: SystemFile) -> list[str]:
     """What the format can say and identification cannot use yet, one line each."""
     found = []
-    for name, source in file.inputs.items():
-        if isinstance(source, SupportInput) and source.displacement is None:
-            found.append(f"inputs.{name}: a support without displacement is not supported by identification yet")
-        elif isinstance(source, SupportInput) and source.acceleration is not None:
-            found.append(f"inputs.{name}.acceleration: not supported by identification yet; leave it out")
     tracks = [name for name, source in file.inputs.items() if isinstance(source, TrackInput)]
     if tracks and len(tracks) < len(file.inputs):
         other = next(name for name in file.inputs if name not in tracks)

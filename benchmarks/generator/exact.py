@@ -59,19 +59,29 @@ def exact_response(vehicle: Vehicle, case: Case, seconds: float) -> Array:
         vehicle.input_side,
         joint_spacing=case.joints,
     )
-    reach = np.arange(LOW_PASS.size) - LOW_PASS.size // 2
-    live = np.flatnonzero(omega < 2 * np.pi * 50.0)  # nothing on the track is faster
-    omega, spectra = omega[live], spectra[live]
-    passed = np.cos(omega[:, None] * reach / STEP_RATE) @ LOW_PASS
     values = [np.array([v[e] for e in vehicle.elements]) for v in (case.stiffness, case.damping)]
     inertia = vehicle.inertia.copy()
     if case.mass_scale:
         inertia[vehicle.on_body(case.mass_scale[0])] *= case.mass_scale[1]
-    transfer = VehicleTransfer(vehicle, values[0], values[1], omega, inertia)
+    live = np.flatnonzero(omega < 2 * np.pi * 50.0)  # nothing on the track is faster
+    transfer = VehicleTransfer(vehicle, values[0], values[1], omega[live], inertia)
+    return filtered(transfer, spectra[live], omega[live], samples, seconds, (0, 1))
+
+
+def filtered(
+    transfer: VehicleTransfer, spectra: Complex, omega: Array, samples: int, seconds: float, orders: tuple[int, ...]
+) -> Array:
+    """What is recorded at 100 Hz behind the low-pass: the derivatives `orders` of all wheels, then the sensors, (T, C).
+
+    spectra: displacements of the wheels at omega, (F, wheels), bins 0, 1, ... of a period of `samples` at 1 kHz.
+    """
+    reach = np.arange(LOW_PASS.size) - LOW_PASS.size // 2
+    passed = np.cos(omega[:, None] * reach / STEP_RATE) @ LOW_PASS
     felt = np.einsum("fsw,fw->fs", transfer.to_sensors, spectra)
-    every = np.concatenate([spectra, 1j * omega[:, None] * spectra, felt], axis=1) * passed[:, None]
+    moved = [(1j * omega[:, None]) ** order * spectra for order in orders]
+    every = np.concatenate([*moved, felt], axis=1) * passed[:, None]
     padded = np.zeros((samples // 2 + 1, every.shape[1]), complex)
-    padded[live] = every
+    padded[: len(every)] = every
     step = int(track.RATE / SAMPLE_RATE)
     series: Array = np.fft.irfft(padded, samples, axis=0)[::step][: int(np.ceil(seconds * SAMPLE_RATE))]
     return series

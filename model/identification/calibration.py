@@ -27,8 +27,7 @@ from torch import Tensor
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.linearise import Chord, Linearisation, WindowBatch, WindowModel, as_rows
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.fusion import fused_shares
-from sprung.model.simulate.linear import knot_columns
+from sprung.model.simulate.drives import drives_of
 
 _ROUNDING = 1e-6  # of sums in single precision, relative
 
@@ -57,14 +56,10 @@ class DeviationSensitivity:
         self.slope = torch.as_tensor(CubicSpline(time, np.eye(model.samples))(time, 1))
         drive, share = [], []
         omega = model.frequency.omega.numpy()
-        for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
-            noise = system.inputs[value].noise, 0.0 if slope is None else system.inputs[slope].noise
-            of_value = fused_shares(omega, 1 / system.sample_rate, noise) if min(noise) > 0 else np.ones(len(omega))
-            drive.append(i)
-            share.append(of_value)
-            if slope is not None:
+        for i, one in enumerate(drives_of(system)):
+            for of_channel in one.shares_at(omega, 1 / system.sample_rate).values() if one.columns else ():
                 drive.append(i)
-                share.append(1 - of_value)
+                share.append(of_channel)
         self.drive = torch.as_tensor(drive)  # of every input channel
         self.share = torch.as_tensor(np.array(share).reshape(-1, len(omega)).T.copy())  # of its drive, (F, inputs)
         self._dropped: dict[bytes, Tensor] = {}

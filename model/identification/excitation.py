@@ -17,7 +17,8 @@ from torch import Tensor
 from sprung.model.identification.frequency import FrequencyModel
 from sprung.model.schema import ForceInput
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.linear import LinearSimulator, knot_columns
+from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import System
 
 ERRI_LOW, ERRI_HIGH = 2.741619e-7, 7.343623e-7  # b0
@@ -69,13 +70,11 @@ def simulate_runs(
     drives = _drive_spectra(system, omega, speeds, level, 2 * np.pi / period, rng)  # (B, F, W/2)
     frequency = FrequencyModel(LinearSimulator(system), omega)
     values = frequency.simulator.element_values(torch.as_tensor(log_ratio))
-    knots = torch.as_tensor(np.stack([drives, 1j * omega[:, None] * drives], axis=3).reshape(B, len(bins), -1))
     out = (frequency.response(values) @ torch.as_tensor(drives).unsqueeze(3)).squeeze(3)
     columns: Tensor = torch.zeros(B, len(bins), len(system.channels), dtype=out.dtype)
-    for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
-        columns[:, :, value] = knots[:, :, 2 * i]
-        if slope is not None:
-            columns[:, :, slope] = knots[:, :, 2 * i + 1]
+    for i, drive in enumerate(drives_of(system)):
+        for order, column in drive.columns.items():
+            columns[:, :, column] = torch.as_tensor((1j * omega) ** order * drives[:, :, i])
     columns[:, :, len(system.inputs) :] = out
     spectrum = torch.zeros(B, size // 2 + 1, columns.shape[2], dtype=columns.dtype)
     spectrum[:, bins] = columns

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from sprung.model.mechanics import DEFLECTION, FORCE
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.fusion import fused_noise
-from sprung.model.simulate.linear import ElementValues, LinearSimulator, knot_columns
+from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.linear import ElementValues, LinearSimulator
 
 
 class FrequencyModel:
@@ -71,19 +71,16 @@ class FrequencyModel:
             output[..., s.supports // 2] += self.element_response(values, s.G)
         return output
 
-    def drive_noise(self) -> FloatArray:
+    def drive_noise(self, *, usual: bool = False) -> FloatArray:
         """Noise of each drive per sample as its value's standard deviation over frequency, shape (F, W/2).
 
-        Slopes follow their values (j w), measured or derived: see `model.simulate.fusion`.
+        Slopes follow their values (j w), measured or derived: see `model.simulate.fusion`.  That of an acceleration
+        grows with 1 / w^2 towards low frequencies, as its integral's does.
+        usual: that of usual instruments where none is stated.
         """
-        system, omega = self.simulator.system, self.omega.numpy()
-        noise = np.zeros((len(omega), self.simulator.W // 2))
-        for i, (value, slope) in enumerate(zip(*knot_columns(system), strict=True)):
-            noise[:, i] = system.inputs[value].noise
-            pair = (system.inputs[value].noise, 0.0 if slope is None else system.inputs[slope].noise)
-            if min(pair) > 0:
-                noise[:, i] = fused_noise(omega, 1 / system.sample_rate, pair)
-        return noise
+        drives = drives_of(self.simulator.system)
+        noise = [drive.noise_at(self.omega.numpy(), self.simulator.dt, usual=usual) for drive in drives]
+        return np.array(noise).reshape(-1, len(self.omega)).T.copy()
 
 
 def bin_frequencies(samples: int, sample_rate: float) -> FloatArray:

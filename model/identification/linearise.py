@@ -15,8 +15,9 @@ from torch import Tensor
 
 from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
-from sprung.model.signals import BoolArray, FloatArray
-from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator, knot_columns
+from sprung.model.signals import BoolArray, FloatArray, IntArray
+from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
 from sprung.model.system import USUAL_NOISE, System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
@@ -52,11 +53,11 @@ class Linearisation:
 
     whiten: Tensor  # shape (B, F, R, R), weights of the bins included
     transfer: Transfer
-    free: Tensor  # whitened free responses, normalised, shape (B, N, K)
-    free_scale: Tensor  # what they were divided by, shape (B, N)
+    free: Tensor  # whitened free responses and trends, normalised, shape (B, N', K)
+    free_scale: Tensor  # what they were divided by, shape (B, N')
     sensitivities: Tensor  # whitened, shape (B, P, K)
-    factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N, N)
-    across: Tensor  # free responses solved for the sensitivities, shape (B, N, P)
+    factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N', N')
+    across: Tensor  # free responses solved for the sensitivities, shape (B, N', P)
     covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
     x: Tensor  # log-ratios of this point, shape (B, P)
     x0: Tensor  # best initial state here, shape (B, N)
@@ -70,7 +71,8 @@ class Linearisation:
 
     def state_after(self, step: Tensor) -> Tensor:
         """Best initial state when the log-ratios move by `step`."""
-        return self.x0 - (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
+        moved = (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
+        return self.x0 - moved[:, : self.x0.shape[1]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +104,11 @@ class WindowModel:
         self.frequency = FrequencyModel(self.simulator, omega[1 : self.bins + 1])
         self.weight = torch.full((self.bins,), np.sqrt(2 / samples), dtype=torch.float64)
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
-        self.usual_noise = torch.where(self.drive_noise > 0, self.drive_noise, torch.as_tensor(_usual_noise(system)))
+        self.input_noise = np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in system.inputs])
+        self.integrated = max((drive.integrated for drive in drives_of(system)), default=0)
         self.sensor_noise = system.sensor_noise
         self._compressions: dict[bytes, Tensor] = {}
+        self._trends: dict[bytes, Tensor] = {}
 
     @property
     def states_count(self) -> int:
@@ -141,6 +145,54 @@ class WindowModel:
             self._compressions[key] = torch.as_tensor(np.concatenate(blocks))
         return self._compressions[key]
 
+    def open_degrees(self, kind: IntArray) -> IntArray:
+        """Highest power of time that the motion of an integrated support leaves open in sensors of a kind.
+
+        The integral of an acceleration is known up to a line, and with its offset up to a parabola, whose second
+        derivative an acceleration shows as a constant: the mean, which is left out anyway.
+        """
+        shown = np.where(kind == ACCELERATION, 2, np.where(kind == VELOCITY, 1, 0))
+        return np.maximum(self.integrated - shown, 0)
+
+    def trends(self, present: BoolArray) -> Tensor:
+        """What the compressed signals may show of the motion that integration leaves open, (T, R, X)."""
+        key = present.tobytes()
+        if key not in self._trends:
+            Q = self.compression(present).numpy()
+            degrees = self.open_degrees(self.system.mechanics.sensor_kind[present])
+            row_degree = np.array([degrees[np.argmax(np.abs(row))] for row in Q], dtype=np.int64)
+            time = np.linspace(-1, 1, self.samples)
+            columns = [(r, power) for r, degree in enumerate(row_degree) for power in range(1, degree + 1)]
+            out = np.zeros((self.samples, len(Q), len(columns)))
+            for i, (r, power) in enumerate(columns):
+                out[:, r, i] = time**power
+            self._trends[key] = torch.as_tensor(out)
+        return self._trends[key]
+
+    def unknowns(self, present: BoolArray) -> int:
+        """Numbers of a window that are eliminated: its first state, and trends."""
+        return self.states_count + (self.trends(present).shape[2] if self.integrated else 0)
+
+    def _open(self, free: Tensor, data: WindowBatch) -> Tensor:
+        """Free responses (B, T, R, N) and what else is unknown of the window, (B, T, R, N')."""
+        if not self.integrated:
+            return free
+        trends = self.trends(data.present)
+        return torch.cat([free, trends.expand(len(free), *trends.shape)], dim=3) if trends.shape[2] else free
+
+    def _without_trends(self, error: Tensor, present: BoolArray) -> Tensor:
+        """Errors (B, T, S') without what is open of their sensors."""
+        degrees = self.open_degrees(self.system.mechanics.sensor_kind[present])
+        if not degrees.any():
+            return error
+        out = error.clone()
+        for degree in np.unique(degrees[degrees > 0]):
+            at = torch.as_tensor(np.flatnonzero(degrees == degree))
+            q, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, self.samples), degree + 1))
+            line = torch.as_tensor(q)
+            out[:, :, at] = error[:, :, at] - line @ (line.T @ error[:, :, at])
+        return out
+
     def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
         """Everything at log-ratios x (B, P)."""
         s = self.simulator
@@ -148,7 +200,7 @@ class WindowModel:
         discrete = self.compressed(s.discretise(values), data)
         forced = s.states(discrete, data.w, x.new_zeros(len(x), discrete.Ad.shape[1]))
         residual = self._signals(data) - forced @ discrete.C.mT - data.w @ discrete.D.mT
-        free = s.free_response(discrete, self.samples)
+        free = self._open(s.free_response(discrete, self.samples), data)
 
         transfer = self.transfer(values, data)
         carried = transfer.drive * self.drive_noise[:, None]
@@ -166,6 +218,7 @@ class WindowModel:
         cost = r.square().sum(dim=(1, 2)) - (along.squeeze(2) * x0_scaled).sum(dim=1)
 
         left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
+        x0 = x0[:, : discrete.Ad.shape[1]]
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
         states = forced + s.free_states(discrete, x0, self.samples)
         J = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
@@ -200,7 +253,8 @@ class WindowModel:
         gradient = at.sensitivities @ r - at.across.mT @ along
         step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
         cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
-        x0 = x0 + (free_part - at.across @ step).squeeze(2) / at.free_scale
+        x0 = x0 + ((free_part - at.across @ step).squeeze(2) / at.free_scale)[:, : x0.shape[1]]
+        error = self._without_trends(error, data.present)
         return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt(), r, outputs, states)
 
     def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
@@ -208,15 +262,16 @@ class WindowModel:
         s = self.simulator
         return s.states(s.discretise(s.element_values(x)), data.w, x0)
 
-    def excitation(self, data: WindowBatch) -> Tensor:
-        """Mean power over bins of the strongest drive, over that of its noise, (B,); about 1 at standstill.
+    def excitation(self, windows: FloatArray) -> FloatArray:
+        """Mean power over bins of the strongest input of windows (B, T, C), over that of its noise, (B,).
 
-        Drives without a stated noise have that of a usual instrument.
+        About 1 at standstill.  Inputs without a stated noise have that of a usual instrument.
         """
-        if not self.simulator.W:
-            return torch.full((len(data.w),), torch.inf, dtype=data.w.dtype)
-        power = self.spectra(data.w[:, :, 0::2]).abs().square() / self.samples
-        return (power / self.usual_noise**2).mean(dim=1).amax(dim=1)
+        inputs = windows[:, :, : len(self.input_noise)]
+        if not inputs.shape[2]:
+            return np.full(len(windows), np.inf)
+        power = self.spectra(torch.as_tensor(inputs)).abs().square().mean(dim=1).numpy() / self.samples
+        return np.asarray((power / self.input_noise**2).max(axis=1))
 
     def by_drive(self, at: Linearisation, value: Tensor, rate: Tensor, data: WindowBatch) -> Tensor:
         """What each drive alone makes the compressed signals show, free responses apart, (B, F, R, W/2).
@@ -389,11 +444,6 @@ def _taken(batch: Any, at: Tensor) -> Any:
     """A dataclass of tensors (B, ...), nested ones included, with only the windows `at`."""
     parts = {f.name: getattr(batch, f.name) for f in fields(batch)}
     return replace(batch, **{n: p[at] if isinstance(p, Tensor) else _taken(p, at) for n, p in parts.items()})
-
-
-def _usual_noise(system: System) -> FloatArray:
-    """Noise of usual instruments for the values of the drives, shape (W/2,)."""
-    return np.array([USUAL_NOISE[system.inputs[value].unit] for value in knot_columns(system)[0]])
 
 
 def _inverse(stiffness: Tensor) -> Tensor:

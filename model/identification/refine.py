@@ -35,6 +35,9 @@ IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not 
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
+_SLACK = (
+    0.5  # rise of the weighted squares that is no failure: the solution with smoothed inputs is not quite its minimum
+)
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
 
 
@@ -112,7 +115,8 @@ class Refiner:
 
         def conclude(at: IntArray) -> Refined:
             with torch.no_grad():
-                return self._result(batch(at), progress, torch.as_tensor(at), states, wanted)
+                excitation = self.model.excitation(windows[at])
+                return self._result(batch(at), progress, torch.as_tensor(at), states, wanted, excitation)
 
         active = everything
         for _ in range(iterations):
@@ -143,9 +147,9 @@ class Refiner:
         at = self.model.linearise(x, data)
         step = _limited(at.step)
         second = self.model.chord(at, x + step, at.state_after(step), data)
-        worse = at.cost > cost * (1 + 1e-6) + 1e-9
+        worse = at.cost > cost * (1 + 1e-6) + _SLACK
         std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
-        held = second.cost <= at.cost * (1 + 1e-6) + 1e-9
+        held = second.cost <= at.cost * (1 + 1e-6) + _SLACK
         small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
         forward = torch.where(held[:, None], x + step + _limited(second.step), x + step / 3)
         # A step that made things worse is taken back to a third.
@@ -169,7 +173,15 @@ class Refiner:
             progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
             progress.score[at_rows], progress.weighed[at_rows] = found.score, True
 
-    def _result(self, data: WindowBatch, progress: _Progress, rows: Tensor, states: bool, wanted: Tensor) -> Refined:
+    def _result(
+        self,
+        data: WindowBatch,
+        progress: _Progress,
+        rows: Tensor,
+        states: bool,
+        wanted: Tensor,
+        excitation: FloatArray,
+    ) -> Refined:
         left = (wanted[rows] & ~progress.weighed[rows]).nonzero().squeeze(1)
         if len(left):  # did not converge: where it stands is as good a point as any to ask what is wrong
             chosen, x = data.take(left), progress.x[rows[left]]
@@ -185,7 +197,7 @@ class Refiner:
             share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
             identifiable[weak] &= share < NOISE_SHARE
         signals = len(self.model.compression(data.present))
-        freedom = 2 * self.model.bins * signals - x0.shape[1] - identifiable.sum(dim=1)
+        freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise, so that intervals stay honest.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
@@ -205,7 +217,7 @@ class Refiner:
             error=progress.error[rows].numpy(),
             rms=rms,
             states=path.numpy(),
-            excitation=self.model.excitation(data).numpy(),
+            excitation=excitation,
             weighed=progress.weighed[rows].numpy(),
             cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),
             information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),

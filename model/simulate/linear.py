@@ -1,7 +1,7 @@
 """Exact discrete solution of the linear system, batched over windows and parameters, differentiable.
 
-Between samples every drive is a cubic through its values and slopes at both ends (Hermite).  A support brings its
-slope along (the measured velocity); a force's slope comes from a spline through its samples.  With z = A h,
+Between samples every drive is a cubic through its values and slopes at both ends (Hermite), see
+`model.simulate.drives`.  With z = A h,
 
     x(h) = e^z x(0) + sum_j a_j Psi_j,    Psi_j = j! (h phi_{j+1}(z) b + phi_j(z) b')
 
@@ -18,12 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.fusion import fuse
+from sprung.model.simulate.drives import knots
 from sprung.model.system import System
 
 _TAYLOR_NORM = 1.0  # 1-norm up to which the Taylor polynomial of degree 15 is exact to double precision
@@ -264,50 +263,6 @@ def phi_functions(z: Tensor) -> Tensor:
         product = (phi.flatten(1, 2) @ phi[:, 0]).reshape(B, 5, N * N)
         phi = (torch.baddbmm(product, mix.expand(B, 5, 5), phi.flatten(2)) * scale).reshape(B, 5, N, N)
     return phi
-
-
-def knot_columns(system: System) -> tuple[list[int], list[int | None]]:
-    """For each drive (a support or a force) the window column of its value and of its slope (None: derived)."""
-    values: list[int] = []
-    slopes: list[int | None] = []
-    columns = system.drive_channels
-    at = 0
-    for source in system.file.inputs.values():
-        value = columns[at]
-        assert value is not None
-        values.append(value)
-        support = source.kind != "force"
-        slopes.append(columns[at + 1] if support else None)
-        at += 2 if support else 1
-    return values, slopes
-
-
-def knots(system: System, windows: FloatArray) -> FloatArray:
-    """Values and slopes of all drives at the samples, (B, T, W) = [value, slope, value, slope, ...].
-
-    Where a support's displacement and velocity are both measured with noise they are fused (`model.simulate.fusion`);
-    slopes that are not measured come from the cubic spline through the samples (not-a-knot ends).
-    """
-    values, slopes = knot_columns(system)
-    out = np.empty((*windows.shape[:2], 2 * len(values)))
-    derived = [i for i, column in enumerate(slopes) if column is None]
-    alike: dict[tuple[float, float], list[int]] = {}  # supports to fuse, by the noises of their two signals
-    for i, (value, slope) in enumerate(zip(values, slopes, strict=True)):
-        out[:, :, 2 * i] = windows[:, :, value]
-        if slope is not None:
-            out[:, :, 2 * i + 1] = windows[:, :, slope]
-            noise = system.inputs[value].noise, system.inputs[slope].noise
-            if min(noise) > 0:
-                alike.setdefault(noise, []).append(2 * i)
-    for noise, at in alike.items():
-        d, v = (np.moveaxis(out[:, :, [i + part for i in at]], 1, 2) for part in (0, 1))
-        d, v = fuse(d, v, 1 / system.sample_rate, noise)
-        out[:, :, at], out[:, :, [i + 1 for i in at]] = np.moveaxis(d, 2, 1), np.moveaxis(v, 2, 1)
-    if derived:
-        samples = out[:, :, [2 * i for i in derived]]
-        time = np.arange(windows.shape[1]) / system.sample_rate
-        out[:, :, [2 * i + 1 for i in derived]] = CubicSpline(time, samples, axis=1)(time, 1)
-    return out
 
 
 def _knot_of(system: System, drive: int) -> int:

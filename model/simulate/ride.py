@@ -13,7 +13,7 @@ from sprung.model.laws.placed import PlacedLaw
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.linear import knots
+from sprung.model.simulate.drives import knots
 from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement
 from sprung.model.system import System
 

@@ -85,6 +85,7 @@ def signals_of(record: MadeRecord) -> Signals:
         support_names=(),
         force_names=("shaker",),
         integrated=np.zeros(0, dtype=bool),
+        accelerated=np.zeros(0, dtype=bool),
     )
 
 

@@ -9,8 +9,11 @@ from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.rules import RULES, RecordRules
+from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
+from sprung.model.simulate.drives import ORDERS
+from sprung.model.simulate.fusion import motion
 from sprung.model.system import System
 
 MINIMUM_SAMPLES = RULES.record.minimum_samples
@@ -59,6 +62,7 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     values = _close_gaps(values[first:last])
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
     _require_motion(system, prepared.signals, rules)
+    _require_accelerometers(system, prepared.signals)
     return prepared
 
 
@@ -72,6 +76,20 @@ def _require_motion(system: System, signals: Signals, rules: RecordRules) -> Non
             f"too still to decide anything: no sensor moves by {rules.moves:g} times its noise "
             f"({signals.sensor_names[best]}: {moves[best]:.2g}, noise {noise[best]:.2g}); "
             "record faster or on rougher track"
+        )
+
+
+def _require_accelerometers(system: System, signals: Signals) -> None:
+    """Over a whole recording a twofold integral wanders further than any sensor of positions may be off."""
+    kinds = system.mechanics.sensor_kind[signals.sensor_index]
+    wandering = [
+        n for n, a, i in zip(signals.support_names, signals.accelerated, signals.integrated, strict=True) if a & i
+    ]
+    other = [n for n, kind in zip(signals.sensor_names, kinds, strict=True) if kind != ACCELERATION]
+    if wandering and other:
+        raise DiagnosisError(
+            f"{wandering[0]} is measured by its acceleration alone: a recording can be diagnosed with accelerometers "
+            f"only; leave {other[0]} out, or measure the displacement or velocity of {wandering[0]} as well"
         )
 
 
@@ -128,7 +146,7 @@ def _by_role(
     notes: list[str],
     first: int,
 ) -> Prepared:
-    displacement, velocity, force = [], [], []
+    displacement, velocity, force, integrated, accelerated = [], [], [], [], []
     support_names, force_names = [], []
     column = 0
     frozen = {name for name, _ in stuck}
@@ -141,19 +159,18 @@ def _by_role(
             force.append(series)
             force_names.append(name)
             continue
-        d = values[:, column]
-        column += 1
-        v = np.full(len(values), np.nan)
-        if source.velocity is not None:
-            v = values[:, column]
-            column += 1
-        if np.isnan(d[0]):
-            if np.isnan(v[0]):
-                raise DiagnosisError(_missing(name, frozen))
-            d = _integral(v) / sample_rate
-            notes.append(f"{name}.displacement is missing: integrated from its velocity")
+        quantities = list(source.measured)
+        there = {q: values[:, column + i] for i, q in enumerate(quantities) if not np.isnan(values[0, column + i])}
+        column += len(quantities)
+        if not there:
+            raise DiagnosisError(_missing(name, frozen))
+        if "displacement" not in there and "displacement" in quantities:
+            notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
+        d, v = _moved(source, there, 1 / sample_rate)
         displacement.append(d)
         velocity.append(v)
+        integrated.append("displacement" not in there)
+        accelerated.append("acceleration" in there)
         support_names.append(name)
     sensors = values[:, column:]
     present = np.isfinite(sensors).all(axis=0)
@@ -173,28 +190,22 @@ def _by_role(
         sensor_names=tuple(np.array(system.sensors)[present]),
         support_names=tuple(support_names),
         force_names=tuple(force_names),
-        integrated=np.array(_integrated(system, values), dtype=bool),
+        integrated=np.array(integrated, dtype=bool),
+        accelerated=np.array(accelerated, dtype=bool),
         start=first / sample_rate,
     )
     return Prepared(signals, stuck, tuple(notes))
 
 
-def _integrated(system: System, values: FloatArray) -> list[bool]:
-    """Supports whose displacement had to be integrated."""
-    result, column = [], 0
-    for source in system.file.inputs.values():
-        if isinstance(source, SupportInput):
-            result.append(bool(np.isnan(values[0, column])))
-            column += 1 + (source.velocity is not None)
-        else:
-            column += 1
-    return result
-
-
-def _integral(series: FloatArray) -> FloatArray:
-    """Of unit-spaced samples, by the antiderivative of their cubic spline."""
-    at = np.arange(len(series))
-    return np.asarray(CubicSpline(at, series).antiderivative()(at))
+def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> tuple[FloatArray, FloatArray]:
+    """Displacement of a support, and its velocity where that is measured beside it and nothing else (else NaN)."""
+    apart = np.full(len(next(iter(measured.values()))), np.nan)
+    if "displacement" in measured and "acceleration" not in measured:
+        return measured["displacement"], measured.get("velocity", apart)
+    by_order = {ORDERS[quantity]: series for quantity, series in measured.items()}
+    noise = {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured}
+    d, _ = motion(by_order, dt, noise)
+    return d, measured.get("velocity", apart) if set(measured) == {"velocity"} else apart
 
 
 def _missing(name: str, frozen: set[str]) -> str:

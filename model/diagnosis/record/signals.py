@@ -5,7 +5,8 @@ Displacement and velocity of the same support tell the same motion twice.  Both 
     D = (D_d / s_d^2 + (V / j w) w^2 / s_v^2) / (1 / s_d^2 + w^2 / s_v^2),   var = 1 / (1 / s_d^2 + w^2 / s_v^2)
 
 drives the model, and the difference V / j w - D_d, which is noise alone and independent of D, tells the noise levels
-and the faults of the input channels.
+and the faults of the input channels.  A measured acceleration is fused with what else there is before
+(`model.simulate.fusion`); it adds w^4 / s_a^2 to 1 / var.
 """
 
 from __future__ import annotations
@@ -19,12 +20,13 @@ from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import ForceInput, SupportInput
 from sprung.model.signals import FloatArray
-from sprung.model.system import System
+from sprung.model.system import USUAL_NOISE, System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _LEAST = 0.2  # of a sensor's declared noise, or of what its fastest changes leave room for
 _ORDER = 8  # of the differences that tell those
 _SEEN = 1e-9  # of a loose motion
+_OPEN = 1e8  # times its noise power: nothing is known of a mean
 _END = 9  # samples that tell the slope at an end of a record
 
 
@@ -41,7 +43,8 @@ class Signals:
     sensor_names: tuple[str, ...]
     support_names: tuple[str, ...]
     force_names: tuple[str, ...]
-    integrated: np.ndarray  # supports whose displacement is only the integral of the velocity, (supports,)
+    integrated: np.ndarray  # supports whose displacement is only an integral, (supports,)
+    accelerated: np.ndarray  # supports in whose displacement a measured acceleration is fused already, (supports,)
     start: float = 0.0  # s, time of the first sample since the start of the recording
 
     @property
@@ -66,6 +69,7 @@ class Noise:
 
     displacement: FloatArray  # m, shape (supports,)
     velocity: FloatArray  # m/s, infinite where not measured, shape (supports,)
+    acceleration: FloatArray  # m/s^2, likewise
     force: FloatArray  # N, shape (forces,)
     sensors: FloatArray  # shape (S,)
     least: FloatArray  # of the sensors' levels: far below what was declared, another noise has taken their place, (S,)
@@ -77,7 +81,8 @@ class Noise:
 
     def support_variance(self, omega: FloatArray) -> FloatArray:
         """Variance of the fused displacement per bin, shape (F, supports)."""
-        return 1 / (1 / self.displacement**2 + (omega[:, None] / self.velocity) ** 2)
+        w = omega[:, None]
+        return 1 / (1 / self.displacement**2 + (w / self.velocity) ** 2 + (w**2 / self.acceleration) ** 2)
 
     def sensor_variance(self, grid: Grid, differentiated: np.ndarray) -> FloatArray:
         """Variance of the compared sensor signals per bin, (F, S); of positions compared by their rates, of the rate.
@@ -85,7 +90,10 @@ class Noise:
         The noise of the record's two ends, where the rate's line is anchored, spreads over all bins alike.
         """
         ends = 2 / (grid.samples * grid.step**2)
-        return self.sensors**2 * np.where(differentiated, grid.omega[:, None] ** 2 + ends, 1.0)
+        variance = self.sensors**2 * np.where(differentiated, grid.omega[:, None] ** 2 + ends, 1.0)
+        if np.any(np.isinf(self.velocity) & np.isfinite(self.acceleration)):
+            variance[0] *= _OPEN  # the mean of an acceleration, whose offset is unknown, moves everything alike
+        return variance
 
 
 @dataclass(frozen=True)
@@ -107,19 +115,20 @@ class Part:
 
 def declared_noise(system: System, signals: Signals) -> Noise:
     """Noise as the system file states it; where it states none, a thousandth of the signal."""
-    displacement, velocity, force = [], [], []
+    displacement, velocity, acceleration, force = [], [], [], []
     at_support = at_force = 0
     for source in system.file.inputs.values():
         if isinstance(source, SupportInput):
-            stated = source.displacement.noise if source.displacement is not None else 0.0
-            level = stated or 1e-3 * _size(signals.displacement[:, at_support])
-            displacement.append(level)
-            if signals.integrated[at_support]:
-                displacement[-1] = _INTEGRATED * max(level, _size(signals.displacement[:, at_support]))
-            measured = source.velocity is not None and np.isfinite(signals.velocity[0, at_support])
-            stated = source.velocity.noise if source.velocity is not None else 0.0
-            level = stated or 1e-3 * _size(signals.velocity[:, at_support])
+            size = _size(signals.displacement[:, at_support])
+            fused = bool(signals.accelerated[at_support])
+            stated = {quantity: address.noise for quantity, address in source.measured.items()}
+            level = stated.get("displacement", 0.0) or 1e-3 * size
+            displacement.append(_INTEGRATED * max(level, size) if signals.integrated[at_support] else level)
+            level = stated.get("velocity", 0.0) or 1e-3 * _size(signals.velocity[:, at_support])
+            measured = np.isfinite(signals.velocity[0, at_support]) or (fused and "velocity" in stated)
             velocity.append(level if measured else np.inf)
+            level = stated.get("acceleration", 0.0) or USUAL_NOISE["m/s^2"]
+            acceleration.append(level if fused else np.inf)
             at_support += 1
         elif isinstance(source, ForceInput):
             force.append(source.noise or 1e-3 * _size(signals.force[:, at_force]))
@@ -130,7 +139,7 @@ def declared_noise(system: System, signals: Signals) -> Noise:
     ]
     levels = np.array(sensors)
     least = _LEAST * np.minimum(levels, _roughness(signals.sensors))
-    return Noise(np.array(displacement), np.array(velocity), np.array(force), levels, least)
+    return Noise(np.array(displacement), np.array(velocity), np.array(acceleration), np.array(force), levels, least)
 
 
 def _roughness(series: FloatArray) -> FloatArray:
@@ -176,7 +185,7 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
     if differentiated.any():
         sensors = np.where(differentiated, rate_of(sensors, grid), sensors)
     omega = grid.omega[:, None]
-    has_rate = np.isfinite(noise.velocity)
+    has_rate = np.isfinite(noise.velocity) & ~signals.accelerated
     d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
     polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
     if d.shape[1]:
@@ -190,7 +199,8 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
     integrated = np.zeros_like(V)
     integrated[1:] = V[1:] / (1j * omega[1:])
     integrated[0] = D[0]
-    precision_d, precision_v = 1 / noise.displacement**2, (omega / noise.velocity) ** 2
+    precision_d = 1 / noise.displacement**2
+    precision_v = np.where(has_rate, (omega / noise.velocity) ** 2, 0.0)
     fused = (D * precision_d + integrated * precision_v) / (precision_d + precision_v)
     pairs = np.flatnonzero(has_rate & ~signals.integrated)
     redundancy = (integrated - D)[:, pairs]
