@@ -39,8 +39,8 @@ def time_domain_bound(
     forced = simulator.simulate(x, w, none)[0].numpy().reshape(-1)
     x0 = torch.as_tensor(np.linalg.lstsq(free, measured - forced, rcond=None)[0][: none.shape[1]])[None]
     step = 1e-5
-    offsets = torch.cat([torch.eye(x.shape[1]), -torch.eye(x.shape[1])]).double() * step
-    moved = simulator.simulate(x + offsets, w.expand(len(offsets), -1, -1), x0.expand(len(offsets), -1))[0]
+    shifts = torch.cat([torch.eye(x.shape[1]), -torch.eye(x.shape[1])]).double() * step
+    moved = simulator.simulate(x + shifts, w.expand(len(shifts), -1, -1), x0.expand(len(shifts), -1))[0]
     up, down = moved.flatten(1).numpy().reshape(2, x.shape[1], -1)
     J = ((up - down) / (2 * step)).T
     covariance = np.diag(np.tile(system.sensor_noise**2, T)) + _input_covariance(system, simulator, x, T, fused)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sprung.benchmarks import ambient
 from sprung.benchmarks.bounds import time_domain_bound
 from sprung.benchmarks.generator import track
-from sprung.benchmarks.generator.exact import Transfer, filtered
+from sprung.benchmarks.generator.exact import VehicleTransfer, filtered
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.model.identification.identify import load_identifier
@@ -112,7 +112,8 @@ def draw_windows(
     """
     vehicle = read_vehicle(SYSTEM)
     seconds = 2 * per_ride * system.window / system.sample_rate
-    clean, truth = [], []
+    clean: list[Array] = []
+    truth: list[Array] = []
     while len(clean) < count:
         ratio = rng.uniform(1 - SPREAD, 1 + SPREAD, 2 * len(vehicle.elements))
         level = np.exp(rng.uniform(np.log(track.LOW_TRACK), np.log(track.HIGH_TRACK)))
@@ -121,7 +122,7 @@ def draw_windows(
         )
         live = np.flatnonzero(omega < 2 * np.pi * 50.0)
         k, c = np.split(ratio, 2)
-        transfer = Transfer(vehicle, vehicle.stiffness * k, vehicle.damping * c, omega[live])
+        transfer = VehicleTransfer(vehicle, vehicle.stiffness * k, vehicle.damping * c, omega[live])
         ride = filtered(transfer, spectra[live], omega[live], samples, seconds, orders)
         wheels = len(vehicle.inputs)  # the generator lists all displacements first, the system wheel by wheel
         inputs = np.arange(len(orders) * wheels).reshape(len(orders), wheels).T.ravel()

@@ -86,6 +86,7 @@ def signals_of(record: MadeRecord) -> Signals:
         force_names=("shaker",),
         integrated=np.zeros(0, dtype=bool),
         accelerated=np.zeros(0, dtype=bool),
+        held=np.zeros(0),
     )
 
 

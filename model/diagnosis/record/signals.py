@@ -45,6 +45,7 @@ class Signals:
     force_names: tuple[str, ...]
     integrated: np.ndarray  # supports whose displacement is only an integral, (supports,)
     accelerated: np.ndarray  # supports in whose displacement a measured acceleration is fused already, (supports,)
+    held: FloatArray  # m, how far off displacements may be that are integrals of accelerations alone, (supports,)
     start: float = 0.0  # s, time of the first sample since the start of the recording
 
     @property
@@ -123,7 +124,9 @@ def declared_noise(system: System, signals: Signals) -> Noise:
             fused = bool(signals.accelerated[at_support])
             stated = {quantity: address.noise for quantity, address in source.measured.items()}
             level = stated.get("displacement", 0.0) or 1e-3 * size
-            displacement.append(_INTEGRATED * max(level, size) if signals.integrated[at_support] else level)
+            if signals.integrated[at_support]:
+                level = signals.held[at_support] or _INTEGRATED * max(level, size)
+            displacement.append(level)
             level = stated.get("velocity", 0.0) or 1e-3 * _size(signals.velocity[:, at_support])
             measured = np.isfinite(signals.velocity[0, at_support]) or (fused and "velocity" in stated)
             velocity.append(level if measured else np.inf)
