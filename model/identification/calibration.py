@@ -116,8 +116,10 @@ class DeviationSensitivity:
         # A reading is (1 + g) y(t - tau): the true motion below is that much smaller and earlier.
         share = self.share[:, None].to(kind)
         value, slope = data.w[:, :, 0::2], data.w[:, :, 1::2]
-        for first, sign, motion in ((0, -1, (value, slope)), (C, 1, (slope, self.slope @ slope))):
-            shown = (at.whiten @ model.by_drive(at, *motion, data)).to(kind)  # (B, F, R, W/2)
+        delayed = (slope, self.slope @ slope)
+        for first, sign, shown in zip(
+            (0, C), (-1, 1), model.by_drive(at, ((value, slope), delayed), data), strict=True
+        ):
             out[..., first : first + self.inputs] = sign * shown[..., self.drive] * share
         columns = self.inputs + torch.as_tensor(np.flatnonzero(data.present))
         shown = model.spectra(after.outputs).to(kind)  # (B, F, S')

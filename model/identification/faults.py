@@ -183,7 +183,7 @@ class Explainer:
         """The simple deviation with the most evidence at its most likely size, shape (H,), and that evidence."""
         V = self.directions
         slope = V @ score
-        curvature = np.einsum("vh,hj,vj->v", V, information, V).clip(1e-12)
+        curvature = ((V @ information) * V).sum(axis=1).clip(1e-12)
         best = int(np.argmax(slope**2 / curvature))
         return np.asarray(V[best] * slope[best] / curvature[best]), float(slope[best] ** 2 / curvature[best] / 2)
 

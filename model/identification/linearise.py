@@ -6,6 +6,7 @@ lost carries no information on the parameters), which also takes absent sensors 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -273,26 +274,33 @@ class WindowModel:
         power = self.spectra(torch.as_tensor(inputs)).abs().square().mean(dim=1).numpy() / self.samples
         return np.asarray((power / self.input_noise**2).max(axis=1))
 
-    def by_drive(self, at: Linearisation, value: Tensor, rate: Tensor, data: WindowBatch) -> Tensor:
-        """What each drive alone makes the compressed signals show, free responses apart, (B, F, R, W/2).
+    def by_drive(self, at: Linearisation, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch) -> list[Tensor]:
+        """What each drive alone makes the whitened signals show, free responses apart, each (B, F, R, W/2).
 
-        value, rate: (B, T, W/2).  Over a finite window the spectrum of the rate is not j w times that of the value.
+        motions: values and rates of the drives, each (B, T, W/2).  Over a finite window the spectrum of the rate is not
+        j w times that of the value.  In single precision.
         """
-        s, kind = self.simulator, at.transfer.compliance.dtype
+        s, kind = self.simulator, torch.complex64
         values = s.element_values(at.x)
-        U, V = (self.spectra(part).unsqueeze(2) for part in (value, rate))  # (B, F, 1, W/2)
-        shown = at.transfer.per_load.new_zeros(*at.transfer.per_load.shape[:3], s.W // 2)
-        if len(s.supports):
-            k, c = (v[:, None, :, None] * s.G for v in (values.stiffness, values.damping))  # (B, 1, E, supports)
-            columns = s.supports // 2
-            shown[..., columns] = at.transfer.per_force @ (k * U[..., columns] + c * V[..., columns])
-            if self.frequency.element_sensors:
-                direct = torch.where((s.kind == DEFLECTION)[:, None], s.L, torch.zeros_like(s.L)) @ s.G
-                shown[..., columns] += self._signal_rows(data, kind) @ direct.to(kind) * U[..., columns]
-        if len(s.forces):
-            columns = s.forces // 2
-            shown[..., columns] = at.transfer.per_load @ s.F.to(kind) * U[..., columns]
-        return shown
+        whiten = at.whiten.to(kind)
+        per_force = whiten @ at.transfer.per_force.to(kind)
+        k, c = ((v[:, None, :, None] * s.G).to(kind) for v in (values.stiffness, values.damping))  # (B, 1, E, supports)
+        found = []
+        for value, rate in motions:
+            U, V = (self.spectra(part).unsqueeze(2).to(kind) for part in (value, rate))  # (B, F, 1, W/2)
+            shown = per_force.new_zeros(*per_force.shape[:3], s.W // 2)
+            if len(s.supports):
+                columns = s.supports // 2
+                shown[..., columns] = per_force @ (k * U[..., columns] + c * V[..., columns])
+                if self.frequency.element_sensors:
+                    direct = torch.where((s.kind == DEFLECTION)[:, None], s.L, torch.zeros_like(s.L)) @ s.G
+                    seen = whiten @ (self._signal_rows(data, kind) @ direct.to(kind))
+                    shown[..., columns] += seen * U[..., columns]
+            if len(s.forces):
+                columns = s.forces // 2
+                shown[..., columns] = whiten @ (at.transfer.per_load.to(kind) @ s.F.to(kind)) * U[..., columns]
+            found.append(shown)
+        return found
 
     def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
         """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).

@@ -42,15 +42,11 @@ class DeviationModel:
     prior: FloatArray  # covariance, shape (H, H)
     walk: FloatArray  # covariance per second, shape (H, H)
     directions: FloatArray  # shape (V, H)
+    loads: BoolArray  # True at loads, shape (H,)
 
     @property
     def size(self) -> int:
         return len(self.kinds)
-
-    @property
-    def loads(self) -> BoolArray:
-        """True at loads, shape (H,)."""
-        return np.array([kind == "load" for kind in self.kinds], dtype=bool)
 
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
@@ -70,7 +66,8 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
         members = (late & (group == number)).astype(float)
         if members.sum() > 1:
             rows.append(members)
-    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H))
+    loads = np.array([kind == "load" for kind in kinds], dtype=bool)
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H), loads)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +119,7 @@ def weigh(
     solved = np.linalg.solve(np.eye(H) + M @ P, np.column_stack([u, M]))
     slope, curvature = solved[:, 0], 0.5 * (solved[:, 1:] + solved[:, 1:].T)
     along = model.directions @ slope
-    information = np.einsum("vh,hj,vj->v", model.directions, curvature, model.directions).clip(1e-12)
+    information = ((model.directions @ curvature) * model.directions).sum(axis=1).clip(1e-12)
     largest = float(np.max(np.abs(along) / np.sqrt(information), initial=0.0))
     bounded = min(1.0, MOST / max(largest, 1e-12))
     calibration, jump = _judged(calibration, model, along, information, bounded, time)
@@ -162,7 +159,7 @@ def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float
     """Belief after a window that speaks of loads only."""
     at = np.flatnonzero(model.loads)
     rows = at + len(belief.mean) - model.size
-    M = found.information[np.ix_(at, at)] * share
+    M = found.information[at][:, at] * share
     off = belief.mean[rows] - found.point[at]
     across = belief.covariance[:, rows]
     gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([-M @ off, M]))

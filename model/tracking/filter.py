@@ -34,7 +34,7 @@ class Belief:
 
     @property
     def level_variance(self) -> FloatArray:
-        return np.diag(self.covariance)[: self.size]
+        return self.covariance.diagonal()[: self.size]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,7 +111,7 @@ def _with_deviations(whole: FloatArray, moved: FloatArray, gain: float, decay: f
 
 def _bounded(covariance: FloatArray, std: FloatArray) -> FloatArray:
     """Shrinks the first rows and columns whose variance passed that of `std`; correlations are kept."""
-    variance = np.diag(covariance)[: len(std)]
+    variance = covariance.diagonal()[: len(std)]
     if np.all(variance <= std**2):
         return covariance
     scale = np.ones(len(covariance))
@@ -135,9 +135,10 @@ def correct(
     covariance holds the estimator's prior and not information.  Errors of overlapping windows are correlated; summed
     over many windows the covariance of one, divided by `share`, gives the right total information.
     """
-    rows = np.flatnonzero(mask)
+    whole = bool(mask.all())
+    rows = slice(0, belief.size) if whole else np.flatnonzero(mask)
     score = np.full(belief.size, np.nan)
-    if len(rows) == 0:
+    if not mask.any():
         return belief, Innovation(score, False)
     residual = value[rows] - belief.mean[rows]
     across = belief.covariance[:, rows]
@@ -146,12 +147,12 @@ def correct(
     own = across[rows]
     if cross is not None:
         own = own - cross[rows] @ across[2 * belief.size :]
-    noise = covariance[np.ix_(rows, rows)]
-    score[rows] = residual / np.sqrt(np.diag(own) + np.diag(noise))
+    noise = covariance if whole else covariance[rows][:, rows]
+    score[rows] = residual / np.sqrt(own.diagonal() + noise.diagonal())
     stretch = np.sqrt(np.maximum(1.0, np.abs(score[rows]) / bound))  # Huber: influence stays at the bound
     noise = noise * np.outer(stretch, stretch)
-    distance = float(residual @ _solve(own + noise, residual)) / len(rows)
-    limit = 1.0 + 2.0 * bound * np.sqrt(2.0 / len(rows))  # mean of chi-square / P, and 2 bound deviations of it
+    distance = float(residual @ _solve(own + noise, residual)) / len(residual)
+    limit = 1.0 + 2.0 * bound * np.sqrt(2.0 / len(residual))  # mean of chi-square / P, and 2 bound deviations of it
     noise = noise * (max(1.0, distance / limit) / share)
     gain = _solve(own + noise, across.T).T
     posterior = belief.covariance - gain @ across.T

@@ -133,7 +133,7 @@ class Tracker:
             usable
             and mask.any()
             and not self._bent(state, estimate)
-            and _proper(estimate.covariance[np.ix_(mask, mask)])
+            and _proper(estimate.covariance if mask.all() else estimate.covariance[mask][:, mask])
         ):
             new, jump = self._fuse(state, estimate, mask, time_ns, centre)
         if usable or not estimate.faults:  # a window whose fault is named is not a riddle
@@ -316,7 +316,7 @@ class Tracker:
                 calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
                 state = replace(state, changes=change_test.restarted(state.changes))
         value, covariance, cross = self._at_belief(estimate, found, calibration, belief, mask)
-        variance = np.where(mask, np.diag(covariance), 1.0)
+        variance = np.where(mask, covariance.diagonal(), 1.0)
         open_ = self._open(calibration, belief, cross)
 
         measured = scatter.update(
@@ -368,7 +368,7 @@ class Tracker:
         if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
             return False
         moved = state.calibration.cross @ np.where(self.model.loads, 0, state.belief.mean[-self.model.size :])
-        return bool(np.any(np.abs(moved) > BENT * np.sqrt(np.diag(estimate.covariance))))
+        return bool(np.any(np.abs(moved) > BENT * np.sqrt(estimate.covariance.diagonal())))
 
     def _armed(self, state: TrackerState) -> bool:
         """Whether the vehicle's baseline is known: before, a deviation is found, but has not jumped."""
@@ -410,8 +410,8 @@ class Tracker:
         if H == 0 or not other.any():
             return np.zeros(len(cross))
         at = np.flatnonzero(other)
-        own = belief.covariance[-H:, -H:][np.ix_(at, at)]
-        return np.asarray(np.einsum("ph,hj,pj->p", cross[:, at], own, cross[:, at]))
+        own = belief.covariance[-H:, -H:][at][:, at]
+        return np.asarray(((cross[:, at] @ own) * cross[:, at]).sum(axis=1))
 
     def _of_baseline(
         self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray, belief: kalman.Belief
