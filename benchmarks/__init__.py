@@ -20,6 +20,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "trust": ("sprung.benchmarks.trust", "windows acknowledged, lost and doubled while the service is killed"),
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
     "sensing": ("sprung.benchmarks.sensing", "every set of sensors: error over the Cramer-Rao bound, coverage"),
+    "sensors": ("sprung.benchmarks.sensors", "wrong gains, delays, signs, channels: named, and no spring accused"),
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),

@@ -268,8 +268,7 @@ class System:
         keep = self.file.model_dump(mode="json", exclude={"hop", "time"})
         signals = [*keep["inputs"].values(), *keep["sensors"].values()]
         signals += [keep["speed"] or {}, *((body["load"] or {}) for body in keep["bodies"].values())]
-        signals += [part for signal in signals for part in signal.values() if isinstance(part, dict)]
-        for signal in signals:
+        for signal in _with_parts(signals):
             for key in _WHERE:
                 signal.pop(key, None)
         for source in keep["inputs"].values():
@@ -283,6 +282,30 @@ class System:
                 part.pop(key, None)
         _without_empty_laws(keep)
         return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+
+    @cached_property
+    def structure(self) -> str:
+        """Hash of what estimates depend on but for their uncertainty: neither names nor noises, ranges or addresses.
+
+        Values of two files with the same structure are the same values.
+        """
+        keep = self.file.model_dump(
+            mode="json", include={"bodies", "elements", "inputs", "sensors", "estimate", "speed"}
+        )
+        for body in keep["bodies"].values():
+            body.pop("load", None)
+        for signal in _with_parts([*keep["inputs"].values(), *keep["sensors"].values(), keep["speed"] or {}]):
+            for key in ("noise", *_WHERE):
+                signal.pop(key, None)
+        for source in keep["inputs"].values():
+            source["kind"] = "displacement" if source["kind"] == "support" else source["kind"]
+        _without_empty_laws(keep)
+        return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _with_parts(signals: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Signals, and the addresses that they hold."""
+    return [*signals, *(part for signal in signals for part in signal.values() if isinstance(part, dict))]
 
 
 def _without_empty_laws(part: Any) -> None:

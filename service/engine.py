@@ -46,6 +46,7 @@ class Engine:
             "sensors": list(self.system.sensors),
             "window": self.system.window,
             "sample_rate": self.system.sample_rate,
+            "structure": self.system.structure,
         }
 
     def identify(

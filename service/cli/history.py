@@ -6,14 +6,11 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from sqlalchemy import select
-
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.settings import settings_with
 from sprung.service.store import fleet, history, open_store
-from sprung.service.store.schema import models
 from sprung.service.times import from_iso
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -50,9 +47,9 @@ def run(
         with opened.read() as connection:
             if not fleet.vehicle_exists(connection, vehicle):
                 raise UserError(f"{settings.store_url}: nothing is known of vehicle {vehicle!r}")
-            model = connection.execute(select(models.c.id).where(models.c.digest == engine.digest)).scalar()
+            model = fleet.known_model(connection, engine.digest, engine.description())
             if model is None:
-                raise UserError(f"{settings.store_url}: nothing was stored with this system and these weights")
+                raise UserError(f"{settings.store_url}: nothing was stored with this system")
             found = history.series(connection, vehicle, model, begin, end, _seconds(resolution), FOREVER)
     body = history_file(engine, vehicle, parameters or known, found, kind)
     if out is None:

@@ -63,10 +63,35 @@ def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
 
 
 def ensure_model(connection: Connection, digest: str, system: str, description: dict[str, Any], now: int) -> int:
-    """The row number of a model, stored when it is new."""
-    row = {"digest": digest, "system": system, "description": description, "created_ns": now}
-    insert_or_ignore(connection, models, [row])
-    return connection.execute(select(models.c.id).where(models.c.digest == digest)).scalar_one()
+    """The row number of a model, stored when it is new; see `known_model`."""
+    there = known_model(connection, digest, description)
+    if there is None:
+        row = {"digest": digest, "system": system, "description": description, "created_ns": now}
+        insert_or_ignore(connection, models, [row])
+        there = connection.execute(select(models.c.id).where(models.c.digest == digest)).scalar_one()
+    return there
+
+
+def known_model(connection: Connection, digest: str, description: dict[str, Any]) -> int | None:
+    """The row number of a stored model, or of one whose values mean the same; None: there is none.
+
+    Other weights, or a system file with another name or other noises, do not make another vehicle: histories and
+    baselines go on.
+    """
+    there = connection.execute(select(models.c.id).where(models.c.digest == digest)).scalar()
+    return _of_same_values(connection, digest, description) if there is None else int(there)
+
+
+def _of_same_values(connection: Connection, digest: str, description: dict[str, Any]) -> int | None:
+    """The newest stored model whose windows read alike and whose values mean the same."""
+    stored = select(models.c.id, models.c.digest, models.c.description).order_by(models.c.id.desc())
+    for number, old_digest, old in connection.execute(stored):
+        if "structure" not in old:  # of an earlier version: other weights of the same file at the most
+            if old_digest.partition("-")[0] == digest.partition("-")[0] and old | description == description and old:
+                return int(number)
+        elif old == description:
+            return int(number)
+    return None
 
 
 def vehicle_exists(connection: Connection, vehicle: str) -> bool:

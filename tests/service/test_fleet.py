@@ -175,7 +175,9 @@ def test_alarms_of_an_earlier_model_stay_in_sight(engine: Engine, tmp_path: Path
     first = build_core(Settings(data_dir=tmp_path), engine)
     with TestClient(create_app(first)):
         alarmed(first, system, "a")
-    other = Engine(system, FakeIdentifier(system, digest="fake-2"), engine.tracker, None)
+    bodies = {**system.file.bodies, "car": system.file.bodies["car"].model_copy(update={"roll_inertia": 6e4})}
+    heavier = System(system.file.model_copy(update={"bodies": bodies}))
+    other = Engine(heavier, FakeIdentifier(heavier, digest="fake-2"), engine.tracker, None)
     second = build_core(Settings(data_dir=tmp_path), other)
     with TestClient(create_app(second)) as client:
         assert client.get("/vehicles").json()["vehicles"][0]["health"] == "out_of_specification"
@@ -183,6 +185,25 @@ def test_alarms_of_an_earlier_model_stay_in_sight(engine: Engine, tmp_path: Path
         line = client.get("/vehicles").json()["vehicles"][0]
         assert line["health"] == "maintenance_required" and line["alarms"] > 0
         assert client.get("/vehicles/a/alarms?active=true").json()["alarms"]
+
+
+def test_other_weights_and_other_noises_go_on_with_the_history(engine: Engine, tmp_path: Path, system: System) -> None:
+    first = build_core(Settings(data_dir=tmp_path), engine)
+    with TestClient(create_app(first)):
+        alarmed(first, system, "a")
+    sensors = {name: s.model_copy(update={"noise": 2 * s.noise}) for name, s in system.file.sensors.items()}
+    noisier = System(system.file.model_copy(update={"name": "renamed", "sensors": sensors}))
+    assert noisier.digest != system.digest and noisier.structure == system.structure
+    other = Engine(noisier, FakeIdentifier(noisier, digest="fake-2"), engine.tracker, None)
+    second = build_core(Settings(data_dir=tmp_path), other)
+    assert second.pipeline.model_id == first.pipeline.model_id
+    with TestClient(create_app(second)) as client:
+        before = client.get("/vehicles/a").json()
+        assert before["health"] == "out_of_specification"
+        feed(second, noisier, "a", 5, first=500)
+        after = client.get("/vehicles/a").json()
+        assert after["windows"]["used"] == before["windows"]["used"] + 5
+        assert after["parameters"][0]["baseline"] == pytest.approx(before["parameters"][0]["baseline"], rel=0.01)
 
 
 def test_a_store_of_an_earlier_version_is_listed_after_the_start(
