@@ -20,6 +20,7 @@ from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
+from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 
 
@@ -190,6 +191,11 @@ def _with_laws(system: System, workers: int) -> Identifies:
     laws = acting_laws(system)
     if not laws:  # faults of measurements alone
         return Undistorted(system, Identifier(system, None, workers))
+    if any(drive.integrated == ORDERS["acceleration"] for drive in drives_of(system)):
+        raise UnusableWindow(
+            f"{system.name}: laws act along deflections, which accelerations alone leave open; "
+            "measure the supports' displacement or velocity as well, or leave the laws out"
+        )
     return Undistorted(system, IdentifierWithLaws(system, laws, workers))
 
 
