@@ -40,7 +40,7 @@ START = 1_800_000_000_000_000_000  # ns
 
 
 @dataclass(frozen=True)
-class Fault:
+class WrongChannel:
     """What is wrong with one channel."""
 
     kind: str
@@ -51,7 +51,7 @@ class Fault:
 
 
 @dataclass(frozen=True)
-class Judged:
+class RideVerdict:
     """What came of a ride."""
 
     accused: int  # springs and dampers with an alarm
@@ -76,7 +76,7 @@ def run(cases: int = 6, seed: int = 5000, file: str = "manchester.yaml", kind: s
                 yield _figures(file, name, size, when, found)
 
 
-def _figures(file: str, name: str, size: float, when: str, found: list[Judged]) -> dict[str, Any]:
+def _figures(file: str, name: str, size: float, when: str, found: list[RideVerdict]) -> dict[str, Any]:
     asked = size >= NAMED_FROM.get(name, 0.0)
     return {
         "figure": "wrong measurement",
@@ -93,7 +93,7 @@ def _figures(file: str, name: str, size: float, when: str, found: list[Judged]) 
     }
 
 
-def _drawn(system: System, kind: str, size: float, begins: float, rng: np.random.Generator) -> Fault:
+def _drawn(system: System, kind: str, size: float, begins: float, rng: np.random.Generator) -> WrongChannel:
     """On any channel, either sign; exchanged channels are of one node and unit."""
     channels = system.channels
     sign = rng.choice([-1.0, 1.0])
@@ -106,11 +106,11 @@ def _drawn(system: System, kind: str, size: float, begins: float, rng: np.random
         ]  # fmt: skip
         if alike or kind != "swapped":
             other = int(rng.choice(alike)) if alike else channel
-            return Fault(kind, sign * size, channel, other, begins)
+            return WrongChannel(kind, sign * size, channel, other, begins)
 
 
 def ride(
-    system: System, fault: Fault | None, rng: np.random.Generator, seconds: float = SECONDS
+    system: System, fault: WrongChannel | None, rng: np.random.Generator, seconds: float = SECONDS
 ) -> tuple[Array, Array]:
     """A measured ride (T, C) at constant speed, with a fault; log-ratios (P,) of the vehicle."""
     vehicle = read_vehicle(SYSTEM)
@@ -157,8 +157,8 @@ def ride(
 
 
 def judge(
-    system: System, identifier: Identifier, tracker: Tracker, values: Array, truth: Array, fault: Fault | None
-) -> Judged:
+    system: System, identifier: Identifier, tracker: Tracker, values: Array, truth: Array, fault: WrongChannel | None
+) -> RideVerdict:
     """What the tracker says of a ride whose windows come as in the service."""
     T, hop = system.window, system.hop
     firsts = np.arange(0, len(values) - T + 1, hop)
@@ -172,7 +172,7 @@ def judge(
     said = bool(tracker.sensors(state)) or any(a.kind in ("sensor", "misfit") for a in state.alarms)
     level, std = tracker.posterior(state)
     off = int(np.sum(np.abs(level - truth) > SILENT * std))
-    return Judged(
+    return RideVerdict(
         accused=sum(a.kind == "change" for a in state.alarms),
         named=named,
         said=said,
@@ -180,7 +180,7 @@ def judge(
     )
 
 
-def _is_named(system: System, tracker: Tracker, state: TrackerState, fault: Fault) -> bool:
+def _is_named(system: System, tracker: Tracker, state: TrackerState, fault: WrongChannel) -> bool:
     """Whether the channel and the kind are told, as a state or as an alarm; others beside do not count against it."""
     names = [channel.name for channel in system.channels]
     told: set[tuple[str, str]] = {(f.channel, f.kind) for f in tracker.sensors(state)}
