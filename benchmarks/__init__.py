@@ -21,6 +21,11 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
     "sensing": ("sprung.benchmarks.sensing", "every set of sensors: error over the Cramer-Rao bound, coverage"),
     "sensors": ("sprung.benchmarks.sensors", "wrong gains, delays, signs, channels: named, and no spring accused"),
+    "nonlinear-tracking": (
+        "sprung.benchmarks.nonlinear_tracking",
+        "vehicles with laws in their file: coverage, errors, windows per second, drift of a law",
+    ),
+    "exchange": ("sprung.benchmarks.exchange", "exports read by other programs, against our own free run"),
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),

@@ -7,19 +7,18 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable
-from itertools import pairwise
 from pathlib import Path
 
 import control
 import numpy as np
 import pytest
 import scipy.io
-from fmpy import extract, read_model_description
-from fmpy.fmi2 import FMU2Model, FMU2Slave
+from fmpy import read_model_description
 from fmpy.validation import validate_fmu
 from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
+from sprung.benchmarks import exchange
 from sprung.model.exchange.fmu import write_fmu
 from sprung.model.exchange.modelica import write_modelica
 from sprung.model.exchange.statespace import ExchangeError, state_space, write_mat, write_npz
@@ -71,56 +70,17 @@ def inputs(seconds: float = 4.0) -> tuple[np.ndarray, np.ndarray]:
     return t, np.stack([z, v, f], axis=1)
 
 
-class Loaded:
-    """An FMU through FMPy's bindings, set up and at rest."""
-
-    def __init__(self, path: Path, kind: type, values: dict[str, float] | None = None) -> None:
-        description = read_model_description(str(path))
-        section = description.coSimulation if kind is FMU2Slave else description.modelExchange
-        folder = extract(str(path), unzipdir=str(path.parent / "unzipped"))
-        self.fmu = kind(
-            guid=description.guid, unzipDirectory=folder, modelIdentifier=section.modelIdentifier, instanceName="a"
-        )
-        self.at = {v.name: v.valueReference for v in description.modelVariables}
-        self.states = len(description.derivatives)
-        self.fmu.instantiate()
-        self.fmu.setupExperiment(startTime=0.0)
-        self.fmu.enterInitializationMode()
-        for name, value in (values or {}).items():
-            self.fmu.setReal([self.at[name]], [value])
-        self.fmu.exitInitializationMode()
-
-    def set(self, u: np.ndarray) -> None:
-        self.fmu.setReal([self.at[name] for name in DRIVES], u.tolist())
-
-    def shown(self, names: tuple[str, ...]) -> list[float]:
-        return self.fmu.getReal([self.at[name] for name in names])
-
-
 DRIVES = ("road.displacement", "road.velocity", "push.force")
 
 
-def cosimulated(
-    path: Path, names: tuple[str, ...], u: np.ndarray, values: dict[str, float] | None = None
-) -> np.ndarray:
-    """Outputs at the samples; inputs continued with the slopes of the cubics through them, in small steps."""
-    loaded, parts = Loaded(path, FMU2Slave, values), 64
-    t = np.arange(len(u)) / RATE
-    fine = CubicSpline(t, u)(np.arange((len(u) - 1) * parts + 1) / (RATE * parts))
-    step, shown = 1 / (RATE * parts), []
-    for k, (now, then) in enumerate(pairwise(fine)):
-        loaded.set(now)
-        if k % parts == 0:
-            shown.append(loaded.shown(names))
-        slopes = ((then - now) / step).tolist()
-        loaded.fmu.setRealInputDerivatives([loaded.at[name] for name in DRIVES], [1] * 3, slopes)
-        loaded.fmu.doStep(currentCommunicationPoint=k * step, communicationStepSize=step)
-    return np.array(shown)
+def cosimulated(path: Path, vehicle: System, u: np.ndarray) -> np.ndarray:
+    """Outputs at the samples, in small steps of its own."""
+    return exchange.cosimulated(path, vehicle, u)
 
 
-def exchanged(path: Path, names: tuple[str, ...], u: np.ndarray) -> np.ndarray:
+def exchanged(path: Path, vehicle: System, u: np.ndarray) -> np.ndarray:
     """Outputs at the samples, its derivatives integrated by SciPy."""
-    loaded = Loaded(path, FMU2Model)
+    loaded = exchange.LoadedFmu(path, "modelExchange")
     t = np.arange(len(u)) / RATE
     drive, n = CubicSpline(t, u), loaded.states
     dx = np.zeros(n)
@@ -130,7 +90,7 @@ def exchanged(path: Path, names: tuple[str, ...], u: np.ndarray) -> np.ndarray:
         state = np.ascontiguousarray(x)
         loaded.fmu.setTime(time)
         loaded.fmu.setContinuousStates(state.ctypes.data_as(pointer), n)
-        loaded.set(drive(time))
+        loaded.set(DRIVES, drive(time))
 
     def rate(time: float, x: np.ndarray) -> np.ndarray:
         put(time, x)
@@ -141,7 +101,7 @@ def exchanged(path: Path, names: tuple[str, ...], u: np.ndarray) -> np.ndarray:
     shown = []
     for time, x in zip(t, path_x, strict=False):
         put(time, x)
-        shown.append(loaded.shown(names))
+        shown.append(loaded.shown(vehicle.sensors))
     return np.array(shown)
 
 
@@ -152,7 +112,7 @@ def test_an_fmu_runs_as_our_own_simulation(laws: str, run: Callable[..., np.ndar
     write_fmu(tmp_path / "car.fmu", vehicle)
     assert validate_fmu(str(tmp_path / "car.fmu")) == []
     _, u = inputs(2.0)
-    theirs, ours = run(tmp_path / "car.fmu", vehicle.sensors, u), simulate_ride(vehicle, u).sensors
+    theirs, ours = run(tmp_path / "car.fmu", vehicle, u), simulate_ride(vehicle, u).sensors
     limit = 1e-6 if laws == "linear" else 1e-3
     for column, name in enumerate(vehicle.sensors):
         error = np.abs(theirs[:, column] - ours[: len(theirs), column]).max()
@@ -167,7 +127,7 @@ def test_the_fmu_names_inputs_outputs_and_parameters(tmp_path: Path) -> None:
     assert by["road.velocity"] == by["push.force"] == "input" and by["strut_f"] == "output"
     _, u = inputs(1.0)
     values = {"strut.damping": 3000.0}
-    found = cosimulated(tmp_path / "car.fmu", ("car_v",), u, values)[:, 0]
+    found = exchange.cosimulated(tmp_path / "car.fmu", system(LAWS["friction"]), u, ("car_v",), values)[:, 0]
     ours = simulate_ride(system(LAWS["friction"]), u, values).sensors[:-1, 1]
     assert np.abs(found - ours).max() < 1e-3 * np.abs(ours).max()
 
