@@ -50,6 +50,33 @@ class TrainingSettings:
     checkpoint_every: int = 100
 
 
+@dataclass(frozen=True, slots=True)
+class WindowCost:
+    """What a window costs on average."""
+
+    iterations: float
+    milliseconds: float  # of a core
+
+
+def what_is_saved(
+    system: System, estimator: Estimator, windows: int = 48, seed: int = 1
+) -> tuple[WindowCost, WindowCost]:
+    """Cost of a window without and with the trained start, on simulated windows of vehicles within +-30 %."""
+    rng = np.random.default_rng(seed)
+    truth = draw_log_ratios(system, windows, 0.3, rng)
+    values = simulate_runs(system, truth, system.window, rng).values
+    refiner = Refiner(system)
+    found = []
+    starts: list[Callable[[], FloatArray | None]] = [lambda: None, lambda: estimator.estimate(values).log_ratio]
+    for start in starts:
+        refiner.refine(values[:4])  # workspaces are made with the first windows
+        begin = time.process_time()
+        refined = refiner.refine(values, start())
+        spent = time.process_time() - begin
+        found.append(WindowCost(float(refined.iterations.mean()), 1e3 * spent / windows))
+    return found[0], found[1]
+
+
 def train(
     system: System,
     out: str | Path,

@@ -166,7 +166,7 @@ def train(
     ] = None,
     steps: Annotated[int | None, typer.Option("--steps", metavar="NUMBER", min=1, help="Optimiser steps.")] = None,
 ) -> int:
-    """Train the estimator for a system; goes on after an interrupt when called again."""
+    """Train the estimator for a system (optional: it saves time, not accuracy); goes on after an interrupt."""
     from sprung.service.cli.train import run
 
     return run(

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sprung.model.identification.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
 from sprung.service.cli.bench import parse
@@ -321,17 +322,22 @@ def test_train_takes_several_recordings_and_tells_how_far_it_is(
 ) -> None:
     asked: dict[str, Any] = {}
 
-    def train(system: System, out: Path, *, recordings: Any, settings: Any, progress: Any) -> None:
+    def train(system: System, out: Path, *, recordings: Any, settings: Any, progress: Any) -> Estimator:
         progress("simulate", 1, 2, float("nan"))
         asked.update(windows=recordings.shape, records=settings.records, out=out)
+        return Estimator(system, new_estimator(system))
 
     monkeypatch.setattr("sprung.model.identification.training.train", train)
     arguments = ["train", "--system", str(csv_system), "--out", str(tmp_path), "--records", "5"]
     assert main([*arguments, "--recordings", str(healthy), str(healthy)]) == 0
     assert asked == {"windows": (2 * 79, 100, 28), "records": 5, "out": tmp_path}
     captured = capsys.readouterr()
-    assert captured.err == "simulate: 1 of 2\n"
-    assert json.loads(captured.out)["out"] == str(tmp_path)
+    assert captured.err.startswith("training is optional: ")
+    assert "\nsimulate: 1 of 2\n" in captured.err
+    assert f"--system {csv_system} --weights {tmp_path}" in captured.err
+    told = json.loads(captured.out)
+    assert told["out"] == str(tmp_path)
+    assert all(cost > 0 for pair in told["saved"].values() for cost in pair)
 
 
 def test_system_tells_what_the_sensors_identify(capsys: pytest.CaptureFixture[str]) -> None:
