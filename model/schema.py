@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
@@ -171,6 +171,9 @@ class SystemFile(Strict):
     hop: int | None = Field(default=None, ge=1)  # samples between window starts; default half a window
     time: TimeKey = TimeKey()
     speed: Annotated[Speed | None, BeforeValidator(_as_speed, json_schema_input_type=float | Speed | None)] = None
+    temperature: Address | None = Field(default=None, description="of the air, or of the bogie: degC, K or degF")
+    yaw_rate: Address | None = Field(default=None, description="of the car or a bogie, rad/s: curves")
+    lateral_acceleration: Address | None = Field(default=None, description="of the car or a bogie: curves")
     bodies: dict[Name, Body] = Field(default_factory=dict)
     inputs: dict[Name, Input] = Field(default_factory=dict)
     elements: dict[Name, Element] = Field(default_factory=dict)
@@ -202,7 +205,13 @@ SI = {
     "pitch_rate": "rad/s",
     "pressure": "Pa",
     "speed": "m/s",
+    "temperature": "degC",
+    "yaw_rate": "rad/s",
+    "lateral_acceleration": "m/s^2",
 }
+
+
+RUNNING = ("temperature", "yaw_rate", "lateral_acceleration")  # how the vehicle runs, measured beside `speed`
 
 
 @dataclass(frozen=True)
@@ -216,11 +225,21 @@ class Parts:
     time: TimeKey | None
     speed: Speed | None
     estimate: Collection[str]
+    running: Mapping[str, Address | None] = field(default_factory=dict)  # temperature, yaw_rate ...
 
     @staticmethod
     def of(file: SystemFile) -> Parts:
         """Those of a file."""
-        return Parts(file.bodies, file.inputs, file.elements, file.sensors, file.time, file.speed, file.estimate)
+        return Parts(
+            file.bodies,
+            file.inputs,
+            file.elements,
+            file.sensors,
+            file.time,
+            file.speed,
+            file.estimate,
+            {key: getattr(file, key) for key in RUNNING},
+        )
 
     def problems(self) -> Iterator[str]:
         """Each as `key: what is wrong`."""
@@ -296,6 +315,9 @@ class Parts:
                 yield f"bodies.{name}.load.pressure", "pressure", body.load.pressure
         if self.speed is not None:
             yield "speed", "speed", self.speed
+        for key, address in self.running.items():
+            if address is not None:
+                yield key, key, address
 
     def _units(self) -> Iterator[str]:
         for key, quantity, address in self.addresses():

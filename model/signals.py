@@ -7,6 +7,7 @@ Times are int64 nanoseconds since the Unix epoch; values are SI, float64; NaN me
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Literal
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+
+CURVE = 0.5  # m/s^2, lateral acceleration from which on a window is one of a curve
 
 Outcome = Literal["used", "repaired", "dropped", "uninformative"]
 
@@ -74,7 +77,23 @@ class Window:
     outcome: Outcome = "used"
     reason: str | None = None  # why it was repaired or dropped
     repaired_samples: int = 0
+    auxiliary: FloatArray | None = None  # mean of `System.auxiliary` while it lasts, shape (A,); NaN: not measured
     new_segment: bool = False  # the first after the clock jumped: its time says nothing about what came before
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """How the vehicle runs during a window; NaN where nobody measures it."""
+
+    speed: float = math.nan  # m/s
+    temperature: float = math.nan  # degC
+    lateral: float = math.nan  # m/s^2, in a curve; the product of speed and yaw rate where only these are measured
+    pressure: tuple[float, ...] = ()  # Pa, of the air springs, one for each load
+
+    @property
+    def curving(self) -> bool:
+        """Whether the vehicle is in a curve that a model of vertical motion need not explain."""
+        return abs(self.lateral) > CURVE
 
 
 FaultKind = Literal["gain", "delay", "frozen", "saturated", "inverted", "swapped"]

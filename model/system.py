@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,8 +17,8 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
-from sprung.model.schema import SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
-from sprung.model.signals import Channel, FloatArray, TimeColumn
+from sprung.model.schema import RUNNING, SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
+from sprung.model.signals import Channel, Conditions, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 
 BUNDLED = Path(__file__).parent / "systems"
@@ -34,6 +35,7 @@ _WHERE = (
     *("gain_std", "delay_std"),
 )
 
+USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
 
 
@@ -62,6 +64,8 @@ class LoadState:
     empty: float  # kg, the mass of the system file
     declared: bool  # the system file says so
     std: float  # of the logarithm of mass over `empty`, before any window
+    least: float | None = None  # kg that it may carry beside `empty`, by the system file
+    most: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,14 +157,32 @@ class System:
 
     @cached_property
     def auxiliary(self) -> tuple[Channel, ...]:
-        """Measured signals that say how the vehicle runs: `speed`, and `BODY.pressure` of loads."""
+        """Measured signals that say how the vehicle runs: `speed`, those of `RUNNING`, and `BODY.pressure` of loads."""
         channels = []
         if self._speed_measured and not self.on_track and self.file.speed is not None:
             channels.append(_channel("speed", "speed", self.file.speed))
+        for key in RUNNING:
+            address = getattr(self.file, key)
+            if address is not None:
+                channels.append(_channel(key, key, address))
         for name, body in self.file.bodies.items():
             if body.load is not None and body.load.pressure is not None:
                 channels.append(_channel(f"{name}.pressure", "pressure", body.load.pressure))
         return tuple(channels)
+
+    def conditions(self, auxiliary: FloatArray | None) -> Conditions:
+        """How the vehicle ran during a window, from its auxiliary values (A,)."""
+        names = [channel.name for channel in self.auxiliary]
+        values = dict(zip(names, [] if auxiliary is None else auxiliary.tolist(), strict=False))
+        speed = values.get("speed", math.nan)
+        if self.file.speed is not None and self.file.speed.value is not None:
+            speed = self.file.speed.value
+        usual = speed if math.isfinite(speed) else USUAL_SPEED
+        lateral = values.get("lateral_acceleration", math.nan)
+        if not math.isfinite(lateral):
+            lateral = usual * values.get("yaw_rate", math.nan)
+        pressure = tuple(values.get(f"{load.body}.pressure", math.nan) for load in self.loads)
+        return Conditions(speed, values.get("temperature", math.nan), lateral, pressure)
 
     @property
     def needed_inputs(self) -> int:
@@ -225,7 +247,8 @@ class System:
         body = self.file.bodies[name]
         mass, most = body.mass.value, None if body.load is None else body.load.max
         std = LOAD_STD if most is None else max(0.5 * np.log1p(most / mass), 0.05)
-        return LoadState(f"{name}.load", name, mass, declared, float(std))
+        least = None if body.load is None else body.load.min
+        return LoadState(f"{name}.load", name, mass, declared, float(std), least, most)
 
     @cached_property
     def load_of_dof(self) -> FloatArray:
@@ -265,7 +288,7 @@ class System:
     @cached_property
     def digest(self) -> str:
         """Hash of everything that the mechanics depends on; addresses and comments do not count."""
-        keep = self.file.model_dump(mode="json", exclude={"hop", "time"})
+        keep = self.file.model_dump(mode="json", exclude={"hop", "time", *RUNNING})
         signals = [*keep["inputs"].values(), *keep["sensors"].values()]
         signals += [keep["speed"] or {}, *((body["load"] or {}) for body in keep["bodies"].values())]
         for signal in _with_parts(signals):
@@ -277,6 +300,8 @@ class System:
         added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
         for body in keep["bodies"].values():
             body.pop("load", None)  # what varies from ride to ride does not make another vehicle
+        if not self.on_track:
+            keep["speed"] = None
         for part, key in [*added, (keep, "speed")]:
             if part.get(key) is None:
                 part.pop(key, None)
@@ -370,6 +395,4 @@ def unsupported(file: SystemFile) -> list[str]:
             f"window: {seconds:g} s is too short to tell vehicle from track where no input is measured; "
             f"{least} samples at the least, a minute ({round(60 * file.sample_rate)}) is usual"
         )
-    if file.speed is not None and file.speed.value is None and not tracks:
-        found.append("speed: a measured speed is not supported by identification yet; give a number in m/s")
     return found

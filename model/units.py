@@ -31,9 +31,11 @@ FACTORS: dict[str, dict[str, float]] = {  # SI unit -> other names of it -> how 
         **{"Pa": 1.0, "hPa": 1e2, "kPa": 1e3, "MPa": 1e6, "mbar": 1e2, "bar": 1e5},
         **{"psi": POUND_FORCE / INCH**2, "atm": 101325.0},
     },
+    "degC": {"degC": 1.0, "K": 1.0, "degF": 5 / 9},
     "kg": {"kg": 1.0, "g": 1e-3, "t": 1e3, "lb": POUND},
     "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "d": 86400.0},
 }
+ZEROS = {"K": -273.15, "degF": -32.0}  # added to what is counted from another zero
 RAW: dict[str, float] = {  # what a transducer puts out: only a scale makes a quantity of it
     **{"V": 1.0, "mV": 1e-3, "uV": 1e-6, "A": 1.0, "mA": 1e-3, "Ohm": 1.0, "mV/V": 1e-3},
     **{"count": 1.0, "digit": 1.0, "LSB": 1.0, "%": 1e-2, "1": 1.0},
@@ -93,6 +95,7 @@ def to_si(unit: str | None, si: str, scale: float | None, offset: float, sign: i
         raise UnitError(f"{unit!r} is no unit of {si}; {hint} {', '.join(FACTORS[si])}; or V, mA, count with a scale")
     if name in FACTORS[si]:
         factor = FACTORS[si][name]
+        offset += ZEROS.get(name, 0.0)
         return sign * gain * factor, sign * offset * factor
     if scale is None:
         raise UnitError(f"{unit} alone says nothing about {si}; give `scale:` in {si} per {_per(name)}")

@@ -15,6 +15,7 @@ from cantools.database import Database
 from sprung.model.signals import ANY_TIME, Channel, SampleBlock, Tally, TimeColumn
 from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.beside import Beside
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
@@ -51,8 +52,11 @@ class Recording:
         source: Iterator[SampleBlock],
         account: Account,
         start: int | None = None,
+        beside: int = 0,
     ) -> None:
+        """beside: of the channels, the last ones that may be missing, and come at rates of their own."""
         self.path = path
+        self.beside = beside
         self.channels = tuple(channels)
         self.account = account
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
@@ -65,10 +69,19 @@ class Recording:
         """Its times are those of sampling; on a bus they are those of arrival."""
         return self.path.suffix.lower() not in CAN_READERS
 
-    def at_rate(self, sample_rate: float) -> Iterator[SampleBlock]:
+    def at_rate(
+        self, sample_rate: float, apart: Callable[[SampleBlock], SampleBlock] | None = None
+    ) -> Iterator[SampleBlock]:
         """`blocks`, channels of much higher rates reduced to that of the grid; raises UnreadableRecording also when all
-        are too slow for it."""
-        return at_rate(self.blocks(), self.channels, sample_rate, self.account, self.path)
+        are too slow for it.
+
+        apart: takes out of a block what needs no grid, the channels `beside`; left out, they are dropped.
+        """
+        blocks = self.blocks()
+        if self.beside:
+            apart = apart or Beside(len(self.channels) - self.beside, self.beside).keep
+            blocks = (left for left in map(apart, blocks) if len(left.time))
+        return at_rate(blocks, self.channels[: len(self.channels) - self.beside], sample_rate, self.account, self.path)
 
     def blocks(self) -> Iterator[SampleBlock]:
         """Blocks in file order; raises UnreadableRecording when none of the channels is in the file, or when it
@@ -86,7 +99,7 @@ class Recording:
                     shift = self._shift(int(block.time.min()))
                 yield SampleBlock(block.time + shift, block.channel, block.value) if shift else block
         self._screen.tell()
-        if not self.seen.any():
+        if not self.seen[: len(self.seen) - self.beside].any():
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():
             names = [channel.name for channel, seen in zip(self.channels, self.seen, strict=True) if not seen]
@@ -160,6 +173,7 @@ def open_recording(
     time_source: str | Mapping[str, str] = "auto",
     time: TimeColumn = ANY_TIME,
     start: int | None = None,
+    beside: Sequence[Channel] = (),
 ) -> Recording:
     """Choose the reader by the file's extension; raises UnreadableRecording with one line.
 
@@ -167,8 +181,9 @@ def open_recording(
     (header stamp where the messages carry one, else publish time), "header", "publish" or "log"; or a table by
     channel name.  `time` says where tables keep their times.  `start` (ns since 1970) is when a
     recording began whose times count from 0; without it such times stay as they are.
+    `beside` are channels that follow the others and may be missing, such as `System.auxiliary`.
     """
-    path = Path(path)
+    path, channels = Path(path), (*channels, *beside)
     extension = kind_of(path)
     account = Account()
     if extension == ".mcap":
@@ -185,7 +200,7 @@ def open_recording(
         if dbc is None:
             raise UnreadableRecording(f"{path}: a CAN recording needs a CAN database; name it with --dbc")
         source = _decoded(CAN_READERS[extension](path, account), CanDecoder(channels, dbc), account)
-    return Recording(path, channels, source, account, start)
+    return Recording(path, channels, source, account, start, len(beside))
 
 
 def _whatever(path: Path, source: Iterator[SampleBlock], account: Account) -> Iterator[SampleBlock]:

@@ -15,6 +15,7 @@ from sprung.model.identification.deviations import deviations
 from sprung.model.identifier import Identifies
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.tracking.alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
@@ -108,4 +109,5 @@ def make_tracker(system: System) -> Tracker:
     """The tracker of a system, told its window and hop."""
     rate = system.sample_rate
     settings = TrackerSettings(window=system.window / rate, hop=system.hop / rate)
-    return Tracker(system.tracked, settings, deviations(system))
+    limits = {load.body: LoadLimit(load.empty, load.least, load.most) for load in system.loads if load.declared}
+    return Tracker(system.tracked, settings, deviations(system), limits=limits)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from sprung.model.signals import Estimate, Window
+from sprung.model.signals import Conditions, Estimate, Window
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from sprung.service.times import AHEAD
 
@@ -16,7 +16,14 @@ class Followed:
     state: TrackerState
     last: int = -1  # ns, start of the newest window that the tracker has seen
 
-    def after(self, tracker: Tracker, window: Window, estimate: Estimate | None, now: int) -> Followed:
+    def after(
+        self,
+        tracker: Tracker,
+        window: Window,
+        estimate: Estimate | None,
+        now: int,
+        conditions: Conditions | None = None,
+    ) -> Followed:
         """After one more window; itself where the window is older than what the tracker has seen.
 
         An older one is followed all the same when the clock must have been wrong: where the clock of its stream
@@ -30,4 +37,4 @@ class Followed:
             return at
         if estimate is None:
             return replace(at, state=tracker.missed(at.state))
-        return Followed(tracker.update(at.state, estimate, window.start), window.start)
+        return Followed(tracker.update(at.state, estimate, window.start, conditions), window.start)

@@ -19,6 +19,7 @@ from typing import Protocol
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.signals import SampleBlock, Tally, Window
+from sprung.replay.beside import Beside
 from sprung.service.compute import Priority
 from sprung.service.errors import Busy
 from sprung.service.feed import OnTally
@@ -152,18 +153,19 @@ class LiveFeed:
         """Source -> windows, begun again after whatever went wrong."""
         turn, retry = self._turn, FIRST_RETRY
         while not self._stopping.is_set() and turn == self._turn:
-            windower = windower_of(self._pipeline.engine.system)
+            system = self._pipeline.engine.system
+            windower, beside = windower_of(system), Beside(len(system.channels), len(system.auxiliary))
             try:
                 for block in self.source.blocks():
                     if self._stopping.is_set() or turn != self._turn:
                         return
                     self._last_block, retry = time.monotonic(), FIRST_RETRY
                     self._trouble, self._hung = "", False
-                    for window in windower.push(block):
-                        self._offer(window)
+                    for window in windower.push(beside.keep(block)):
+                        self._offer(beside.to(window))
                     self._on_tally(self.source.tally)
                 for window in windower.flush():
-                    self._offer(window)
+                    self._offer(beside.to(window))
                 self._on_tally(self.source.tally)
                 self._ended = True
                 return

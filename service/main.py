@@ -140,7 +140,7 @@ def live_feed(core: Core, text: str, vehicle: str | None) -> LiveFeed:
     bus = LiveBus(
         address.interface,
         address.channel,
-        core.engine.system.channels,
+        (*core.engine.system.channels, *core.engine.system.auxiliary),
         core.engine.dbc,
         stop=core.stopping,
         **address.options,

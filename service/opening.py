@@ -16,7 +16,7 @@ def open_stream(path: Path, system: System, dbc: Path | None = None, start: int 
     """
     if start is None and path.is_file():
         start = path.stat().st_mtime_ns
-    return open_recording(path, system.channels, dbc=dbc, time=system.time, start=start)
+    return open_recording(path, system.channels, dbc=dbc, time=system.time, start=start, beside=system.auxiliary)
 
 
 def open_record(path: Path, system: System, dbc: Path | None = None, start: int | None = None) -> Record:

@@ -203,7 +203,9 @@ class Pipeline:
         for window, estimate in zip(windows, estimates, strict=True):
             posterior, before = None, followed
             if window.start not in skip:
-                followed = followed.after(tracker, window, estimate, now)
+                followed = followed.after(
+                    tracker, window, estimate, now, self.engine.system.conditions(window.auxiliary)
+                )
             fed = estimate is not None and followed.last == window.start and followed is not before
             if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
                 posterior = Posterior(*tracker.posterior(followed.state))

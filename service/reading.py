@@ -12,6 +12,7 @@ from typing import Any, Protocol, TypeVar
 
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.system import System
+from sprung.replay.beside import Beside
 from sprung.replay.pacing import paced
 from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
@@ -107,6 +108,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     system = request.system
     recording = open_stream(request.path, system, request.dbc, request.start)
     windower, spans = windower_of(system, recording.stamped), Spans()
+    beside = Beside(len(system.channels), len(system.auxiliary))
     held: list[Window] = []
     whole = 0
     told = time.monotonic()
@@ -116,16 +118,16 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
         emit(ReadWindows(held, _copy(recording.tally), recording.vehicle))
         held, told = [], time.monotonic()
 
-    for block in paced(spans.watch(recording.at_rate(system.sample_rate)), request.speed):
+    for block in paced(spans.watch(recording.at_rate(system.sample_rate, beside.keep)), request.speed):
         for window in windower.push(block):
-            held.append(window)
+            held.append(beside.to(window))
             whole += 1
             if len(held) >= request.batch_windows:
                 tell()
         if time.monotonic() - told > SIGN_OF_LIFE_SECONDS:
             tell()
     last = windower.flush()
-    held += last
+    held += [beside.to(window) for window in last]
     for first in range(0, len(held), request.batch_windows):
         emit(ReadWindows(held[first : first + request.batch_windows], _copy(recording.tally), recording.vehicle))
     said = remarks(windower, whole + len(last))

@@ -6,6 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
             r.baseline,
             r.drift,
             r.drift_std,
-            alarmed.get(r.name) or (alarmed.get(f"*.{p.quantity}") if r.baseline is not None else None),
+            alarmed.get(r.name) or (_of_kind(alarmed, r.name) if r.baseline is not None else None),
         )
         for r, p in zip(reports, engine.system.tracked, strict=True)
     )
@@ -180,6 +181,13 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         per_sensor,
         engine.tracker.sensors(state),
         _loads(engine, state),
+    )
+
+
+def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
+    """Severity of an alarm of all elements of a kind, `*.damping` or `primary_*.damping`, to which one belongs."""
+    return next(
+        (s for pattern, s in alarmed.items() if pattern and "*" in pattern and fnmatchcase(name, pattern)), None
     )
 
 

@@ -19,6 +19,7 @@ from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System, load_system, parse_system
 from sprung.model.tracking.tracker import Alarm, ParameterReport
+from sprung.replay.beside import Beside
 from sprung.replay.record import Record
 from sprung.replay.recording import Recording
 from sprung.service.engine import Engine, make_tracker
@@ -171,7 +172,8 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
             estimates = iter(found)
         for window in windows:
             estimate = None if window.outcome == "dropped" else next(estimates)
-            followed = followed.after(engine.tracker, window, estimate, now_ns())
+            conditions = system.conditions(window.auxiliary)
+            followed = followed.after(engine.tracker, window, estimate, now_ns(), conditions)
         count += len(whole)
     state = followed.state
     return Tracked(engine.tracker.report(state), state.alarms, engine.tracker.health(state), count)
@@ -181,12 +183,13 @@ def _cut(system: System, recording: Recording) -> Iterator[list[Window]]:
     """Windows in batches, in order of time."""
     windower = windower_of(system, recording.stamped)
     held: list[Window] = []
-    for block in recording.at_rate(system.sample_rate):
-        held += windower.push(block)
+    beside = Beside(len(system.channels), len(system.auxiliary))
+    for block in recording.at_rate(system.sample_rate, beside.keep):
+        held += map(beside.to, windower.push(block))
         while len(held) >= AT_ONCE:
             yield held[:AT_ONCE]
             held = held[AT_ONCE:]
-    held += windower.flush()
+    held += map(beside.to, windower.flush())
     for first in range(0, len(held), AT_ONCE):
         yield held[first : first + AT_ONCE]
 

@@ -9,7 +9,7 @@ import pytest
 from sprung.model.schema import SI, SystemFileError
 from sprung.model.system import System, load_system, parse_system
 from sprung.model.systemfile import json_schema, parse_system_file
-from sprung.model.units import FACTORS, UnitError, to_si
+from sprung.model.units import FACTORS, ZEROS, UnitError, to_si
 from sprung.service.cli import main
 from tests.test_system import QUARTER_CAR
 
@@ -88,7 +88,10 @@ def test_every_unit_of_the_tables_is_found_by_its_own_name():
     for si, names in FACTORS.items():
         assert names[si] == 1.0
         for name, factor in names.items():
-            assert to_si(name, si, 2.0, 3.0, -1) == (pytest.approx(-2 * factor), pytest.approx(-3 * factor))
+            zero = -(3.0 + ZEROS.get(name, 0.0)) * factor
+            assert to_si(name, si, 2.0, 3.0, -1) == (pytest.approx(-2 * factor), pytest.approx(zero))
+    assert to_si("degF", "degC", None, 212.0, 1)[1] == pytest.approx(100.0)
+    assert to_si("K", "degC", None, 0.0, 1) == (1.0, -273.15)
 
 
 def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale():

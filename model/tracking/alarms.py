@@ -11,15 +11,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from itertools import takewhile
 
 import numpy as np
 
 from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations as dev
+from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.deviations import DeviationModel, Jump
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
+from sprung.model.tracking.weather import WeatherModel
 
 CERTAIN = 2.5  # standard deviations within which two explanations are equally good
 LARGEST = {"gain": 0.3, "delay": 0.03, "load": 0.7}  # a deviation beyond this is none that a sensor has for long
@@ -27,6 +31,8 @@ PATIENCE = 20.0  # s that an alarm waits for windows weighed for deviations
 ALIKE = 0.35  # of the common change: elements within this of it move together
 MOST_OF = 0.75  # of the elements of a kind
 FEWEST = 4  # elements that can be said to move together
+RECOVERED = 0.6  # of the change that opens an alarm of a kind: below it is over
+LOAD_KNOWN = 0.02  # standard deviation of a load that can be said to be beyond a limit
 WINDOWS = 6  # windows that a frozen or reversed channel needs to be told
 HARD = ("frozen", "saturated", "inverted", "swapped")
 
@@ -35,8 +41,25 @@ HARD = ("frozen", "saturated", "inverted", "swapped")
 class Drift:
     """Posterior over baseline of every parameter."""
 
-    change: FloatArray  # value / baseline - 1, shape (P,)
+    change: FloatArray  # value / baseline - 1, apart from what all of a kind have in common, shape (P,)
     std: FloatArray
+    whole: FloatArray  # with it, but for the slow part that is weather
+
+
+@dataclass(frozen=True, slots=True)
+class LoadLimit:
+    """What a body may carry, kg beside its empty mass."""
+
+    empty: float  # kg
+    least: float | None
+    most: float | None
+
+    def beyond(self, ratio: float) -> float:
+        """kg above the most, or (negative) below the least, of a mass whose logarithm over the empty one is `ratio`."""
+        carried = self.empty * float(np.expm1(ratio))
+        if self.most is not None and carried > self.most:
+            return carried - self.most
+        return min(0.0, carried - self.least) if self.least is not None else 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +70,8 @@ class Attribution:
     settings: TrackerSettings
     deviations: tuple[Deviation, ...]
     model: DeviationModel
+    weather: WeatherModel
+    limits: dict[str, LoadLimit]
 
     @property
     def kinds(self) -> list[str]:
@@ -55,14 +80,23 @@ class Attribution:
 
     def after(self, state: TrackerState, drift: Drift, jump: Jump | None, now: int) -> tuple[Alarm, ...]:
         """Alarms after a window."""
-        quiet = not state.active and state.misfit_since is None and not state.changes.active.any()
+        common = self._common_changes(state)
+        overloaded = self._overloads(state)
+        quiet = not (state.active or state.changes.active.any() or common or overloaded)
+        quiet = quiet and state.misfit_since is None
         if quiet and jump is None and not state.stuck:
             return state.alarms
         alarms = [self._kept_open(alarm, state, drift, now) for alarm in state.alarms]
-        if jump is not None and jump.kind != "load" and abs(jump.size) >= dev.JUMPED[jump.kind]:
+        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMPED[jump.kind]:
             alarms = self._with_sensor(alarms, state, jump, now)
         alarms = self._with_stuck(alarms, state, now)
+        alarms = self._with_common(alarms, common, now)
         alarms = self._with_changes(alarms, state, drift, now)
+        alarms += [
+            self._overload(Alarm("load", f"{body}.load", now, now, "warning"), excess, std)
+            for body, (excess, std) in overloaded.items()
+            if not any(a.kind == "load" and a.closed is None and a.parameter == f"{body}.load" for a in alarms)
+        ]
         if state.misfit_since is not None and not any(a.kind == "misfit" and a.closed is None for a in alarms):
             alarms.append(Alarm("misfit", None, state.misfit_since, now, "warning"))
         return self._latest(alarms)
@@ -75,16 +109,80 @@ class Attribution:
             return alarm if state.misfit_since is not None else _closed(alarm, now)
         if alarm.kind == "sensor":
             return self._sensor_followed(alarm, state, now)
+        if alarm.kind == "load":
+            return self._load_followed(alarm, state, now)
         name = alarm.parameter or ""
-        if name.startswith("*."):
-            members = self._of_kind(name[2:])
-            if not state.changes.active[members].any():
+        if "*" in name:
+            members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
+            still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
+            if not (still or state.changes.active[members].any()):
                 return _closed(alarm, now)
-            return self._followed(alarm, *_common(drift, members))
+            return self._followed(alarm, *_common(replace(drift, change=drift.whole), members))
         i = self.names.index(name)
         if state.changes.active[i] == 0:
             return _closed(alarm, now)
         return self._followed(alarm, float(drift.change[i]), float(drift.std[i]))
+
+    def _common_changes(self, state: TrackerState, share: float = 1.0) -> list[tuple[str, float, float]]:
+        """Kinds that moved as no weather does: name, change and its standard deviation.
+
+        share: of what opens an alarm.  Kinds of one quantity that move alike are one.
+        """
+        weather, model = state.weather, self.weather
+        if weather is None or not model.groups:
+            return []
+        odd = weathers.unusual(weather, model, self.names, share)
+        out, told = [], set()
+        for g in np.flatnonzero(odd).tolist():
+            quantity = self.kinds[int(np.flatnonzero(model.group == g)[0])]
+            alike = [o for o in range(model.groups) if self.kinds[int(np.flatnonzero(model.group == o)[0])] == quantity]
+            everything = all(weather.common[o] * weather.common[g] > 0.25 * weather.common[g] ** 2 for o in alike)
+            name = f"*.{quantity}" if everything else self._kind_name(g)
+            if name not in told:
+                told.add(name)
+                change = float(np.expm1(np.mean(weather.common[alike if everything else [g]])))
+                out.append((name, change, float(np.sqrt(weather.variance[g]))))
+        return out
+
+    def _kind_name(self, group: int) -> str:
+        """`primary_*.damping`: what the names of a kind have in common."""
+        members = [self.names[i] for i in np.flatnonzero(self.weather.group == group)]
+        quantity = members[0].rpartition(".")[2]
+        letters = zip(*(m.rpartition(".")[0] for m in members), strict=False)
+        prefix = "".join(c[0] for c in takewhile(lambda column: len(set(column)) == 1, letters))
+        return f"{prefix.rstrip('0123456789')}*.{quantity}"
+
+    def _with_common(self, alarms: list[Alarm], common: list[tuple[str, float, float]], now: int) -> list[Alarm]:
+        """Opens one alarm for a kind that moved together."""
+        opened = [a.parameter or "" for a in alarms if a.closed is None and a.kind == "change"]
+        fresh = [c for c in common if not any(fnmatchcase(c[0], name) for name in opened)]
+        return alarms + [
+            self._followed(Alarm("change", name, now, now, "warning", 0.0, 0.0, 0.0), change, std)
+            for name, change, std in fresh
+        ]
+
+    def _overloads(self, state: TrackerState, certain: float = CERTAIN) -> dict[str, tuple[float, float]]:
+        """Bodies that carry more, or less, than they may: by how much of the empty mass, and its standard deviation."""
+        found = {}
+        H = len(self.deviations)
+        for h, deviation in enumerate(self.deviations):
+            limit = self.limits.get(deviation.name) if deviation.kind == "load" else None
+            if limit is None or state.calibration.recent[-1] == 0:
+                continue
+            value, std = float(state.belief.mean[-H:][h]), float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
+            excess = limit.beyond(value) / limit.empty
+            if std < LOAD_KNOWN and abs(excess) > certain * std * np.exp(value):
+                found[deviation.name] = (excess, std * float(np.exp(value)))
+        return found
+
+    def _load_followed(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
+        body = (alarm.parameter or "").removesuffix(".load")
+        found = self._overloads(state, 0.0).get(body)
+        return _closed(alarm, now) if found is None else self._overload(alarm, *found)
+
+    def _overload(self, alarm: Alarm, excess: float, std: float) -> Alarm:
+        peak = excess if abs(excess) > abs(alarm.peak or 0.0) else alarm.peak
+        return replace(alarm, change=excess, std=std, peak=peak)
 
     def _with_changes(self, alarms: list[Alarm], state: TrackerState, drift: Drift, now: int) -> list[Alarm]:
         """Opens alarms of parameters whose test has left the baseline."""
@@ -93,15 +191,18 @@ class Attribution:
         for i in np.flatnonzero(state.changes.active).tolist():
             together = f"*.{self.kinds[i]}"
             members = self._of_kind(self.kinds[i])
-            if self.names[i] in alarmed or (together in alarmed and self._moves_along(i, drift, members)):
+            kinds = [name for name in alarmed if name and "*" in name and fnmatchcase(self.names[i], name)]
+            whole = replace(drift, change=drift.whole)
+            along = self._moves_along(int(i), whole, members)
+            if self.names[i] in alarmed or (kinds and along):
                 continue
             since = state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since
             others = self._alternatives(int(i), state, drift, int(since[i]), now)
             if others is None:
                 continue
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
-            if together not in alarmed and self._all_move(drift, members):
-                name, (change, std), others = together, _common(drift, members), ()
+            if not kinds and along and self._all_move(whole, members):
+                name, (change, std), others = together, _common(whole, members), ()
             alarm = Alarm("change", name, int(since[i]), now, "warning", 0.0, 0.0, 0.0, alternatives=others)
             alarmed.add(name)
             out.append(self._followed(alarm, change, std))
@@ -140,7 +241,7 @@ class Attribution:
         found = []
         for h, deviation in enumerate(self.deviations):
             slope = calibration.cross[i, h]
-            if deviation.kind == "load" or calibration.curvature[h] <= 0 or slope == 0:
+            if deviation.kind not in LARGEST or deviation.kind == "load" or calibration.curvature[h] <= 0 or slope == 0:
                 continue
             needed = moved / -slope  # a reading that is too large by this moves the estimate so
             std = calibration.curvature[h] ** -0.5

@@ -64,11 +64,12 @@ def update(
     time: int,  # ns, centre of the window
     settings: TrackerSettings,
     plausible: FloatArray | None = None,  # `value` with outliers pulled in, for the baseline, shape (..., P)
+    doubt: FloatArray | float = 0.0,  # variance of the baseline beyond its own, at this window's conditions
 ) -> Changes:
     """After one window: tests, then learns."""
     armed = mask & (changes.learned >= settings.learning)
     variance = np.where(mask, variance, 1.0)
-    tested, highest, threshold = _tested(changes, value, variance, armed, time, settings)
+    tested, highest, threshold = _tested(changes, value, variance, armed, time, settings, doubt)
     quiet = (highest < QUIET * threshold) & (tested.active == 0)
     refining = quiet & (changes.weight < settings.baseline_std**-2)
     gain = np.where(mask & (~armed | refining), 1.0 / variance, 0.0)
@@ -87,10 +88,11 @@ def _tested(
     armed: BoolArray,
     time: int,
     settings: TrackerSettings,
+    doubt: FloatArray | float,
 ) -> tuple[Changes, FloatArray, FloatArray]:
     """Statistics and alarms after one window where `armed`; the larger statistic and the threshold, (..., P)."""
     baseline = changes.weighted / np.maximum(changes.weight, np.finfo(float).tiny)
-    spread = 1.0 / np.maximum(changes.weight, settings.prior**-2)
+    spread = 1.0 / np.maximum(changes.weight, settings.prior**-2) + doubt
     size, threshold = design(settings.evidence(value.shape[-1]), settings.change, spread)
     offset = np.where(armed, value - baseline, 0.0)
     scale = np.where(armed, size / variance, 0.0)

@@ -31,6 +31,7 @@ LOAD_WALK = 1e-3  # per sqrt(s), of a running vehicle: 1 % in two minutes
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
 JUMPED = {"gain": 0.005, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
+LOST_LOAD = 6.0  # deviations of one window from the believed load beyond which it is taken for another
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
 
 
@@ -206,13 +207,30 @@ def _loosened(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Ju
     return replace(belief, covariance=belief.covariance + np.outer(open_, open_) + np.outer(taken, taken))
 
 
-def boarded(belief: Belief, model: DeviationModel) -> Belief:
-    """Belief after a stop: any load."""
-    covariance = belief.covariance.copy()
-    at = np.flatnonzero(model.loads) + len(belief.mean) - model.size
+def boarded(
+    belief: Belief, model: DeviationModel, mean: FloatArray | None = None, variance: FloatArray | None = None
+) -> Belief:
+    """Belief after a stop: any load, or what is known of it, `mean` and `variance` (L,)."""
+    covariance, state = belief.covariance.copy(), belief.mean.copy()
+    first = len(belief.mean) - model.size
+    at = np.flatnonzero(model.loads) + first
     covariance[at, :] = covariance[:, at] = 0.0
     covariance[at, at] = np.diag(model.prior)[model.loads]
-    return replace(belief, covariance=covariance)
+    if mean is not None and variance is not None:
+        state[at], covariance[at, at] = mean, variance
+    return replace(belief, mean=state, covariance=covariance)
+
+
+def moved(belief: Belief, model: DeviationModel, found: Deviating) -> bool:
+    """Whether a window's loads are none that the belief allows: something was put on, or let down, on the way."""
+    at = np.flatnonzero(model.loads)
+    information = found.information[np.ix_(at, at)]
+    if not len(at) or np.any(np.diag(information) <= 0):
+        return False
+    rows = at + len(belief.mean) - model.size
+    off = belief.mean[rows] - found.point[at]
+    spread = np.linalg.inv(information) + belief.covariance[np.ix_(rows, rows)]
+    return bool(off @ np.linalg.solve(spread, off) > LOST_LOAD**2)
 
 
 def unsure(belief: Belief, model: DeviationModel) -> Belief:

@@ -11,6 +11,7 @@ import numpy as np
 
 from sprung.model.signals import FaultKind, FloatArray, IntArray
 from sprung.model.tracking import deviations
+from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
 from sprung.model.tracking.deviations import DeviationRecord
@@ -18,9 +19,10 @@ from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.misfit import MisfitFloor
 from sprung.model.tracking.scatter import Scatter
 from sprung.model.tracking.surprise import Surprise
+from sprung.model.tracking.weather import Weather
 
-FORMAT = 2
-_READ = (1, FORMAT)
+FORMAT = 3
+_READ = (1, 2, FORMAT)
 
 Kind = Literal["change", "misfit", "sensor", "load"]
 Severity = Literal["warning", "alarm"]
@@ -84,6 +86,8 @@ class TrackerState:
     stuck: tuple[Stuck, ...]  # frozen, saturated, reversed or exchanged channels of the last windows
     alarms: tuple[Alarm, ...]  # active and closed, oldest first
     coverage: Coverage = field(default_factory=Coverage)
+    weather: Weather | None = None  # None: of an older format; it is learned from now on
+    cargo: Cargo | None = None
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -115,6 +119,8 @@ class TrackerState:
             "stuck": [asdict(stuck) for stuck in self.stuck],
             "alarms": [asdict(alarm) for alarm in self.alarms],
             "coverage": asdict(self.coverage),
+            "weather": None if self.weather is None else _pack_all(asdict(self.weather)),
+            "cargo": None if self.cargo is None else _pack_all(asdict(self.cargo)),
         }
 
     @classmethod
@@ -144,6 +150,8 @@ class TrackerState:
                     Alarm(**{**alarm, "alternatives": tuple(alarm.get("alternatives", ()))}) for alarm in data["alarms"]
                 ),
                 coverage=_coverage(data),
+                weather=_weather(data),
+                cargo=None if data.get("cargo") is None else Cargo(**_unpack_all(data["cargo"])),
             )
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise TrackerStateError(f"stored tracker state can't be read: {error!r}") from error
@@ -152,6 +160,19 @@ class TrackerState:
 def _coverage(data: Mapping[str, Any]) -> Coverage:
     """Older states do not have it: what they used they could use."""
     return Coverage(**data["coverage"]) if "coverage" in data else Coverage(data["used"], 1.0)
+
+
+def _weather(data: Mapping[str, Any]) -> Weather | None:
+    if data.get("weather") is None:
+        return None
+    arrays = _unpack_all(data["weather"])
+    P = len(data["names"])
+    mean = arrays["mean"].reshape(P, -1)
+    size = mean.shape[1]
+    shapes = {"mean": (-1, size), "covariance": (-1, size, size)}
+    shaped = {name: arrays[name].reshape(shapes[name.removeprefix("kind_")]) for name in
+              ("mean", "covariance", "kind_mean", "kind_covariance")}  # fmt: skip
+    return Weather(**arrays | shaped)
 
 
 def _belief(data: Mapping[str, Any]) -> Belief:

@@ -5,23 +5,28 @@ Pure: no clock, no files; `update` returns a new state and touches nothing else.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
 from scipy.linalg.lapack import dpotrf
 
 from sprung.model.identification.deviations import Deviation, named
-from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray, MeasurementFault
+from sprung.model.signals import BoolArray, Conditions, Deviating, Estimate, FloatArray, MeasurementFault
+from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import coverage, misfit, scatter, surprise
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking.alarms import HARD, WINDOWS, Attribution, Drift, counted
+from sprung.model.tracking import weather as weathers
+from sprung.model.tracking.alarms import HARD, WINDOWS, Attribution, Drift, LoadLimit, counted
+from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, TrackerState, TrackerStateError
+from sprung.model.tracking.weather import WeatherModel
 
 __all__ = [
     "Alarm",
@@ -36,6 +41,7 @@ __all__ = [
 
 OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
 BENT = 4.0  # standard deviations of a window that deviations may move it by without being weighed itself
+STILL = 5.0  # log-likelihood ratio of a change above which a parameter teaches no slopes
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -81,7 +87,10 @@ class Tracker:
         parameters: Sequence[ParameterLike],
         settings: TrackerSettings | None = None,
         deviations: Sequence[Deviation] = (),
+        weather: WeatherModel | None = None,
+        limits: Mapping[str, LoadLimit] = MappingProxyType({}),
     ) -> None:
+        """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body."""
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
         self.parameters = tuple(parameters)
@@ -89,7 +98,11 @@ class Tracker:
         self.settings = settings or TrackerSettings()
         self.deviations = tuple(deviations)
         self.model = dev.model_of(self.deviations)
-        self._attribution = Attribution(self.names, self.settings, self.deviations, self.model)
+        nominal = [parameter.nominal for parameter in self.parameters]
+        self.weather = weather or weathers.model_of(self.names, nominal)
+        self._attribution = Attribution(
+            self.names, self.settings, self.deviations, self.model, self.weather, dict(limits)
+        )
         self._limit = np.sqrt(np.diag(self.model.prior))
 
     def initial_state(self) -> TrackerState:
@@ -111,20 +124,28 @@ class Tracker:
             calibration=dev.start(size, self.model),
             stuck=(),
             alarms=(),
+            weather=weathers.start(self.weather),
+            cargo=cargos.start(np.diag(self.model.prior)[self.model.loads]),
         )
 
-    def update(self, state: TrackerState, estimate: Estimate, time_ns: int) -> TrackerState:
+    def update(
+        self, state: TrackerState, estimate: Estimate, time_ns: int, conditions: Conditions | None = None
+    ) -> TrackerState:
         """State after the window that starts at `time_ns`; a window not later than the last is ignored.
 
-        One without excitation speaks neither for nor against anything: it only passes the time.
+        One without excitation speaks neither for nor against anything: it only passes the time.  One that does not
+        fit in a curve is passed over likewise, where curves are measured.
         """
         self._check(state, estimate)
+        state = self._whole(state)
         if state.time is not None and time_ns <= state.time:
             return state
         seen = coverage.update(state.coverage, usable=True)
         if not estimate.informative:
             return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         centre = time_ns + _ns(self.settings.window / 2)
+        if conditions is not None and conditions.curving and not estimate.adequate:
+            return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         stuck = counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
@@ -135,7 +156,7 @@ class Tracker:
             and not self._bent(state, estimate)
             and _proper(estimate.covariance if mask.all() else estimate.covariance[mask][:, mask])
         ):
-            new, jump = self._fuse(state, estimate, mask, time_ns, centre)
+            new, jump = self._fuse(state, estimate, mask, time_ns, centre, conditions)
         if usable or not estimate.faults:  # a window whose fault is named is not a riddle
             fit = misfit.update(
                 state.fit,
@@ -148,6 +169,19 @@ class Tracker:
         new = replace(new, time=time_ns, stuck=stuck, coverage=seen)
         told = jump if jump is not None and self._armed(state) else None
         return replace(new, alarms=self._attribution.after(new, self._drift(new), told, centre))
+
+    def _whole(self, state: TrackerState) -> TrackerState:
+        """A state of an older format, or of a pooled prior that is gone, knows nothing of weather and pressures."""
+        known = state.weather is not None and len(state.weather.common) == self.weather.groups
+        loads = int(self.model.loads.sum())
+        if known and state.cargo is not None and len(state.cargo.constant) == loads:
+            return state
+        fresh = self.initial_state()
+        return replace(
+            state,
+            weather=state.weather if known else fresh.weather,
+            cargo=state.cargo if state.cargo is not None and len(state.cargo.constant) == loads else fresh.cargo,
+        )
 
     def missed(self, state: TrackerState) -> TrackerState:
         """State after a window that was of no use (samples lost, a gap): nobody watched the vehicle meanwhile."""
@@ -197,6 +231,8 @@ class Tracker:
             raise TrackerStateError(f"no parameter {unknown[0]!r} to relearn; known are {', '.join(self.names)}")
         rows = np.array([name in chosen for name in self.names])
         new = replace(state, changes=change_test.relearn(state.changes, rows))
+        if new.weather is not None:
+            new = replace(new, weather=weathers.forgotten(new.weather, self.weather, rows))
         return replace(new, alarms=self._attribution.after(new, self._drift(new), None, state.time or 0))
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
@@ -226,7 +262,7 @@ class Tracker:
                     identifiable=bool(std[i] < KNOWN * self.settings.prior),
                     baseline=healthy,
                     baseline_std=None if healthy is None else healthy * float(base_std[i]),
-                    drift=float(drift.change[i]) if own else None,
+                    drift=float(drift.whole[i]) if own else None,
                     drift_std=float(drift.std[i]) if own else None,
                 )
             )
@@ -291,7 +327,13 @@ class Tracker:
         return found
 
     def _fuse(
-        self, state: TrackerState, estimate: Estimate, mask: BoolArray, time_ns: int, centre: int
+        self,
+        state: TrackerState,
+        estimate: Estimate,
+        mask: BoolArray,
+        time_ns: int,
+        centre: int,
+        conditions: Conditions | None,
     ) -> tuple[TrackerState, Jump | None]:
         """Filter, scatter and change tests after a usable window; a deviation that is found to have jumped."""
         settings, model, H = self.settings, self.model, self.model.size
@@ -300,9 +342,8 @@ class Tracker:
         belief, calibration, jump = state.belief, state.calibration, None
         if state.last is not None:
             belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self._limit)
-            if elapsed > dev.STOPPED and H:
-                belief = dev.boarded(belief, model)
         found = estimate.deviating if H else None
+        belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
         if found is not None and not found.whole:
             belief = dev.loaded(belief, model, found, share)
             gains = np.where(model.loads, found.cross, calibration.cross)
@@ -340,16 +381,27 @@ class Tracker:
             belief, value, covariance, mask, share=share, bound=settings.outlier, cross=cross if H else None
         )
         off = self._of_baseline(state, calibration, cross, belief)
+        at = weathers.features(conditions, self._load(belief))
+        usable = mask & (state.changes.learned >= settings.learning)
+        assert state.weather is not None
+        weather = weathers.foreseen(state.weather, self.weather, at, learning=not self._armed(state))
+        left = np.where(usable, value - off - np.where(usable, state.changes.baseline, 0.0), 0.0)
+        weather = weathers.together(weather, self.weather, left, fresh, usable, centre)
+        effect = np.where(usable, weather.effect + weathers.shared(weather, self.weather), 0.0)
+        doubt = np.where(usable, weather.doubt, 0.0)
         tested = change_test.update(
             state.changes,
-            value - off,
+            value - off - effect,
             fresh,
             mask,
             seconds=share * settings.window,
             time=centre,
             settings=settings,
-            plausible=plausible - off,
+            plausible=plausible - off - effect,
+            doubt=doubt,
         )
+        still = usable & (tested.active == 0) & (np.maximum(tested.up, tested.down) < STILL)
+        weather = weathers.learned(weather, self.weather, left, fresh, still, at, centre, share * settings.window)
         new = replace(
             state,
             last=time_ns,
@@ -360,8 +412,44 @@ class Tracker:
             surprise=watch,
             changes=tested,
             calibration=self._learned(state, tested, calibration, cross, belief),
+            weather=weather,
+            cargo=cargo,
         )
         return new, jump
+
+    def _loaded(
+        self,
+        state: TrackerState,
+        belief: kalman.Belief,
+        elapsed: float,
+        found: Deviating | None,
+        conditions: Conditions | None,
+    ) -> tuple[kalman.Belief, Cargo | None]:
+        """Loads are open again after a stop, and where a window shows another one; pressures say what they are."""
+        model, cargo = self.model, state.cargo
+        if not self.model.size or cargo is None or not model.loads.any():
+            return belief, cargo
+        rows = np.flatnonzero(model.loads) + len(belief.mean) - model.size
+        pressure = np.full(len(rows), np.nan)
+        if conditions is not None and len(conditions.pressure) == len(rows):
+            pressure = np.array(conditions.pressure)
+        departs = elapsed - self.settings.window > dev.STOPPED
+        changed = found is not None and state.last is not None and not departs and dev.moved(belief, model, found)
+        if not (departs or changed):
+            return belief, cargos.felt(cargo, pressure)
+        if state.last is not None and departs:
+            cargo = cargos.arrived(cargo, belief.mean[rows], np.diag(belief.covariance)[rows])
+        cargo = cargos.departed(cargo, pressure, np.diag(model.prior)[model.loads])
+        return dev.boarded(belief, model, cargo.prior, cargo.prior_variance), cargo
+
+    def _load(self, belief: kalman.Belief) -> float | None:
+        """Logarithm of the loaded mass over the empty one, of the first load; None where it is not known."""
+        at = np.flatnonzero(self.model.loads)
+        if not len(at):
+            return None
+        row = len(belief.mean) - self.model.size + int(at[0])
+        known = belief.covariance[row, row] < (KNOWN * self._limit[at[0]]) ** 2
+        return float(belief.mean[row]) if known else None
 
     def _bent(self, state: TrackerState, estimate: Estimate) -> bool:
         """Whether known deviations move this window so far that mean sensitivities are not good enough for it."""
@@ -451,16 +539,23 @@ class Tracker:
     def _baseline(self, state: TrackerState) -> FloatArray:
         """Log-ratio to nominal of the vehicle's own healthy state, shape (P,); NaN before any window."""
         calibration = state.calibration
+        base = state.changes.baseline
+        if state.weather is not None:
+            base = base + state.weather.effect + weathers.usual(state.weather, self.weather)
         if not self.model.size:
-            return state.changes.baseline
+            return np.asarray(base)
         reference = np.where(self.model.loads, 0.0, calibration.reference)
-        return np.asarray(state.changes.baseline + calibration.base_cross @ reference)
+        return np.asarray(base + calibration.base_cross @ reference)
 
     def _drift(self, state: TrackerState) -> Drift:
         """value / baseline - 1 and its standard deviation; NaN before any window."""
         level, std = self.posterior(state)
-        ratio = np.exp(level - self._baseline(state))
-        return Drift(ratio - 1.0, ratio * np.sqrt(std**2 + state.changes.baseline_variance))
+        whole = level - self._baseline(state)
+        own = whole
+        if state.weather is not None:
+            own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)
+        spread = np.sqrt(std**2 + state.changes.baseline_variance)
+        return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
 
 
 def _proper(covariance: FloatArray) -> bool:

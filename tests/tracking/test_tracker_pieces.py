@@ -11,6 +11,7 @@ from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
 from sprung.model.tracking.tracker import Tracker, TrackerSettings
+from sprung.model.tracking.weather import WeatherModel
 from tests.tracker_windows import TrackedParameter, correlated, estimate
 
 
@@ -110,7 +111,9 @@ def test_batched_change_test_alarms_exactly_when_the_tracker_does() -> None:
     size, vehicles = 5, 3
     covariance = correlated(rng, np.array([0.003, 0.01, 0.02, 0.03, 0.03]))
     errors = CorrelatedErrors(covariance[None], vehicles, rng)
-    tracker = Tracker([TrackedParameter(f"element_{i}.damping") for i in range(size)])
+    none, kinds = np.zeros((size, 4)), np.zeros((0, 4))  # nothing in common, no slopes
+    alone = WeatherModel(np.full(size, -1), none, none, kinds, kinds)
+    tracker = Tracker([TrackedParameter(f"element_{i}.damping") for i in range(size)], weather=alone)
     states = [tracker.initial_state() for _ in range(vehicles)]
     fleet = Fleet(vehicles, size, tracker.settings)
     jump = np.array([[0.06, 0, 0, 0, 0], [0, 0, -0.08, 0, 0], [0, 0, 0, 0.1, 0]])

@@ -1,0 +1,301 @@
+"""What load, temperature and speed do to healthy springs and dampers, and what all of a kind do together.
+
+A parameter's healthy value is b + (s_kind + s)' x: its own baseline, and slopes over the conditions x, measured from
+those in which the baseline was learned.  Slopes are learned from the vehicle's own first weeks by Bayesian linear
+regression, those of a kind from the middle of its elements, those of a parameter from how it differs from its kind;
+the prior is physics (oil thins by 0.2 % per kelvin, rubber stiffens in the cold), or what the fleet's other vehicles
+have shown.  What is left and common to all elements of a kind is followed as one level: air that nobody measures,
+oil that runs warm.  Elements are compared with their kind, so that weather accuses none of
+them, and one that leaves the others is seen.
+
+P parameters, G groups of like elements, K = 3 conditions: temperature in 10 K, logarithm of the loaded mass over the
+empty one, speed in 10 m/s.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.signals import BoolArray, Conditions, FloatArray, IntArray
+
+CONDITIONS = 3
+KELVIN, SPEED = 10.0, 10.0  # units of the conditions
+FEWEST = 4  # elements that are a kind: below, a middle is not robust
+ALIKE = 1.5  # ratio of nominal values within which elements of a quantity are of one kind
+MOST_OF = 0.75  # of a kind that must move together
+FEWEST_VEHICLES = 3  # that must have learned a slope before others are told
+FIRST_WEEKS = 21 * 86400.0  # s in which slopes are learned
+CORRELATED = 600.0, 0.005  # s, and 1: what one window says of a slope is no better than this, for that long
+OF_KINDS = 3600.0, 0.01  # the same of a kind's, since oil and air differ
+COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), of what a kind has in common while the vehicle runs
+RESTED = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands
+MOST_RESTED = 0.08  # what a pause may bring at most
+FAST = 0.05  # log-ratio by which a kind may leave its settled level: oil that warms up, a front that passes
+SETTLING = 6 * 3600.0  # s in which a common level becomes the weather that it is compared with
+NEAR = 0.025  # of a kind's middle: elements within this, or within their errors, move with it
+RANGE = {"damping": 0.2, "stiffness": 0.12}  # what weather alone may do, where nobody measures it
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeatherModel:
+    """Constants of one system."""
+
+    group: IntArray  # of each parameter; -1: too few like it, shape (P,)
+    mean: FloatArray  # of [offset, slopes], in a kind measured from the kind's, shape (P, 1 + K)
+    std: FloatArray  # shape (P, 1 + K)
+    kind_mean: FloatArray  # of kinds, shape (G, 1 + K)
+    kind_std: FloatArray  # shape (G, 1 + K)
+
+    @property
+    def groups(self) -> int:
+        return int(self.group.max(initial=-1)) + 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Weather:
+    """What is known of slopes and of what kinds have in common."""
+
+    mean: FloatArray  # of [offset, slopes], shape (P, 1 + K)
+    covariance: FloatArray  # shape (P, 1 + K, 1 + K)
+    kind_mean: FloatArray  # shape (G, 1 + K)
+    kind_covariance: FloatArray  # shape (G, 1 + K, 1 + K)
+    reference: FloatArray  # conditions in which the baseline was learned, shape (K,)
+    weight: FloatArray  # windows in that mean, shape (K,)
+    common: FloatArray  # log-ratio that all of a kind have in common beyond the slopes, shape (G,)
+    variance: FloatArray  # shape (G,)
+    settled: FloatArray  # the slow part of it, shape (G,)
+    slack: FloatArray  # how far both may be apart beyond the usual, after a rest, shape (G,)
+    began: IntArray  # ns, of the first window, and of the last, shape (2,); 0: none
+    effect: FloatArray  # of the conditions of the last window on each parameter, shape (P,)
+    doubt: FloatArray  # its variance, shape (P,)
+
+
+def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection[str] = ()) -> WeatherModel:
+    """From parameters' names and nominal values; `by_load`: elements whose stiffness goes with the load."""
+    group = _groups(names, nominal)
+    G = int(group.max(initial=-1)) + 1
+    mean, std = np.zeros((len(names), 1 + CONDITIONS)), np.zeros((len(names), 1 + CONDITIONS))
+    kind_mean, kind_std = np.zeros((G, 1 + CONDITIONS)), np.zeros((G, 1 + CONDITIONS))
+    for i, name in enumerate(names):
+        element, _, quantity = name.rpartition(".")
+        air = element in by_load and quantity == "stiffness"
+        physics = 0.0, {"damping": -0.02, "stiffness": 0.0 if air else -0.005}.get(quantity, 0.0), float(air), 0.0
+        open_ = 0.01, {"damping": 0.01, "stiffness": 0.006}.get(quantity, 0.003), 0.2 if air else 0.05, 0.004
+        std[i] = 0.005, {"damping": 0.003, "stiffness": 0.002}.get(quantity, 0.001), 0.05 if air else 0.01, 0.002
+        if group[i] < 0:  # nobody of its kind to be compared with
+            mean[i], std[i] = physics, np.hypot(std[i], np.multiply(open_, [0, 1, 1, 1]))
+        else:
+            kind_mean[group[i]], kind_std[group[i]] = physics, open_
+    return WeatherModel(group, mean, std, kind_mean, kind_std)
+
+
+def _groups(names: Sequence[str], nominal: Sequence[float]) -> IntArray:
+    """Elements of one quantity with like nominal values are of one kind."""
+    group = np.full(len(names), -1, dtype=np.int64)
+    quantities = [name.rpartition(".")[2] for name in names]
+    found = 0
+    for quantity in dict.fromkeys(quantities):
+        rows = [i for i, q in enumerate(quantities) if q == quantity and nominal[i] > 0]
+        rows.sort(key=lambda i: nominal[i])
+        cuts = [k for k in range(1, len(rows)) if nominal[rows[k]] > ALIKE * nominal[rows[k - 1]]]
+        for first, last in zip([0, *cuts], [*cuts, len(rows)], strict=True):
+            if last - first >= FEWEST:
+                group[rows[first:last]] = found
+                found += 1
+    return group
+
+
+def start(model: WeatherModel) -> Weather:
+    """Nothing seen yet."""
+    P, G = len(model.group), model.groups
+    covariances = [np.einsum("pi,ij->pij", std**2, np.eye(1 + CONDITIONS)) for std in (model.std, model.kind_std)]
+    return Weather(
+        model.mean.copy(), covariances[0], model.kind_mean.copy(), covariances[1], np.zeros(CONDITIONS),
+        np.zeros(CONDITIONS), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(2, dtype=np.int64),
+        np.zeros(P), np.zeros(P),
+    )  # fmt: skip
+
+
+def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather:
+    """After a repair of the parameters `rows` (P,): their baseline is learned anew, with what was known of slopes."""
+    mean, covariance = weather.mean.copy(), weather.covariance.copy()
+    mean[rows, 0] = 0.0
+    covariance[rows, 0, :] = covariance[rows, :, 0] = 0.0
+    covariance[rows, 0, 0] = model.std[rows, 0] ** 2
+    return replace(weather, mean=mean, covariance=covariance)
+
+
+def features(conditions: Conditions | None, load: float | None) -> FloatArray:
+    """Conditions (K,), NaN where nobody knows; `load`: logarithm of the loaded mass over the empty one."""
+    temperature = math.nan if conditions is None else conditions.temperature
+    speed = math.nan if conditions is None else conditions.speed
+    return np.array([temperature / KELVIN, math.nan if load is None else load, speed / SPEED])
+
+
+def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning: bool) -> Weather:
+    """`weather` with the effect of conditions `at` (K,); `learning`: the baseline is, so these are its conditions.
+
+    The offset corrects the baseline itself, so that it is part of the effect and of its doubt.
+    """
+    known = np.isfinite(at)
+    if learning or np.any(known & (weather.weight == 0)):
+        taken = known & (learning | (weather.weight == 0))
+        weight = weather.weight + taken
+        moved = np.where(taken, np.where(known, at, 0.0) - weather.reference, 0.0) / np.maximum(weight, 1)
+        weather = replace(weather, reference=weather.reference + moved, weight=weight)
+    x = np.concatenate([[0.0 if learning else 1.0], np.where(known, at - weather.reference, 0.0)])
+    kinds = np.append(weather.kind_mean[:, 1:] @ x[1:], 0.0)  # a kind's own offset is part of what it has in common
+    effect = weather.mean @ x + kinds[model.group]
+    return replace(weather, effect=effect, doubt=np.einsum("i,pij,j->p", x, weather.covariance, x))
+
+
+def learned(
+    weather: Weather,
+    model: WeatherModel,
+    left: FloatArray,  # log-ratios less baseline, before any effect, shape (P,)
+    variance: FloatArray,  # of one window's, independent, shape (P,)
+    usable: BoolArray,  # measured, the baseline is known, and nothing speaks for a change, shape (P,)
+    at: FloatArray,  # conditions, shape (K,)
+    time: int,  # ns
+    seconds: float,  # of signal that no earlier window held
+) -> Weather:
+    """Slopes after one window."""
+    young = (time - int(weather.began[0])) * 1e-9 < FIRST_WEEKS
+    if not young or not usable.any():
+        return weather
+    x = np.concatenate([[1.0], np.where(np.isfinite(at), at - weather.reference, 0.0)])
+    own = left - shared(weather, model) - (weather.effect - weather.mean @ x)
+    mean, covariance = _regressed(
+        weather.mean, weather.covariance, x, own, _floored(variance, CORRELATED, seconds), usable
+    )
+    weather = replace(weather, mean=mean, covariance=covariance)
+    if not model.groups or not np.isfinite(at).any():
+        return weather
+    middle, noise, fit = (np.zeros(model.groups) for _ in range(3))
+    for g in range(model.groups):
+        rows = np.flatnonzero((model.group == g) & usable)
+        if len(rows) >= FEWEST:
+            middle[g], fit[g] = np.median(left[rows] - weather.mean[rows] @ x), 1.0
+            noise[g] = 1.57 * variance[rows].mean() / len(rows)
+    mean, covariance = _regressed(
+        weather.kind_mean, weather.kind_covariance, x, middle, _floored(noise, OF_KINDS, seconds), fit > 0
+    )
+    return replace(weather, kind_mean=mean, kind_covariance=covariance)
+
+
+def _floored(variance: FloatArray, correlated: tuple[float, float], seconds: float) -> FloatArray:
+    length, floor = correlated
+    return np.maximum(variance, floor**2 * length / max(seconds, 1e-3))
+
+
+def _regressed(
+    mean: FloatArray, covariance: FloatArray, x: FloatArray, value: FloatArray, noise: FloatArray, usable: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """One step of linear regression in every row: value = mean' x + noise."""
+    across = covariance @ x  # (rows, 1 + K)
+    total = across @ x + noise
+    off = value - mean @ x
+    fits = usable & (np.abs(off) < 4.0 * np.sqrt(total))
+    gain = np.where(fits[:, None], across / total[:, None], 0.0)
+    covariance = covariance - gain[:, :, None] * across[:, None, :]
+    return mean + gain * off[:, None], 0.5 * (covariance + covariance.transpose(0, 2, 1))
+
+
+def together(
+    weather: Weather, model: WeatherModel, left: FloatArray, variance: FloatArray, usable: BoolArray, time: int
+) -> Weather:
+    """After one window at `time`, ns: the middle of every kind is followed, as long as most of it is near.
+
+    left: log-ratios less baseline, shape (P,), with `variance`; usable: measured, and the baseline is known.
+    """
+    elapsed = (time - int(weather.began[1])) * 1e-9 if weather.began[1] else 0.0
+    weather = replace(weather, began=np.array([weather.began[0] or time, time]))
+    left, variance = left - weather.effect, variance + weather.doubt
+    common, spread = weather.common.copy(), weather.variance.copy()
+    rest = min(RESTED**2 * max(elapsed - 60.0, 0.0), MOST_RESTED**2)
+    spread += COMMON_WALK**2 * min(elapsed, 60.0) + rest
+    for g in range(model.groups):
+        rows = np.flatnonzero((model.group == g) & usable)
+        if len(rows) < FEWEST:
+            continue
+        middle = float(np.median(left[rows]))
+        near = np.abs(left[rows] - middle) < np.maximum(NEAR, 3 * np.sqrt(variance[rows]))
+        if near.mean() < MOST_OF:
+            continue
+        noise = 1.57 * float(variance[rows].mean()) / len(rows)  # of a median
+        gain = spread[g] / (spread[g] + noise)
+        common[g] += gain * (middle - common[g])
+        spread[g] *= 1 - gain
+    weather = replace(weather, common=common, variance=spread)
+    slack = np.minimum(weather.slack * math.exp(-min(elapsed, 60.0) / SETTLING) + math.sqrt(rest), MOST_RESTED)
+    part = -math.expm1(-elapsed / SETTLING)
+    usual_ = np.abs(common - weather.settled) < FAST + slack  # what no weather does is not taken for weather later
+    settled = weather.settled + np.where(usual_, part * (common - weather.settled), 0.0)
+    return replace(weather, settled=settled, slack=slack)
+
+
+def shared(weather: Weather, model: WeatherModel) -> FloatArray:
+    """What each parameter has in common with its kind, shape (P,)."""
+    return np.where(model.group >= 0, np.append(weather.common, 0.0)[model.group], 0.0)
+
+
+def usual(weather: Weather, model: WeatherModel) -> FloatArray:
+    """The slow part of it, which is weather, shape (P,)."""
+    return np.where(model.group >= 0, np.append(weather.settled, 0.0)[model.group], 0.0)
+
+
+def unusual(weather: Weather, model: WeatherModel, names: Sequence[str], share: float = 1.0) -> BoolArray:
+    """Kinds that moved faster than weather does, or further, shape (G,); `share` of the limits."""
+    out = np.zeros(model.groups, dtype=bool)
+    for g in range(model.groups):
+        quantity = names[int(np.flatnonzero(model.group == g)[0])].rpartition(".")[2]
+        certain = 4.0 * math.sqrt(float(weather.variance[g]))
+        fast = abs(weather.common[g] - weather.settled[g]) > share * (FAST + weather.slack[g]) + certain
+        out[g] = fast or abs(weather.common[g]) > share * RANGE.get(quantity, 0.1) + certain
+    return out
+
+
+def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
+    """The prior of a new vehicle from what others of the same system have learned: mean and spread of their slopes.
+
+    Elements of a kind are pooled, too.  A slope that none of them has learned keeps the prior of physics.
+    """
+    if not found:
+        return model
+    mean, std = _spread(model.mean, model.std, [(w.mean, w.covariance) for w in found], _kinds(model))
+    rows = [np.array([g]) for g in range(model.groups)]
+    kind_mean, kind_std = _spread(
+        model.kind_mean, model.kind_std, [(w.kind_mean, w.kind_covariance) for w in found], rows
+    )
+    return WeatherModel(model.group, mean, std, kind_mean, kind_std)
+
+
+def _spread(
+    mean: FloatArray, std: FloatArray, found: Sequence[tuple[FloatArray, FloatArray]], together: Sequence[IntArray]
+) -> tuple[FloatArray, FloatArray]:
+    """Mean and deviation of slopes over vehicles, and over the rows of one kind."""
+    mean, std = mean.copy(), std.copy()
+    means = np.array([m for m, _ in found])  # (V, rows, 1 + K)
+    variances = np.array([np.diagonal(c, axis1=1, axis2=2) for _, c in found])
+    informed = variances < 0.5 * std**2
+    for rows in together:
+        for k in range(1, 1 + CONDITIONS):
+            chosen = informed[:, rows, k]
+            if chosen.sum() < FEWEST_VEHICLES:
+                continue
+            values, weight = means[:, rows, k][chosen], 1 / variances[:, rows, k][chosen]
+            middle = float(np.sum(weight * values) / weight.sum())
+            between = max(float(np.var(values)) - float(np.mean(1 / weight)), 0.0)
+            mean[rows, k] = middle
+            std[rows, k] = np.minimum(std[rows, k], math.sqrt(between + 1 / float(weight.sum())) + 0.1 * std[rows, k])
+    return mean, std
+
+
+def _kinds(model: WeatherModel) -> list[IntArray]:
+    """Rows of parameters that are pooled: those of a kind, and every other alone."""
+    alone = [np.array([i]) for i in np.flatnonzero(model.group < 0)]
+    return [np.flatnonzero(model.group == g) for g in range(model.groups)] + alone

@@ -1,0 +1,160 @@
+"""Weather, load and speed: what they do to healthy parameters is learned, and hides no change beside it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from sprung.model.signals import Conditions, SampleBlock, Window
+from sprung.model.tracking import weather
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
+from sprung.replay.beside import Beside
+from tests.tracker_windows import EPOCH, correlated, estimate
+
+NAMES = [f"{e}.{q}" for q in ("stiffness", "damping") for e in (
+    *(f"primary_{i}" for i in range(8)), *(f"secondary_{i}" for i in range(4)))]  # fmt: skip
+STD = np.repeat([0.004, 0.006, 0.02, 0.01], [8, 4, 8, 4])
+DAMPERS = slice(12, 24)
+MINUTE = 60_000_000_000
+
+
+@dataclass(frozen=True)
+class One:
+    name: str
+    unit: str
+    nominal: float
+
+
+def tracker() -> Tracker:
+    nominal = np.repeat([1.22e6, 4.3e5, 4e3, 2e4], [8, 4, 8, 4])
+    parameters = [One(n, "", float(v)) for n, v in zip(NAMES, nominal, strict=True)]
+    return Tracker(parameters, TrackerSettings(window=60.0, hop=60.0, learning=600.0))
+
+
+def day(rng, state, minutes, truth, conditions, first=0, every=1):
+    """Windows of a minute, each the mean of many."""
+    follow, covariance = tracker(), correlated(rng, STD / 6)
+    root = np.linalg.cholesky(covariance)
+    for k in range(first, first + minutes, every):
+        value = truth(k) + root @ rng.normal(size=24)
+        state = follow.update(state, estimate(value, covariance), EPOCH + k * MINUTE, conditions(k))
+    return state
+
+
+def warm(k, slope=-0.002):
+    """Degrees, and what they do to dampers: a day's swing of 24 K."""
+    degrees = 10.0 + 12.0 * np.sin(2 * np.pi * k / 1440)
+    effect = np.zeros(24)
+    effect[DAMPERS] = np.log1p(slope * (degrees - 20.0))
+    return degrees, effect
+
+
+def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned():
+    rng = np.random.default_rng(1)
+    slope, follow = -0.0027, tracker()
+    state = day(rng, follow.initial_state(), 4320, lambda k: warm(k, slope)[1],
+                lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
+    assert state.alarms == ()
+    kinds = [k for k in range(4) if state.weather.kind_mean[k, 1] < -0.01]  # of dampers
+    assert len(kinds) == 2
+    middle, std = state.weather.kind_mean[kinds, 1], np.sqrt(state.weather.kind_covariance[kinds, 1, 1])
+    assert np.all(std < 0.5 * follow.weather.kind_std[kinds, 1])
+    assert np.all(np.abs(middle / weather.KELVIN - slope) < 3 * std / weather.KELVIN)
+
+
+def test_weather_that_nobody_measures_raises_nothing():
+    rng = np.random.default_rng(2)
+    state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k)[1], lambda k: None, every=5)
+    assert state.alarms == ()
+
+
+@pytest.mark.parametrize("measured", [True, False])
+def test_a_true_change_beside_the_weather_is_found_and_is_the_only_one(measured):
+    rng = np.random.default_rng(3)
+    row, fault = 12 + 9, np.zeros(24)
+    fault[row] = np.log(0.85)
+    state = day(
+        rng, tracker().initial_state(), 2000, lambda k: warm(k)[1] + fault * (k >= 1500),
+        lambda k: Conditions(temperature=warm(k)[0]) if measured else None, every=5,
+    )  # fmt: skip
+    assert [alarm.parameter for alarm in state.alarms] == [NAMES[row]]
+    assert state.alarms[0].change == pytest.approx(-0.15, abs=0.02)
+    assert state.alarms[0].onset >= EPOCH + 1490 * MINUTE
+
+
+def test_oil_that_leaves_all_dampers_at_once_is_one_message():
+    rng = np.random.default_rng(4)
+    lost = np.zeros(24)
+    lost[DAMPERS] = np.log(0.88)
+    state = day(rng, tracker().initial_state(), 160, lambda k: lost * np.clip((k - 100) / 10, 0, 1), lambda k: None)
+    assert [alarm.parameter for alarm in state.active] == ["*.damping"]
+    assert state.active[0].change == pytest.approx(-0.12, abs=0.02)
+
+
+def test_a_kind_alone_is_named_by_what_its_names_share():
+    rng = np.random.default_rng(5)
+    lost = np.zeros(24)
+    lost[12:20] = np.log(0.88)
+    state = day(rng, tracker().initial_state(), 160, lambda k: lost * np.clip((k - 100) / 10, 0, 1), lambda k: None)
+    assert [alarm.parameter for alarm in state.active] == ["primary_*.damping"]
+
+
+def test_what_was_learned_survives_a_restart_bit_for_bit():
+    rng = np.random.default_rng(6)
+    state = day(rng, tracker().initial_state(), 300, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
+    again = TrackerState.from_dict(state.to_dict())
+    one, other = (
+        day(np.random.default_rng(7), s, 20, lambda k: warm(k)[1], lambda k: Conditions(20.0, 5.0), 300)
+        for s in (state, again)
+    )
+    assert one.to_dict() == other.to_dict()
+
+
+def test_a_state_without_weather_goes_on_and_begins_to_learn_it():
+    rng = np.random.default_rng(8)
+    old = day(rng, tracker().initial_state(), 100, lambda k: np.zeros(24), lambda k: None).to_dict()
+    for key in ("weather", "cargo"):
+        del old[key]
+    state = day(rng, TrackerState.from_dict(old | {"format": 2}), 20, lambda k: np.zeros(24), lambda k: None, 100)
+    assert state.weather is not None
+    assert state.used == 120
+    assert state.alarms == ()
+
+
+def test_the_fleet_teaches_a_new_vehicle_its_slopes():
+    rng = np.random.default_rng(9)
+    slope, found = -0.003, []
+    for _ in range(3):
+        state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k, slope)[1],
+                    lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
+        found.append(state.weather)
+    prior = weather.pooled(tracker().weather, found)
+    dampers = prior.kind_mean[:, 1] < -0.01
+    assert np.allclose(prior.kind_mean[dampers, 1] / weather.KELVIN, slope, atol=3e-4)
+    assert np.all(prior.kind_std[dampers, 1] < tracker().weather.kind_std[dampers, 1])
+    assert np.array_equal(prior.kind_mean[:, 2:], tracker().weather.kind_mean[:, 2:])  # of load and speed nothing
+
+
+def test_a_repaired_damper_keeps_its_slope_and_learns_its_level():
+    rng = np.random.default_rng(10)
+    follow = tracker()
+    state = day(rng, follow.initial_state(), 400, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
+    new = follow.relearn(state, [NAMES[15]])
+    assert new.weather.mean[15, 1] == state.weather.mean[15, 1]
+    assert new.weather.mean[15, 0] == 0.0
+
+
+def test_slow_signals_are_taken_beside_the_windows():
+    beside = Beside(2, 1)
+    second = 1_000_000_000
+    block = SampleBlock(
+        np.array([0, 1, 2, 3, 4]) * second,
+        np.array([0, 2, 1, 2, 2], dtype=np.int32),
+        np.array([1.0, 10, 2, 20, np.nan]),
+    )
+    left = beside.keep(block)
+    assert left.channel.tolist() == [0, 1]
+    assert beside.to(Window(0, 1.0, np.zeros((2, 2)))).auxiliary == [10.0]
+    assert beside.to(Window(second, 1.0, np.zeros((3, 2)))).auxiliary == [15.0]
+    assert beside.to(Window(10 * second, 1.0, np.zeros((3, 2)))).auxiliary == [20.0]
+    assert np.isnan(beside.to(Window(90 * second, 1.0, np.zeros((3, 2)))).auxiliary)
