@@ -1,12 +1,14 @@
 # syntax=docker/dockerfile:1
 # Two stages: the first installs into /opt/sprung, the second holds only that and an interpreter.
-FROM python:3.11-slim-bookworm AS build
+# pin the base by digest where you build for good: docker buildx imagetools inspect python:3.11-slim-bookworm
+ARG BASE=python:3.11-slim-bookworm
+FROM ${BASE} AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src
-COPY requirements.lock ./
+COPY requirements.lock requirements.hashes.lock ./
 RUN python3 -m venv /opt/sprung
 RUN /opt/sprung/bin/pip install --no-cache-dir --extra-index-url "$TORCH_INDEX" "$(grep '^torch==' requirements.lock)"
-RUN /opt/sprung/bin/pip install --no-cache-dir -r requirements.lock
+RUN /opt/sprung/bin/pip install --no-cache-dir --no-deps --require-hashes -r requirements.hashes.lock
 COPY pyproject.toml README.md ./
 COPY sprung ./sprung
 COPY model ./model
@@ -15,7 +17,7 @@ COPY service ./service
 COPY benchmarks ./benchmarks
 RUN /opt/sprung/bin/pip install --no-cache-dir --no-deps .
 
-FROM python:3.11-slim-bookworm
+FROM ${BASE}
 RUN useradd --system --uid 10001 --home-dir /var/lib/sprung --create-home sprung
 COPY --from=build /opt/sprung /opt/sprung
 # the root file system may be read-only: everything that changes is in the volume and in /tmp

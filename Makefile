@@ -11,7 +11,7 @@ DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 PYTEST ?=
 
-.PHONY: docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
+.PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
@@ -28,11 +28,11 @@ install: $(VENV)/.installed
 install-dev: $(VENV)/.installed-dev
 
 # torch comes first and by itself: with the exact CPU build there, nothing pulls the CUDA packages
-$(VENV)/.installed: requirements.lock pyproject.toml
+$(VENV)/.installed: requirements.lock requirements.hashes.lock pyproject.toml
 	@echo "installing into $(VENV) (a few minutes the first time)"
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) "$$(grep '^torch==' requirements.lock)"
-	$(PIP) -r requirements.lock
+	$(PIP) --no-deps --require-hashes -r requirements.hashes.lock
 	$(PIP) --no-deps --editable .
 	@touch $@
 
@@ -70,6 +70,23 @@ sbom: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
 	$(BIN)/cyclonedx-py requirements requirements.lock --of JSON -o sbom.json
 
+# the SHA-256 of every file of the packages in requirements.lock; torch comes from an index of the user's choice
+lock: install-dev
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet "uv>=0.5,<1"
+	grep -v "^torch==" requirements.lock > .lock.in
+	(head -2 requirements.hashes.lock; $(BIN)/uv pip compile .lock.in --no-deps --generate-hashes --no-annotate --no-header \
+		--quiet --python-version 3.11) > .lock.out
+	mv .lock.out requirements.hashes.lock
+	rm .lock.in
+
+# which licence each installed package has
+licences: install-dev
+	$(BIN)/python docs/licences.py
+
+# the API against its own description; needs no running service
+schemathesis: install-dev
+	$(BIN)/python -m pytest -q -m "slow or not slow" tests/deploy/test_schemathesis.py
+
 audit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "pip-audit>=2.7,<3"
 	$(BIN)/pip-audit --requirement requirements.lock --no-deps
@@ -78,8 +95,7 @@ bandit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"
 	$(BIN)/bandit --quiet --recursive model replay service --severity-level medium --skip B104,B608
 
-docs: install
-	$(PIP) "mkdocs==1.6.1"
+docs: install-dev
 	$(BIN)/mkdocs build --quiet --site-dir site
 
 bench: install

@@ -77,6 +77,7 @@ class Fed:
             "fitting": self.fitting,
             "monitored": self.monitored,
             "late_windows": self.late,
+            "stored_before": self.stored_before,  # windows of a recording that was sent before
             "comfort": None if self.ride is None else self.ride.summary(),
         }
 

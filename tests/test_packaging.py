@@ -229,3 +229,13 @@ def test_the_steps_of_the_image_make_a_service_that_answers(tmp_path: Path) -> N
         finally:
             process.terminate()
         assert process.wait(30) == 0
+
+
+def test_the_lock_with_hashes_is_the_lock() -> None:
+    def pinned(name: str) -> list[str]:
+        lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
+        return sorted(line.split()[0].lower() for line in lines if "==" in line and not line.startswith("#"))
+
+    plain = [line for line in pinned("requirements.lock") if not line.startswith("torch==")]
+    assert pinned("requirements.hashes.lock") == plain, "run `make lock`"
+    assert (ROOT / "requirements.hashes.lock").read_text(encoding="utf-8").count("--hash=sha256:") >= len(plain)

@@ -28,14 +28,19 @@ Text = Annotated[str, Field(min_length=1, max_length=2000, examples=["damper 2l 
 class AcknowledgeBody(StrictBody):
     """Which alarm was seen."""
 
-    alarm: int | None = Field(default=None, ge=1, le=2**63 - 1, description="its id; left out: all that are active")
+    alarm: int | None = Field(default=None, ge=1, le=2**53, description="its id; left out: all that are active")
 
 
 class NoteBody(StrictBody):
     """A note on the time line."""
 
     text: Text
-    time: str | None = Field(default=None, max_length=40, description="RFC 3339; now where left out")
+    time: str | None = Field(
+        default=None,
+        max_length=40,
+        description="RFC 3339; now where left out",
+        json_schema_extra={"format": "date-time"},
+    )
 
 
 class MaintenanceBody(NoteBody):

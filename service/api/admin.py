@@ -8,7 +8,7 @@ import threading
 import time
 from collections import Counter
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
@@ -30,11 +30,14 @@ SAMPLE_SECONDS = 0.01
 MOST_STACKS = 2000
 
 
+Scope = Literal["read", "ingest", "operate", "admin"]
+
+
 class TokenBody(StrictBody):
     """A token to be made."""
 
     name: Annotated[str, Field(min_length=1, max_length=128)]
-    scopes: Annotated[list[str], Field(min_length=1, max_length=4, description="read, ingest, operate, admin")]
+    scopes: Annotated[list[Scope], Field(min_length=1, max_length=4)]
     fleet: Annotated[str, Field(max_length=128, description="vehicles whose ids begin so; empty: all")] = ""
     days: Annotated[float | None, Field(gt=0, lt=36_500, description="until it ends; null: never")] = 365.0
 
@@ -81,7 +84,9 @@ async def tokens(core: CoreOf) -> Response:
 @router.post("/tokens", status_code=201, summary="Make a token", response_model=dict[str, Any])
 async def create_token(core: CoreOf, actor: ActorOf, body: TokenBody) -> Response:
     """The answer holds the token; it is shown this once."""
-    text, row = await run_in_threadpool(core.tokens.create, body.name, body.scopes, body.fleet, body.days, actor.name)
+    text, row = await run_in_threadpool(
+        core.tokens.create, body.name, list(body.scopes), body.fleet, body.days, actor.name
+    )
     return json_response(token_dict(row) | {"token": text}, 201)
 
 

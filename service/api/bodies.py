@@ -37,12 +37,23 @@ class WindowBody(StrictBody):
         description="samples by channel; a sensor may be missing, an input may not"
     )
     start: str | None = Field(
-        default=None, max_length=40, description="time of the first sample, RFC 3339; used with ?track=true"
+        default=None,
+        max_length=40,
+        description="time of the first sample, RFC 3339 or seconds since 1970; used with ?track=true",
     )
 
 
 class DiagnoseBody(StrictBody):
     """What to look into: a recording that was uploaded before, or a vehicle's last minute."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [
+                {"required": [name], "properties": {name: {"type": "string"}}, "not": {"required": [other]}}
+                for name, other in (("recording", "vehicle"), ("vehicle", "recording"))
+            ]
+        }
+    )
 
     recording: str | None = Field(default=None, max_length=36)
     vehicle: VehicleId | None = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 from fastapi import FastAPI
@@ -9,6 +11,7 @@ from fastapi.openapi.utils import get_openapi
 
 from sprung.service.api.models import ProblemAnswer
 
+KEPT_EXAMPLES = Path(__file__).parent / "examples.json"  # answers of a real service, shortened
 MEDIA = "application/problem+json"
 ERRORS = {
     404: ("Not Found", "No such thing.", "nothing is known of vehicle 'car-99'"),
@@ -18,6 +21,7 @@ ERRORS = {
     400: ("Bad Request", "What came is no HTTP that can be understood.", "invalid request"),
     401: ("Unauthorized", "A token is needed, or the one that was sent is wrong or expired.", "a token is needed"),
     403: ("Forbidden", "The token does not allow this.", "the token has no scope `operate`"),
+    409: ("Conflict", "A request with this Idempotency-Key is being worked on, or was another one.", "it is at work"),
     405: ("Method Not Allowed", "The path takes other methods.", "Method Not Allowed"),
     429: ("Too Many Requests", "More than the limit of one client; `Retry-After` says when.", "too many requests"),
     507: ("Insufficient Storage", "No room is left for uploads or on the disk.", "no room for this upload"),
@@ -44,16 +48,25 @@ def describe(app: FastAPI) -> None:
             found = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
             schemas = found.setdefault("components", {}).setdefault("schemas", {})
             own = ProblemAnswer.model_json_schema(ref_template="#/components/schemas/{model}")
+            kept = json.loads(KEPT_EXAMPLES.read_text(encoding="utf-8"))
             schemas |= own.pop("$defs", {}) | {"ProblemAnswer": own}
             for path, methods in found["paths"].items():
                 for method, operation in methods.items():
                     _complete(path, operation)
-                    if (path, method) in EXAMPLES:
-                        operation["responses"]["200"]["content"]["application/json"]["example"] = EXAMPLES[path, method]
+                    example = EXAMPLES.get((path, method)) or kept.get(f"{method} {path}")
+                    if example is not None:
+                        _answer(operation)["example"] = example
             app.openapi_schema = found
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]
+
+
+def _answer(operation: dict[str, Any]) -> dict[str, Any]:
+    """The content of the answer of a request that went well."""
+    status = next(status for status in sorted(operation["responses"]) if status.startswith("2"))
+    content: dict[str, Any] = operation["responses"][status]["content"]["application/json"]
+    return content
 
 
 EXAMPLES: dict[tuple[str, str], Any] = {
@@ -122,9 +135,12 @@ EXAMPLES: dict[tuple[str, str], Any] = {
 
 def _complete(path: str, operation: dict[str, Any]) -> None:
     answers = operation["responses"]
-    if "{" in path:
+    if "{" in path or path == "/diagnose":
         answers.setdefault("404", _problem(404))
+    if any(one.get("name") == "Idempotency-Key" for one in operation.get("parameters", [])):
+        answers.setdefault("409", _problem(409))
     if "requestBody" in operation:
+        answers.setdefault("400", _problem(400))
         answers.setdefault("413", _problem(413))
         answers.setdefault("507", _problem(507))
         answers.setdefault("415", _problem(415))

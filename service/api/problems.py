@@ -17,6 +17,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlch
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
+from starlette.routing import Match, Route
 
 from sprung.service.errors import Busy, NoSpace, NotFound, UserError
 
@@ -93,10 +94,24 @@ def install(app: FastAPI) -> None:
     async def on_problem(request: Request, error: Exception) -> Response:
         if isinstance(error, ClientDisconnect):  # nobody is there to be answered
             return Response(status_code=499)
-        return problem_response(_as_problem(error), request.url.path)
+        problem = _as_problem(error)
+        if problem.status == 405:
+            problem.headers["Allow"] = ", ".join(_methods(app, request))
+        return problem_response(problem, request.url.path)
 
     for kind in (*EXPECTED, Exception):
         app.add_exception_handler(kind, on_problem)
+
+
+def _methods(app: FastAPI, request: Request) -> list[str]:
+    """The methods of all routes at a path: each route by itself tells only its own."""
+    found = {
+        method
+        for route in app.routes
+        if isinstance(route, Route) and route.matches(dict(request.scope))[0] is not Match.NONE
+        for method in route.methods or ()
+    }
+    return sorted(found | ({"HEAD"} if "GET" in found else set()))
 
 
 def _as_problem(error: Exception) -> ApiProblem:

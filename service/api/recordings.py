@@ -63,7 +63,7 @@ async def job(core: CoreOf, actor: ActorOf, id: str) -> Response:
     return json_response(job_dict(await read(core, query)))
 
 
-@router.delete("/jobs/{id}", summary="Cancel a job", response_model=models.Job)
+@router.post("/jobs/{id}/cancel", summary="Cancel a job", response_model=models.Job)
 async def cancel(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """A job that waits or runs is given up; it is then `failed`, and its error says that it was cancelled.  What it
     stored before stays."""

@@ -31,7 +31,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("POST", "/recordings"): Need("ingest", by_fleet=True, body=FORM),
     ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", *FORM)),
     ("GET", "/jobs/{id}"): Need("read", by_fleet=True),
-    ("DELETE", "/jobs/{id}"): Need("operate", by_fleet=True),
+    ("POST", "/jobs/{id}/cancel"): Need("operate", by_fleet=True),
     ("GET", "/reports/{id}"): Need("read", by_fleet=True),
     ("GET", "/reports/{id}/page"): Need("read", by_fleet=True),
     ("GET", "/"): Need("read", by_fleet=True),

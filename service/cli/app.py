@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from sprung import __version__
+from sprung.service.cli.plain import PlainTyper
 from sprung.service.threads import hand_over_often, one_thread_each
 
-app = typer.Typer(
+app = PlainTyper(
     name="sprung",
     help="Springs and dampers of rail vehicles, identified from running recordings.",
     no_args_is_help=True,
@@ -392,7 +393,7 @@ def restore(
     return run(source, data_dir, store)
 
 
-token = typer.Typer(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
+token = PlainTyper(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
 app.add_typer(token, name="token")
 
 

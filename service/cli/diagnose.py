@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from sprung.replay.record import Record
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
+from sprung.service.cli.stdin import spooled
 from sprung.service.diagnosing import load_excerpt
 from sprung.service.improved import write_improved
 
@@ -38,7 +40,10 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
         catalogue += load_laws(asked.laws, tuple(law.name for law in CATALOGUE))
     system = load_system(system_file or MANCHESTER, catalogue)
     known = dbc or (MANCHESTER_DBC if system_file is None else None)
-    record = load(file, system, known, start_time(asked.start, [file]))
+    with ExitStack() as stack:
+        record = load(spooled(file, stack), system, known, start_time(asked.start, [file]))
+    if str(file) == "-":
+        file = Path("standard input")
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
     try:

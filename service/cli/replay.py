@@ -26,6 +26,9 @@ from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.views import VehicleView, alarm_dict, load_parameters, vehicle_view, window_dict
 from sprung.service.worker import ProcessLimits
 
+SLACK_SECONDS = 3.0  # to start
+KEPT_UP = 0.9  # of the speed asked for
+
 
 def run(
     files: list[Path],
@@ -71,6 +74,9 @@ def run(
                 json_lines,
             )
             status = max(status, _report(pipeline, path, fed, json_lines))
+            told = slower_line(fed, speed, engine.system.sample_rate)
+            if told:
+                print(f"sprung: {path}: {told}", file=sys.stderr)
     return status
 
 
@@ -177,6 +183,15 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
 def health(view: VehicleView, fed: Fed) -> str:
     """The vehicle's health; a recording that hardly tells of it calls for a check of the function."""
     return view.health if fed.monitored or view.health == "failure" else "check_function"
+
+
+def slower_line(fed: Fed, speed: float, sample_rate: float) -> str | None:
+    """What to say of a replay that did not keep up with the speed that was asked for; None where it did."""
+    recorded = fed.recorded_seconds(sample_rate)
+    pace = recorded / max(fed.wall_seconds, 1e-9)
+    if speed <= 0 or fed.wall_seconds < recorded / speed + SLACK_SECONDS or pace > KEPT_UP * speed:
+        return None
+    return f"--speed {speed:g} was asked for and {pace:.2g} reached: this machine, busy as it is, is no faster"
 
 
 def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:

@@ -175,9 +175,9 @@ def test_a_running_diagnosis_is_cancelled_over_http_and_does_not_hold_up_a_stop(
     with TestClient(create_app(core)) as client:
         job = ask_for(client, "endless.mcap")
         eventually(lambda: stored(core.store, job).progress > 0)
-        answer = client.delete(f"/jobs/{job}").json()
+        answer = client.post(f"/jobs/{job}/cancel").json()
         assert (answer["state"], answer["error"]) == ("failed", "cancelled by local")
-        assert client.delete("/jobs/nothing").status_code == 404
+        assert client.post("/jobs/nothing/cancel").status_code == 404
         second = ask_for(client, "endless too.mcap")
         eventually(lambda: stored(core.store, second).progress > 0)
         begun = time.monotonic()

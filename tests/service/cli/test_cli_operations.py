@@ -16,7 +16,9 @@ from mcap.reader import make_reader
 
 from sprung.service.cli import describe, main
 from sprung.service.cli.console import parameter_table
+from sprung.service.cli.replay import slower_line
 from sprung.service.engine import Engine
+from sprung.service.feed import Fed
 from sprung.service.views import vehicle_view
 
 ROOT = Path(__file__).parents[3]
@@ -30,13 +32,14 @@ def run(*arguments: str, stdin: bytes | None = None, columns: str = "120") -> su
     return subprocess.run(command, cwd=ROOT, env=environment, input=stdin, capture_output=True, check=False)
 
 
-@pytest.mark.parametrize("command", ["replay", "serve", "export", "doctor", "diagnose", "train", "system"])
+@pytest.mark.parametrize(
+    "command", ["replay", "serve", "export", "doctor", "diagnose", "train", "system", "simulate", "backup"]
+)
 def test_help_is_in_full_words(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
-    options = text[text.index("Options:") :]
-    for machine in ("<bool>", "<path>", "<str>", "list[", "range>"):
-        assert machine not in options
+    for machine in ("<bool>", "<path>", "<str>", "<Path>", "list[", "range>", "{FILE"):
+        assert machine not in text
 
 
 def test_wrong_usage_points_to_the_help_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -113,3 +116,29 @@ def test_an_interrupt_tells_what_is_kept(tmp_path: Path) -> None:
 def test_a_free_body_is_a_legal_system(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["system", str(ROOT / "benchmarks" / "systems" / "emps.yaml")]) == 0
     assert "slide.mass" in capsys.readouterr().out
+
+
+def test_a_replay_that_is_slower_than_asked_says_so() -> None:
+    fed = Fed("a", first_ns=0, last_ns=100_000_000_000, wall_seconds=20.0)
+    assert slower_line(fed, 60.0, 100.0) == (
+        "--speed 60 was asked for and 5 reached: this machine, busy as it is, is no faster"
+    )
+    assert slower_line(fed, 5.2, 100.0) is None  # it kept up
+    assert slower_line(fed, 0.0, 100.0) is None  # as fast as possible
+
+
+def test_an_empty_standard_input_is_told_by_every_command_that_takes_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in ("replay", "diagnose"):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"")))
+        assert main([command, "-"]) == 2
+        assert "standard input is empty" in capsys.readouterr().err
+
+
+def test_a_recording_from_standard_input_is_read_for_a_diagnosis(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(b"time,a\n0,1\n0.01,2\n")))
+    assert main(["diagnose", "-"]) == 2
+    assert "stdin.csv" in capsys.readouterr().err  # it came as far as its columns

@@ -1,0 +1,32 @@
+"""The licence of every package that requirements.lock installs, as its own metadata says: `make licences`."""
+
+from __future__ import annotations
+
+from importlib.metadata import PackageNotFoundError, metadata
+from pathlib import Path
+
+LOCK = Path(__file__).resolve().parents[1] / "requirements.lock"
+
+
+def licence(name: str) -> str:
+    """The licence expression, else the classifier, else the first line of the licence field."""
+    found = metadata(name)
+    classifiers = [line.rpartition(" :: ")[2] for line in found.get_all("Classifier", []) if line.startswith("License")]
+    said = found.get("License-Expression") or ", ".join(classifiers) or (found.get("License") or "not stated")
+    return said.strip().splitlines()[0][:80]
+
+
+def main() -> None:
+    """A line a package."""
+    for line in LOCK.read_text(encoding="utf-8").splitlines():
+        name, _, version = line.partition("==")
+        if not version or name.startswith("#"):
+            continue
+        try:
+            print(f"{name:32s} {version:16s} {licence(name)}")
+        except PackageNotFoundError:
+            print(f"{name:32s} {version:16s} is not installed")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""The pages in a real browser: nothing leaves the machine, nothing is wide or wrong, everything can be reached by keys.
+
+Needs Debian's chromium and playwright; `SPRUNG_SHOTS=FOLDER` keeps the pictures that docs/img/pages shows.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import uvicorn
+
+from sprung.model.system import System
+from sprung.service.api.app import create_app
+from sprung.service.core import build_core
+from sprung.service.engine import Engine
+from sprung.service.settings import Settings
+from tests.service_fakes import make_window
+
+CHROMIUM = shutil.which("chromium")
+PAGES = {"fleet": "/", "vehicle": "/pages/vehicles/car-17", "work": "/pages/work", "signin": "/signin"}
+MOST_BYTES = 300_000  # of the first load of the vehicle's page
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterator[str]:
+    """A running service with an alarmed vehicle and a good one."""
+    from sprung.model.system import MANCHESTER_DBC
+    from sprung.service.engine import make_tracker
+    from tests.service_fakes import FakeIdentifier
+
+    engine = Engine(system, FakeIdentifier(system), make_tracker(system), MANCHESTER_DBC)
+    core = build_core(Settings(data_dir=tmp_path_factory.mktemp("data")), engine)
+    server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        thread.join(0.05)
+    core.pipeline.process("car-17", [make_window(system, i) for i in range(80)])
+    core.pipeline.process("car-17", [make_window(system, 80 + i, 0.3) for i in range(60)])
+    core.pipeline.process("car-18", [make_window(system, i) for i in range(80)])
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(20)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api")
+    with sync_api.sync_playwright() as driver:
+        running = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield running
+        running.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 380])
+@pytest.mark.parametrize("name", ["fleet", "vehicle", "work", "signin"])
+def test_pages_stay_at_home_fit_their_screen_and_say_no_error(
+    address: str, browser: Any, name: str, width: int, scheme: str
+) -> None:
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page = context.new_page()
+    outside: list[str] = []
+    errors: list[str] = []
+    page.on(
+        "request",
+        lambda asked: None if asked.url.startswith((address, "data:", "blob:")) else outside.append(asked.url),
+    )
+    page.on("pageerror", lambda error: errors.append(str(error)))
+    page.on("console", lambda said: errors.append(said.text) if said.type == "error" else None)
+    answer = page.goto(address + PAGES[name], wait_until="load")
+    page.wait_for_timeout(700)
+    assert answer.status == 200
+    assert outside == [] and errors == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    if folder := os.environ.get("SPRUNG_SHOTS"):
+        page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png")
+    context.close()
+
+
+def test_the_first_load_of_a_vehicle_is_light(address: str, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(address + PAGES["vehicle"])
+    page.wait_for_timeout(1000)
+    entries = "[...performance.getEntriesByType('resource'), ...performance.getEntriesByType('navigation')]"
+    assert 20_000 < page.evaluate(f"{entries}.reduce((sum, one) => sum + one.encodedBodySize, 0)") <= MOST_BYTES
+    page.close()
+
+
+@pytest.mark.parametrize("name", ["fleet", "vehicle", "work", "signin"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious(address: str, browser: Any, name: str, scheme: str) -> None:
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    context = browser.new_context(color_scheme=scheme)
+    page = context.new_page()
+    page.goto(address + PAGES[name])
+    page.wait_for_timeout(700)
+    found = axe.Axe().run(page).response["violations"]
+    assert [
+        (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
+    ] == []
+    context.close()
+
+
+def test_every_control_of_the_vehicle_page_is_reached_by_keys_and_seen(address: str, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(address + PAGES["vehicle"])
+    page.wait_for_timeout(700)
+    wanted = page.evaluate(
+        "[...document.querySelectorAll('button, select, input, a[href]')].filter(e => e.offsetParent).length"
+    )
+    reached = set()
+    for _ in range(3 * wanted):
+        page.keyboard.press("Tab")
+        where = page.evaluate(
+            "(e => [e.tagName, e.id, e.textContent.slice(0, 30), getComputedStyle(e).outlineStyle,"
+            " e.getBoundingClientRect().top + scrollY].join('|'))(document.activeElement)"
+        )
+        if where in reached:
+            break
+        reached.add(where)
+    assert len(reached) >= 0.9 * wanted, (len(reached), wanted)
+    unseen = [one for one in reached if one.split("|")[3] == "none" and not one.startswith("BODY")]
+    assert unseen == []
+    page.close()
+
+
+def test_an_alarm_is_acknowledged_by_keys(address: str, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(address + PAGES["vehicle"])
+    button = page.get_by_role("button", name="Acknowledge")
+    button.focus()
+    page.keyboard.press("Enter")
+    page.wait_for_timeout(1500)
+    if page.locator("dialog[open]").count():
+        page.keyboard.press("Enter")
+        page.wait_for_timeout(1500)
+    page.goto(address + PAGES["vehicle"])
+    assert "acknowledged" in page.inner_text("main")
+    page.close()
