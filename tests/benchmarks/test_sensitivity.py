@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, cast
 
+import numpy as np
 import pytest
 
-from sprung.benchmarks.sensitivity import Line, Said, Subject, _rig
+from sprung.benchmarks.sensitivity import Line, Said, Subject, _rig, recordings
 from sprung.model.diagnosis.rules import RULES, Rules
 
 HEALTHY = Said("consistent", (), ())
@@ -46,9 +47,15 @@ def test_a_component_test_is_not_asked_about_vehicles() -> None:
     assert told.tried == 0 and told.figure()["changed"] == []
 
 
-def test_made_recordings_of_a_rig_repeat_with_their_seed() -> None:
-    import numpy as np
+def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -> None:
+    made = list(recordings("quick", 8, 3.0, 1))
+    assert [name.split("-", 1)[1] for name, _, _ in made][:3] == ["friction", "weak friction", "cubic spring"]
+    assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made)
+    healthy, rubbing = made[5][2].values, made[0][2].values
+    assert np.std(healthy[:, 2]) > 0.1 and np.std(rubbing[:, 2]) > 0.1  # m/s^2
 
+
+def test_made_recordings_of_a_rig_repeat_with_their_seed() -> None:
     first, again = (_rig(2.0, np.random.default_rng(1)) for _ in range(2))
     assert np.array_equal(first.values, again.values) and first.values.shape == (200, 2)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -34,7 +33,7 @@ def baseline(
     declared: Noise,
     split: int,
     rules: Rules = RULES,
-    memory: FitMemory[Any] | None = None,
+    memory: FitMemory | None = None,
 ) -> tuple[Problem, Fit]:
     """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
 
@@ -51,7 +50,7 @@ def baseline(
 
 
 def _baseline(
-    system: System, signals: Signals, declared: Noise, split: int, rules: Rules, memory: FitMemory[Any] | None
+    system: System, signals: Signals, declared: Noise, split: int, rules: Rules, memory: FitMemory | None
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)

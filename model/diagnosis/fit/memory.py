@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from typing import Generic, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,20 +15,21 @@ from sprung.model.system import System
 Known = TypeVar("Known")
 
 
-class FitMemory(Generic[Known]):
+class FitMemory:
     """Results by what goes into them, the recording and the start by value.  May be shared among threads.
 
     A result that two threads ask for at once is made twice; they are alike.
     """
 
     def __init__(self) -> None:
-        self._known: dict[bytes, Known] = {}
+        self._known: dict[object, Any] = {}
 
-    def recall(self, key: bytes, make: Callable[[], Known]) -> Known:
+    def recall(self, key: object, make: Callable[[], Known]) -> Known:
         """The result of a key, made where it is not known yet."""
         if key not in self._known:
             self._known[key] = make()
-        return self._known[key]
+        known: Known = self._known[key]
+        return known
 
 
 def key_of(system: System, part: Part, noise: Noise, start: Point, *others: object) -> bytes:

@@ -8,7 +8,6 @@ with G from the measured inputs to the sensors and S_u the inputs' noise (`white
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -43,7 +42,7 @@ class Problem:
     sensors: np.ndarray  # indices of the present sensors
     noise: Noise
     rules: Rules = RULES  # by which fits to it are judged
-    memory: FitMemory[Any] | None = None  # fits that are known already
+    memory: FitMemory | None = None  # fits that are known already
 
     @property
     def process_noise(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.optimise import Fit
@@ -49,7 +49,7 @@ class Options:
     file: str = ""  # name of the recording, for the report
     catalogue: tuple[Law, ...] = CATALOGUE
     rules: Rules = RULES  # every number that decides
-    memory: FitMemory[Any] | None = None  # of the same recording's earlier diagnoses
+    memory: FitMemory | None = None  # of the same recording's earlier diagnoses
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,13 @@ GROUPS = (element_candidates, harmonic_candidates, body_candidates, measurement_
 
 def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = True) -> Screening:
     """Score every candidate on the residual of a fit, by the smallest chance of such a score first."""
+    if problem.memory is None:
+        return _screened(problem, fit, laws, project)
+    key = "screen", id(fit), problem.rules.screening, tuple(law.name for law in laws), project
+    return problem.memory.recall(key, lambda: _screened(problem, fit, laws, project))
+
+
+def _screened(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool) -> Screening:
     projector = Projector(problem, fit, project)
     found: list[Candidate] = []
     tests: dict[Family, int] = {}

@@ -249,6 +249,13 @@ def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
     The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
     which have absorbed much of it, the model may be too far away for a first step.
     """
+    if problem.memory is None:
+        return _joint_start(problem, base, hit)
+    key = "start", id(base), hit.term, problem.rules.selection.hint
+    return problem.memory.recall(key, lambda: _joint_start(problem, base, hit))
+
+
+def _joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
     start = start_of(base, hit)
     law = hit.term.law
     if not isinstance(law, ElementLaw) or law.strength is None or not law.named:

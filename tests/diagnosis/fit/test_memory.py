@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.memory import FitMemory, key_of
-from sprung.model.diagnosis.fit.optimise import Fit, optimise
+from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from tests.diagnosis_cases import problem_of, simulate
@@ -20,7 +20,7 @@ def start_of(problem: Problem) -> Point:
 
 def test_a_fit_is_made_once() -> None:
     problem = problem_of(simulate(seconds=8.0))
-    memory: FitMemory[Fit] = FitMemory()
+    memory: FitMemory = FitMemory()
     known = replace(problem, memory=memory)
     first = optimise(known, start_of(problem), iterations=2)
     assert optimise(known, start_of(problem), iterations=2) is first
