@@ -167,7 +167,7 @@ class Attribution:
         H = len(self.deviations)
         for h, deviation in enumerate(self.deviations):
             limit = self.limits.get(deviation.name) if deviation.kind == "load" else None
-            if limit is None or state.calibration.recent[-1] == 0:
+            if limit is None:
                 continue
             value, std = float(state.belief.mean[-H:][h]), float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
             excess = limit.beyond(value) / limit.empty

@@ -1,0 +1,145 @@
+"""Loads of a running vehicle: steps at stops and on the way, limits, air-spring pressure, curves."""
+
+import numpy as np
+import pytest
+
+from sprung.model.identification.deviations import Deviation
+from sprung.model.signals import Conditions, Deviating
+from sprung.model.system import parse_system
+from sprung.model.tracking.alarms import LoadLimit
+from sprung.model.tracking.tracker import Tracker, TrackerSettings
+from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
+
+SECOND = 1_000_000_000
+STD = np.repeat([0.004, 0.006, 0.02, 0.01], [8, 4, 8, 4])
+TAKES = np.repeat([0.0, 1.0, 0.0, 0.5], [8, 4, 8, 4])  # of the parameters, were the load another than assumed
+SEEN = 0.01  # standard deviation of the load that one window gives
+EMPTY = 32000.0
+
+
+def follow(most=None, least=None):
+    parameters = [TrackedParameter(f"element_{i}.{q}") for q in ("stiffness", "damping") for i in range(12)]
+    limits = {"car": LoadLimit(EMPTY, least, most)}
+    return Tracker(parameters, TrackerSettings(), [Deviation("car", "load", 0.15, -1)], limits=limits)
+
+
+def ride(rng, tracker, state, seconds, load, first=0, conditions=lambda k: None, **changes):
+    """Windows of a second, one after the other; `load`: logarithm of the loaded mass, by second."""
+    covariance = correlated(rng, STD)
+    root = np.linalg.cholesky(covariance)
+    for k in range(first, first + seconds):
+        carried = load(k) + SEEN * rng.normal()
+        value = root @ rng.normal(size=24) + TAKES * (carried - load(k))
+        found = Deviating(
+            np.array([carried]), covariance, TAKES[:, None], np.array([[SEEN**-2]]), np.zeros(1), 300.0, False
+        )
+        both = covariance + SEEN**2 * np.outer(TAKES, TAKES)
+        told = estimate(value, both, deviating=found, **changes)
+        state = tracker.update(state, told, EPOCH + k * SECOND, conditions(k))
+    return state
+
+
+def worst(tracker, state):
+    mean, std = tracker.posterior(state)
+    return float(np.abs(mean / std).max())
+
+
+@pytest.mark.parametrize("step", [-0.3, 0.3])
+@pytest.mark.parametrize("stop", [0, 40])
+def test_a_step_of_the_load_raises_nothing_and_is_known_within_half_a_minute(step, stop):
+    rng = np.random.default_rng(1)
+    tracker, new = follow(), np.log1p(step)
+    state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
+    largest = 0.0
+    for k in range(60 + stop, 90 + stop):
+        state = ride(rng, tracker, state, 1, lambda k: new, k)
+        largest = max(largest, worst(tracker, state))
+    value, std = tracker.loads(state)["car"]
+    assert abs(value - new) < 0.02
+    assert std < 0.01
+    assert largest < 4.0
+    assert state.alarms == ()
+    assert tracker.health(state) == "ok"
+
+
+def test_more_than_the_car_may_carry_is_an_alarm_until_it_is_let_down():
+    rng = np.random.default_rng(2)
+    tracker = follow(most=6000.0)
+    state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: np.log1p(0.1))
+    assert state.alarms == ()
+    state = ride(rng, tracker, state, 30, lambda k: np.log1p(0.25), 100)
+    (alarm,) = state.active
+    assert (alarm.kind, alarm.parameter) == ("load", "car.load")
+    assert alarm.change == pytest.approx(0.25 - 6000 / EMPTY, abs=0.01)
+    assert tracker.health(state) == "maintenance_required"
+    state = ride(rng, tracker, state, 30, lambda k: np.log1p(0.1), 200)
+    assert state.active == ()
+
+
+def test_less_than_the_least_is_an_alarm_too():
+    rng = np.random.default_rng(3)
+    tracker = follow(least=1000.0)
+    state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
+    assert [a.parameter for a in state.active] == ["car.load"]
+    assert state.active[0].change < 0
+
+
+def test_pressure_tells_the_load_at_once_when_its_constant_is_known():
+    rng = np.random.default_rng(4)
+    tracker, state, at = follow(), None, 0
+    state = tracker.initial_state()
+
+    def pressure(load):
+        return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
+
+    for load in (0.0, 0.2, -0.1, 0.1):
+        state = ride(rng, tracker, state, 60, lambda k, load=load: load, at, pressure(load))
+        at += 100
+    assert state.cargo.constant[0] == pytest.approx(np.log(4.2e5), abs=0.02)
+    state = ride(rng, tracker, state, 1, lambda k: 0.25, at, pressure(0.25))
+    value, std = tracker.loads(state)["car"]
+    assert value == pytest.approx(0.25, abs=0.03)
+    assert std < 0.01  # a window alone gives SEEN
+    assert state.cargo.prior_variance[0] < 0.02**2
+
+
+def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over():
+    rng = np.random.default_rng(5)
+    tracker = follow()
+    state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
+    bent = ride(
+        rng, tracker, state, 40, lambda k: 0.0, 60, lambda k: Conditions(lateral=1.2), adequate=False, chi_square=9.0
+    )
+    assert bent.active == ()
+    assert bent.idle == 40
+    straight = ride(rng, tracker, state, 40, lambda k: 0.0, 60, adequate=False, chi_square=9.0)
+    assert [a.kind for a in straight.active] == ["misfit"]
+
+
+FILE = """
+name: measured beside
+sample_rate: 100
+window: 100
+speed: {csv: v, unit: km/h}
+temperature: {csv: T, unit: K}
+yaw_rate: {csv: turn, unit: deg/s}
+bodies: {car: {mass: 1000, load: {min: 0, max: 300, pressure: {csv: p, unit: bar}}}}
+inputs: {road: {kind: displacement, displacement: {csv: road}}}
+elements: {spring: {upper: car, lower: road, stiffness: 40000, damping: 2000}}
+sensors: {a: {kind: acceleration, body: car, csv: a}}
+"""
+
+
+def test_a_system_file_says_where_conditions_are_measured():
+    system = parse_system(FILE)
+    assert [c.name for c in system.auxiliary] == ["speed", "temperature", "yaw_rate", "car.pressure"]
+    gains = np.array([[c.gain, c.offset] for c in system.auxiliary])
+    conditions = system.conditions(np.array([20.0, 5.0, 0.05, 3e5]))
+    assert conditions.speed == 20.0
+    assert conditions.lateral == pytest.approx(1.0)
+    assert conditions.curving
+    assert conditions.pressure == (3e5,)
+    assert gains[1].tolist() == [1.0, -273.15]
+    plain = "\n".join(line for line in FILE.split("\n") if not line.startswith(("speed", "temp", "yaw")))
+    assert parse_system(plain).digest == system.digest  # how it runs makes no other vehicle
+    assert not parse_system(plain).conditions(None).curving
