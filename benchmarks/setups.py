@@ -1,8 +1,9 @@
 """`sprung bench setups [--count 100] [--seed 1]`: wrong set-ups on simulated recordings of the bundled vehicle.
 
 Clean recordings of the independent generator, vehicles drawn anew, are falsified as a workshop does it: a sign, two
-channels exchanged, a whole node late, a wrong scale or unit, a sensor elsewhere than the system file says.  A place is
-right when the first finding names exactly the channels that were falsified; a spring or damper may never be blamed.
+channels exchanged, left and right, a whole node upside down or late, a wrong scale or unit, a sensor or an element
+elsewhere than the system file says, an element at another body.  A place is right when the first finding names exactly
+the channels that were falsified, or the element; a spring or damper may never be blamed otherwise.
 """
 
 from __future__ import annotations
@@ -17,47 +18,65 @@ from numpy.typing import NDArray
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation.verdict import SETUP_EFFECTS
 from sprung.model.schema import MotionSensor
 from sprung.model.system import MANCHESTER, System, load_system
 
 Array = NDArray[np.float64]
-KINDS = ("sign_reversed", "channels_swapped", "node_delay", "wrong_scale", "wrong_position")
-SECONDS, RATE, EACH = 20.0, 100.0, 5  # length of a recording, Hz, set-ups made of one recording
+KINDS = {  # kind: effect
+    "sign of a sensor": "sign_reversed",
+    "sign of a motion": "sign_reversed",
+    "upside down": "sign_reversed",
+    "two channels": "channels_swapped",
+    "left and right": "channels_swapped",
+    "late sensors": "node_delay",
+    "late inputs": "node_delay",
+    "scale of a node": "wrong_scale",
+    "scale of all": "wrong_scale",
+    "position of a sensor": "wrong_position",
+    "position of an element": "wrong_position",
+    "element at another body": "wrong_body",
+}
+SECONDS, RATE, EACH = 20.0, 100.0, len(KINDS)  # length of a recording, Hz, set-ups made of one recording
 SCALES = (1 / 9.80665, 9.80665, 0.1, 10.0, 1000.0, 0.5, 2.0)
 
 
 @dataclass(frozen=True)
 class Falsified:
-    """A recording with a wrong set-up."""
+    """A recording with a wrong set-up: wrong channels, or a wrong system file."""
 
-    effect: str
-    channels: frozenset[str]
+    kind: str
+    channels: frozenset[str]  # or the element
     values: Array
+    system: System
     sample_rate: float = RATE
     lost: int = 0
 
 
-def run(count: int = 100, seed: int = 1) -> Iterator[dict[str, Any]]:
-    """Yields one line per recording, and the rates."""
+def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 0) -> Iterator[dict[str, Any]]:
+    """Yields one line per recording from number `first` on, and the rates."""
     system, vehicle = load_system(), read_vehicle(MANCHESTER)
-    random = np.random.default_rng(seed)
     cases = draw_cases(vehicle, -(-count // EACH), seed, ["clean"])
     right = named = blamed = done = 0
-    for made in make_recordings(vehicle, cases, SECONDS):
+    for number, made in enumerate(make_recordings(vehicle, cases, seconds)):
         values = in_order(system, made.values)
-        for _ in range(min(EACH, count - done)):
-            wrong = falsified(system, values, KINDS[done % len(KINDS)], random)
+        for index, kind in enumerate(KINDS):
+            which = number * EACH + index
+            if not first <= which < count:
+                continue
+            wrong = falsified(system, values, kind, np.random.default_rng([seed, which]))
             began = time.process_time()
-            report = diagnose(system, wrong, Options(file=f"{wrong.effect}-{done}"))
-            first = report.findings[0] if report.findings else None
-            place = frozenset((first.location if first else "").split("|"))
-            hit = first is not None and place == wrong.channels
-            physical = any(f.location.split("|")[0] in system.elements for f in report.findings)
-            right, blamed = right + hit, blamed + physical
-            named += first is not None and first.effect == wrong.effect
-            done += 1
+            report = diagnose(wrong.system, wrong, Options(file=f"{kind}-{which}"))
+            top = report.findings[0] if report.findings else None
+            place = frozenset(top.location.split("|")) if top else frozenset()
+            hit = place == wrong.channels
+            other = [f for f in report.findings if f.effect not in SETUP_EFFECTS]
+            physical = any(f.location.split("|")[0] in system.elements for f in other)
+            right, blamed, done = right + hit, blamed + physical, done + 1
+            named += top is not None and top.effect == KINDS[kind]
             yield {
-                "truth": [wrong.effect, sorted(wrong.channels)],
+                "number": which,
+                "truth": [kind, sorted(wrong.channels)],
                 "verdict": report.verdict,
                 "said": [[f.location, f.effect] for f in report.findings],
                 "place": bool(hit),
@@ -75,32 +94,55 @@ def in_order(system: System, values: Array) -> Array:
 
 def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> Falsified:
     """One wrong set-up of a kind."""
-    values = clean.copy()
+    values, wrong = clean.copy(), system
     names = [channel.name for channel in system.channels]
-    sensors = list(system.sensors)
-    if kind == "sign_reversed":
-        chosen = [str(random.choice(sensors))]
-        values[:, names.index(chosen[0])] *= -1
-    elif kind == "channels_swapped":
-        chosen = [str(n) for n in random.choice(sensors, 2, replace=False)]
+    sensors, body = list(system.sensors), str(random.choice(list(system.bodies)))
+    node = [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
+    bogie = str(random.choice([b for b in system.bodies if b != "car"]))
+    wheels = [e.lower for e in system.file.elements.values() if e.upper == bogie]
+    if kind in ("element at another body", "position of an element"):
+        wrong, name = _wrong_file(system, kind, random)
+        return Falsified(kind, frozenset([name]), values, wrong)
+    if kind == "sign of a motion":
+        chosen = [str(random.choice(list(system.file.inputs)))]
+        values[:, [i for i, n in enumerate(names) if n.split(".")[0] == chosen[0]]] *= -1
+    elif kind in ("sign of a sensor", "upside down"):
+        chosen = node if kind == "upside down" else [str(random.choice(sensors))]
+        values[:, [names.index(n) for n in chosen]] *= -1
+    elif kind in ("two channels", "left and right"):
+        chosen = node if kind == "left and right" else [str(n) for n in random.choice(sensors, 2, replace=False)]
+        other = [n[:-1] + {"l": "r", "r": "l"}[n[-1]] for n in chosen] if kind == "left and right" else chosen[::-1]
+        values[:, [names.index(n) for n in chosen]] = clean[:, [names.index(n) for n in other]]
+    elif kind in ("late sensors", "late inputs"):
+        chosen = node if kind == "late sensors" else [n for n in names if n.split(".")[0] in wheels]
+        late = int(random.integers(1, 15))  # samples
+        values = values[late:]
         at = [names.index(n) for n in chosen]
-        values[:, at] = values[:, at[::-1]]
-    elif kind in ("node_delay", "wrong_scale"):
-        body = str(random.choice(list(system.bodies)))
-        chosen = [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
-        at = [names.index(n) for n in chosen]
-        if kind == "node_delay":
-            late = int(random.integers(1, 15))  # samples
-            values = values[late:]
-            values[:, at] = clean[: len(clean) - late, at]
-        else:
-            values[:, at] *= float(random.choice(SCALES))
+        values[:, at] = clean[: len(clean) - late, at]
+    elif kind in ("scale of a node", "scale of all"):
+        chosen = node if kind == "scale of a node" else sensors
+        values[:, [names.index(n) for n in chosen]] *= float(random.choice(SCALES))
     else:
         chosen = [str(random.choice(sensors))]
-        values[:, names.index(chosen[0])] = elsewhere(
-            system, clean, names, chosen[0], float(random.choice((-1, 1)) * random.uniform(0.5, 2.0))
-        )
-    return Falsified(kind, frozenset(chosen), values)
+        offset = float(random.choice((-1, 1)) * random.uniform(0.5, 2.0))
+        values[:, names.index(chosen[0])] = elsewhere(system, clean, names, chosen[0], offset)
+    return Falsified(kind, frozenset(chosen), values, wrong)
+
+
+def _wrong_file(system: System, kind: str, random: np.random.Generator) -> tuple[System, str]:
+    """The system file with an element elsewhere, or with one end at a body where it does not belong."""
+    name = str(random.choice(list(system.elements)))
+    element = system.file.elements[name]
+    if kind == "position of an element":
+        position = list(element.position or (0.0, 0.0))
+        axis = int(random.integers(2))
+        position[axis] += float(random.choice((-1, 1)) * random.uniform(0.4, 1.0) * (1.0, 0.6)[axis])
+        changed = element.model_copy(update={"position": (position[0], position[1])})
+    else:
+        end = "upper" if element.lower in system.file.inputs else "lower"
+        there = [b for b in system.bodies if b not in (element.upper, element.lower)]
+        changed = element.model_copy(update={end: str(random.choice(there))})
+    return System(system.file.model_copy(update={"elements": {**system.file.elements, name: changed}})), name
 
 
 def elsewhere(system: System, clean: Array, names: list[str], name: str, offset: float) -> Array:

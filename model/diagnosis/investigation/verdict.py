@@ -22,10 +22,10 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
-SENSOR_FAULTS = frozenset(
-    {law.name for law in CATALOGUE if law.fault}
-    | {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position"}
+SETUP_EFFECTS = frozenset(
+    {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position", "wrong_body"}
 )
+SENSOR_FAULTS = frozenset({law.name for law in CATALOGUE if law.fault} | SETUP_EFFECTS)
 NO_FAULTS = frozenset({"preload"})  # nuisances: reported, and no reason for any verdict
 
 

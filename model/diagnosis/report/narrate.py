@@ -380,7 +380,8 @@ _SETUP_WORDS = {
     "channels_swapped": "{place}: the two channels are exchanged",
     "node_delay": "{place}: all of them are late by {value}, as a whole node is",
     "wrong_scale": "{place}: {value} times what it should show, a wrong scale or unit",
-    "wrong_position": "{place}: sits {value} from where the system file says",
+    "wrong_position": "{place}: sits {value} along {axis} from where the system file says",
+    "wrong_body": "{place}: is not fixed to what the system file says; its {detail} fits",
 }
 _SETUP_VALUES = {"node_delay": ("time", "s"), "wrong_scale": ("ratio", "1"), "wrong_position": ("offset", "m")}
 
@@ -392,7 +393,9 @@ def _setup_finding(fault: SetupFault) -> Finding:
         name, unit = _SETUP_VALUES[fault.effect]
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
         words = _value(parameters[0])
-    sentence = _SETUP_WORDS[fault.effect].format(place=fault.location.replace("|", " and "), value=words)
+    sentence = _SETUP_WORDS[fault.effect].format(
+        place=fault.location.replace("|", " and "), value=words, axis="xy"[fault.axis], detail=fault.detail
+    )
     share = 100 * (1 - fault.after / fault.before)
     return Finding(
         location=fault.location,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
-from sprung.benchmarks.setups import falsified, in_order
+from sprung.benchmarks.setups import KINDS, falsified, in_order
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.investigation.setup import SetupFault, without_setup_faults
 from sprung.model.diagnosis.record.channels import prepare
@@ -33,12 +33,14 @@ def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> Non
     assert found(*vehicle) == ()
 
 
-@pytest.mark.parametrize("kind", ["sign_reversed", "channels_swapped", "node_delay", "wrong_scale"])
+@pytest.mark.parametrize(
+    "kind", ["upside down", "left and right", "late inputs", "scale of a node", "element at another body"]
+)
 def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[System, np.ndarray]) -> None:
     system, values = vehicle
     wrong = falsified(system, values, kind, np.random.default_rng(8))
-    fault = found(system, wrong.values)[0]
-    assert fault.effect == kind
+    fault = found(wrong.system, wrong.values)[0]
+    assert fault.effect == KINDS[kind]
     assert frozenset(fault.location.split("|")) == wrong.channels
 
 

@@ -1,0 +1,117 @@
+"""How faults of a set-up are undone: changes of recorded signals, or of the system file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.schema import Element, MotionSensor, SystemFile
+from sprung.model.system import System
+
+Undo = Callable[[System, Signals], tuple[System, Signals]]
+_EDGE = 5  # samples beside a cut that a shift between samples spoils
+
+
+def turn(sensors: Sequence[int] = (), supports: Sequence[int] = (), forces: Sequence[int] = ()) -> Undo:
+    """The other sign."""
+    return scale(sensors, supports, supports, -1.0, forces)
+
+
+def scale(
+    sensors: Sequence[int],
+    displacements: Sequence[int],
+    velocities: Sequence[int],
+    ratio: float,
+    forces: Sequence[int] = (),
+) -> Undo:
+    """Divided by what they were too large by."""
+
+    def undo(system: System, signals: Signals) -> tuple[System, Signals]:
+        copies = {}
+        for key, at in (
+            ("sensors", sensors),
+            ("displacement", displacements),
+            ("velocity", velocities),
+            ("force", forces),
+        ):
+            series = getattr(signals, key).copy()
+            series[:, list(at)] /= ratio
+            copies[key] = series
+        return system, replace(signals, **copies)
+
+    return undo
+
+
+def exchange(sensors: Sequence[tuple[int, int]] = (), supports: Sequence[tuple[int, int]] = ()) -> Undo:
+    """Pairs of channels in each other's place."""
+
+    def undo(system: System, signals: Signals) -> tuple[System, Signals]:
+        copies = {}
+        for key, pairs in (("sensors", sensors), ("displacement", supports), ("velocity", supports)):
+            series = getattr(signals, key).copy()
+            for i, j in pairs:
+                series[:, [i, j]] = series[:, [j, i]]
+            copies[key] = series
+        return system, replace(signals, **copies)
+
+    return undo
+
+
+def advance(sensors: Sequence[int], supports: Sequence[int], late: float) -> Undo:
+    """Earlier by a delay; what they no longer have at the ends is cut off of all signals."""
+
+    def undo(system: System, signals: Signals) -> tuple[System, Signals]:
+        rate, samples = signals.sample_rate, signals.samples
+        time, omega = np.arange(samples) / rate, 2 * np.pi * np.fft.rfftfreq(samples, 1 / rate)
+        copies = {}
+        for key, at in (("sensors", sensors), ("displacement", supports), ("velocity", supports)):
+            series = getattr(signals, key).copy()
+            chosen = [i for i in at if np.isfinite(series[0, i])]
+            line = series[:1, chosen] + (series[-1:, chosen] - series[:1, chosen]) * (time / time[-1])[:, None]
+            spectrum = np.fft.rfft(series[:, chosen] - line, axis=0) * np.exp(1j * omega * late)[:, None]
+            series[:, chosen] = np.fft.irfft(spectrum, samples, axis=0) + line
+            copies[key] = series
+        lost = int(np.ceil(abs(late) * rate)) + _EDGE
+        return system, replace(signals, **copies).part(lost, samples - lost)
+
+    return undo
+
+
+def _with_part(file: SystemFile, kind: str, name: str, part: Element | MotionSensor) -> System:
+    return System(file.model_copy(update={kind: {**getattr(file, kind), name: part}}))
+
+
+def moved_sensor(system: System, name: str, axis: int, offset: float) -> System:
+    """The system with a sensor elsewhere along an axis, m."""
+    sensor = system.file.sensors[name]
+    assert isinstance(sensor, MotionSensor)
+    position = list(sensor.position or system.file.bodies[sensor.body].position)
+    position[axis] += offset
+    return _with_part(system.file, "sensors", name, sensor.model_copy(update={"position": (position[0], position[1])}))
+
+
+def moved_element(system: System, name: str, axis: int, offset: float) -> System:
+    """The system with an element elsewhere along an axis, m."""
+    element = system.file.elements[name]
+    position = list(element.position or (0.0, 0.0))
+    position[axis] += offset
+    return _with_part(
+        system.file, "elements", name, element.model_copy(update={"position": (position[0], position[1])})
+    )
+
+
+def attached(system: System, name: str, end: str, to: str) -> System:
+    """The system with one end of an element at something else."""
+    return _with_part(system.file, "elements", name, system.file.elements[name].model_copy(update={end: to}))
+
+
+def in_system(change: Callable[[System], System]) -> Undo:
+    """A change of the system file alone."""
+
+    def undo(system: System, signals: Signals) -> tuple[System, Signals]:
+        return change(system), signals
+
+    return undo

@@ -1,0 +1,227 @@
+"""What may be wrong between a rig and its channels: signs, exchanges, delays, scales, positions of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from sprung.model.diagnosis.investigation import setup_changes as changes
+from sprung.model.diagnosis.investigation.setup_response import Group, Hypothesis, ModelResponse
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.rules import SetupRules
+from sprung.model.schema import MotionSensor
+from sprung.model.system import System
+
+ORDINARY = ("sensor_gain", "sensor_lag")  # that screening seeks; they only have to be beaten
+_ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
+_ALIKE = 1e-6  # m, of positions that mirror each other
+
+
+def hypotheses(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
+    """All of them with the misfit that they leave by spectra."""
+    wired = Wiring(system, signals)
+    yield from _signs(one, signals, wired)
+    yield from _exchanges(one, system, signals, wired)
+    yield from _delays(one, wired, rules)
+    yield from _scales(one, wired, rules)
+    yield from _positions(one, system, signals, rules)
+    yield from _ordinary(one, signals, rules)
+
+
+class Wiring:
+    """Which channels belong together: those of one body, of one kind, of one place."""
+
+    def __init__(self, system: System, signals: Signals) -> None:
+        self.system, self.signals = system, signals
+        listed = list(system.file.sensors.values())
+        self.sensors = [listed[int(i)] for i in signals.sensor_index]
+        self.body = [getattr(sensor, "body", None) for sensor in self.sensors]
+        self.kind = [sensor.kind for sensor in self.sensors]
+        self.carries: dict[str, list[int]] = {body: [] for body in system.bodies}  # supports right below a body
+        self.place: dict[int, tuple[float, float]] = {}
+        for element in system.file.elements.values():
+            for body, support in ((element.upper, element.lower), (element.lower, element.upper)):
+                if body in self.carries and support in signals.support_names:
+                    at = signals.support_names.index(support)
+                    self.carries[body].append(at)
+                    self.place[at] = element.position or (0.0, 0.0)
+
+    def name(self, group: Group) -> str:
+        """Channels of a group joined by "|"."""
+        names = [self.signals.sensor_names[i] for i in group.sensors]
+        for j in group.supports:
+            support = self.signals.support_names[j]
+            for quantity in ("displacement", "velocity"):
+                if f"{support}.{quantity}" in {channel.name for channel in self.system.inputs}:
+                    names.append(f"{support}.{quantity}")
+        return "|".join(names)
+
+    def groups(self) -> list[Group]:
+        """Single channels, and what may share a node, a kind or a scale."""
+        everything = range(len(self.sensors))
+        found = [Group((i,)) for i in everything]
+        found += [Group((), (j,)) for j in range(len(self.signals.support_names))]
+        for body in self.system.bodies:
+            own = tuple(i for i in everything if self.body[i] == body)
+            below = tuple(dict.fromkeys(self.carries[body]))
+            found += [Group(own), Group((), below), Group(own, below) if own and below else Group()]
+        found += [Group(tuple(i for i in everything if self.kind[i] == kind)) for kind in dict.fromkeys(self.kind)]
+        found += [Group(tuple(everything)), Group((), tuple(range(len(self.signals.support_names))))]
+        found += [Group((), axle) for axle in self.axles()]
+        return [group for group in dict.fromkeys(found) if group.sensors or group.supports]
+
+    def axles(self) -> list[tuple[int, ...]]:
+        """Supports at the same x."""
+        at = sorted({round(x, 6) for x, _ in self.place.values()})
+        axles = [tuple(sorted(j for j, (x, _) in self.place.items() if abs(x - here) < _ALIKE)) for here in at]
+        return [axle for axle in axles if len(axle) > 1]
+
+    def mirrored(self, axis: int) -> Iterator[tuple[list[tuple[int, int]], list[tuple[int, int]]]]:
+        """Pairs of sensors and of supports in mirrored places: of each body, of all sensors, of all supports."""
+        every = list(range(len(self.sensors)))
+        for chosen in [[i for i in every if self.body[i] == body] for body in self.system.bodies] + [every]:
+            pairs = self._pairs({i: self._position(i) for i in chosen if self._turns(i)}, axis)
+            if len(pairs) > 1:
+                yield pairs, []
+        supports = self._pairs(self.place, axis)
+        if len(supports) > 1:
+            yield [], supports
+
+    def _turns(self, i: int) -> bool:
+        return isinstance(self.sensors[i], MotionSensor) and self.sensors[i].kind in _ORDERS
+
+    def _position(self, i: int) -> tuple[float, float]:
+        sensor = self.sensors[i]
+        assert isinstance(sensor, MotionSensor)
+        return sensor.position or self.system.file.bodies[sensor.body].position
+
+    def _pairs(self, places: dict[int, tuple[float, float]], axis: int) -> list[tuple[int, int]]:
+        found = []
+        for i, j in combinations(places, 2):
+            centre = 0.0 if axis == 1 else float(np.mean([place[0] for place in places.values()]))
+            mirror = list(places[i])
+            mirror[axis] = 2 * centre - mirror[axis]
+            if np.abs(np.subtract(mirror, places[j])).max() < _ALIKE and places[i] != places[j]:
+                found.append((i, j))
+        return found
+
+
+def _signs(one: ModelResponse, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
+    for group in wired.groups():
+        name = wired.name(group)
+        if len(group.supports) == 1 and not group.sensors:
+            name = signals.support_names[group.supports[0]]
+        left = one.left(one.turned(group))
+        yield Hypothesis("sign_reversed", name, None, left, changes.turn(group.sensors, group.supports), group)
+    for j, name in enumerate(signals.force_names):
+        left = one.left(one.shown - 2 * one.of_force[:, :, j])
+        yield Hypothesis("sign_reversed", name, None, left, changes.turn(forces=[j]))
+
+
+def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
+    def hypothesis(sensors: Sequence[tuple[int, int]], supports: Sequence[tuple[int, int]]) -> Hypothesis:
+        names = [signals.sensor_names[i] for pair in sensors for i in pair]
+        names += [signals.support_names[j] for pair in supports for j in pair]
+        left = one.left(_exchanged(one, sensors, supports))
+        return Hypothesis(
+            "channels_swapped", "|".join(names), None, left, changes.exchange(list(sensors), list(supports))
+        )
+
+    for i, j in combinations(range(len(wired.sensors)), 2):
+        if wired.kind[i] == wired.kind[j]:
+            yield hypothesis([(i, j)], [])
+    for i, j in combinations(range(len(signals.support_names)), 2):
+        yield hypothesis([], [(i, j)])
+    for axis in (1, 0):
+        for sensors, supports in wired.mirrored(axis):
+            yield hypothesis(sensors, supports)
+
+
+def _exchanged(
+    one: ModelResponse, sensors: Iterable[tuple[int, int]], supports: Iterable[tuple[int, int]]
+) -> ComplexArray:
+    plant, part = one.forward.plant, one.forward.part
+    band = slice(1, part.grid.band.stop)
+    shown = one.shown
+    for i, j in supports:
+        G, u = plant.sensor_of_support[band], part.support[band]
+        shown = shown + (G[:, :, i] - G[:, :, j]) * (u[:, j] - u[:, i])[:, None]
+    for i, j in sensors:
+        shown[:, [i, j]] = shown[:, [j, i]]
+    return shown
+
+
+def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
+    """Nodes are late, not early: where a group seems early, the others are late."""
+    for group in wired.groups():
+        count = len(group.sensors) + len(group.supports)
+        if len(group.sensors) == len(wired.sensors):
+            if wired.signals.support_names:  # the motions are early: said of neither
+                continue
+        elif count < 2:
+            continue
+        late = one.delay(group, rules.latest)
+        if late > 0:
+            undo = changes.advance(group.sensors, group.supports, late)
+            yield Hypothesis("node_delay", wired.name(group), late, one.left(one.late(group, late)), undo, group)
+
+
+def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
+    for group in wired.groups():
+        if group.sensors and group.supports:
+            continue
+        if len(group.supports) == len(wired.signals.support_names) > 1:
+            continue  # the same as all sensors the other way
+        ratio = one.ratio(group)
+        if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
+            undo = changes.scale(group.sensors, group.supports, group.supports, ratio)
+            yield Hypothesis("wrong_scale", wired.name(group), ratio, one.left(one.scaled(group, ratio)), undo, group)
+
+
+def _positions(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
+    """Sensors on bodies that turn, elsewhere than the file says: along x or y."""
+    dofs = list(system.mechanics.dofs)
+    for i, name in enumerate(map(str, signals.sensor_names)):
+        sensor = system.file.sensors[name]
+        if not isinstance(sensor, MotionSensor) or sensor.kind not in _ORDERS:
+            continue
+        for axis, turn in ((0, "pitch"), (1, "roll")):
+            if f"{sensor.body}.{turn}" not in dofs:
+                continue
+            offset, change = sensor_offset(one, system, i, name, axis)
+            if abs(offset) >= rules.offset:
+                shown = one.shown
+                shown[:, i] += offset * change
+                moved = moves_sensor(name, axis, offset)
+                yield Hypothesis("wrong_position", name, offset, one.left(shown), moved, Group((i,)), axis)
+
+
+def moves_sensor(name: str, axis: int, offset: float) -> changes.Undo:
+    """A sensor where it is."""
+    return changes.in_system(lambda system: changes.moved_sensor(system, name, axis, offset))
+
+
+def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: int) -> tuple[float, ComplexArray]:
+    """By how much a sensor sits elsewhere along an axis, m, and what one metre would change, (F,)."""
+    sensor = system.file.sensors[name]
+    assert isinstance(sensor, MotionSensor)
+    dof = system.mechanics.dofs.index(f"{sensor.body}.{('pitch', 'roll')[axis]}")
+    change = (1j * one.omega) ** _ORDERS[sensor.kind] * one.motion[:, dof]
+    error = one.measured[:, i] - one.shown[:, i]
+    size = max(float(np.sum(np.abs(change) ** 2)), 1e-300)
+    return float(np.sum(np.real(change.conj() * error)) / size), change
+
+
+def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
+    """Gain and lag of single sensors: no faults of a set-up, but what a position may be mistaken for."""
+    for i, name in enumerate(map(str, signals.sensor_names)):
+        group = Group((i,))
+        ratio, late = one.ratio(group), one.delay(group, rules.latest)
+        if ratio > 0:
+            undo = changes.scale([i], (), (), ratio)
+            yield Hypothesis("sensor_gain", name, ratio, one.left(one.scaled(group, ratio)), undo, group)
+        undo = changes.advance([i], (), late)
+        yield Hypothesis("sensor_lag", name, late, one.left(one.late(group, late)), undo, group)
