@@ -38,7 +38,7 @@ from sprung.model.system import MANCHESTER, System, load_system, parse_system
 LAST = ("verdict", "report")  # stages that read finished investigations
 LATE = ("evidence", "selection", "plausible", "acceptance", "noise")  # stages that go on from begun ones
 FIRST = ("input_faults", "input_rounds", "input_rival", "input_rivals", "input_done")  # of acceptance, but decide early
-SETUPS = ("node_delay", "wrong_scale", "sign_reversed")
+SETUPS = ("late sensors", "scale of a node", "sign of a sensor")
 RATE = 100.0  # Hz
 RIG = """
 name: damper on a test bench
@@ -245,7 +245,7 @@ def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Syst
         record, what = Falsified("", frozenset(), values), made.case.kind
         if what == "clean" and number < len(strong):  # the others stay healthy
             record = falsified(system, values, SETUPS[number % len(SETUPS)], random)
-            what = record.effect
+            what = record.kind
         yield what, system, record
 
 

@@ -48,9 +48,9 @@ class Falsified:
     kind: str
     channels: frozenset[str]  # or the element
     values: Array
-    system: System
     sample_rate: float = RATE
     lost: int = 0
+    file: System | None = None  # the wrong one
 
 
 def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 0) -> Iterator[dict[str, Any]]:
@@ -66,7 +66,7 @@ def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 
                 continue
             wrong = falsified(system, values, kind, np.random.default_rng([seed, which]))
             began = time.process_time()
-            report = diagnose(wrong.system, wrong, Options(file=f"{kind}-{which}"))
+            report = diagnose(wrong.file or system, wrong, Options(file=f"{kind}-{which}"))
             top = report.findings[0] if report.findings else None
             place = frozenset(top.location.split("|")) if top else frozenset()
             hit = place == wrong.channels
@@ -94,7 +94,7 @@ def in_order(system: System, values: Array) -> Array:
 
 def falsified(system: System, clean: Array, kind: str, random: np.random.Generator) -> Falsified:
     """One wrong set-up of a kind."""
-    values, wrong = clean.copy(), system
+    values = clean.copy()
     names = [channel.name for channel in system.channels]
     sensors, body = list(system.sensors), str(random.choice(list(system.bodies)))
     node = [n for n, s in system.file.sensors.items() if isinstance(s, MotionSensor) and s.body == body]
@@ -102,7 +102,7 @@ def falsified(system: System, clean: Array, kind: str, random: np.random.Generat
     wheels = [e.lower for e in system.file.elements.values() if e.upper == bogie]
     if kind in ("element at another body", "position of an element"):
         wrong, name = _wrong_file(system, kind, random)
-        return Falsified(kind, frozenset([name]), values, wrong)
+        return Falsified(kind, frozenset([name]), values, file=wrong)
     if kind == "sign of a motion":
         chosen = [str(random.choice(list(system.file.inputs)))]
         values[:, [i for i, n in enumerate(names) if n.split(".")[0] == chosen[0]]] *= -1
@@ -126,7 +126,7 @@ def falsified(system: System, clean: Array, kind: str, random: np.random.Generat
         chosen = [str(random.choice(sensors))]
         offset = float(random.choice((-1, 1)) * random.uniform(0.5, 2.0))
         values[:, names.index(chosen[0])] = elsewhere(system, clean, names, chosen[0], offset)
-    return Falsified(kind, frozenset(chosen), values, wrong)
+    return Falsified(kind, frozenset(chosen), values)
 
 
 def _wrong_file(system: System, kind: str, random: np.random.Generator) -> tuple[System, str]:

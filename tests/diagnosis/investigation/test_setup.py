@@ -39,7 +39,7 @@ def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> Non
 def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[System, np.ndarray]) -> None:
     system, values = vehicle
     wrong = falsified(system, values, kind, np.random.default_rng(8))
-    fault = found(wrong.system, wrong.values)[0]
+    fault = found(wrong.file or system, wrong.values)[0]
     assert fault.effect == KINDS[kind]
     assert frozenset(fault.location.split("|")) == wrong.channels
 
