@@ -96,7 +96,7 @@ def _one(
     return figure, inside
 
 
-def _inside(estimate: Estimate, truth: FloatArray) -> FloatArray:
+def _inside(estimate: Estimate, truth: FloatArray) -> np.ndarray:
     """Which identifiable values lie within their 95 % interval."""
     std = np.sqrt(np.diag(estimate.covariance))
     told = estimate.identifiable

@@ -85,7 +85,7 @@ def _timed(optimiser: torch.optim.Optimizer, loss: Update, device: str) -> tuple
     """One update end to end; seconds on the clock and of the processor (the latter hardly see other load)."""
     begin, busy = time.perf_counter(), time.process_time()
     optimiser.zero_grad()
-    loss().backward()  # type: ignore[no-untyped-call]
+    loss().backward()
     optimiser.step()
     if device != "cpu":
         torch.cuda.synchronize()
@@ -141,13 +141,6 @@ def _held_rate(stiffness: Tensor, inputs: Tensor, times: Tensor) -> Callable[[Te
         return (a @ x[..., None])[..., 0] + drive[:, min(max(at, 0), len(times) - 1)]
 
     return rate
-
-
-def _model(task: Task, method: str, device: str) -> tuple[VisualModel, torch.optim.Optimizer]:
-    torch.manual_seed(0)
-    sizes = NetworkConfig()
-    model = VisualModel(FrameAutoencoder(sizes), Network(task, method, sizes)).to(device)
-    return model, torch.optim.Adam(model.parameters(), 1e-4)
 
 
 def _visual_loss(model: VisualModel, pictures: Tensor, inputs: Tensor, batch: int) -> Update:

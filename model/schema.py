@@ -315,9 +315,9 @@ class Parts:
                 yield f"bodies.{name}.load.pressure", "pressure", body.load.pressure
         if self.speed is not None:
             yield "speed", "speed", self.speed
-        for key, address in self.running.items():
-            if address is not None:
-                yield key, key, address
+        for key, condition in self.running.items():
+            if condition is not None:
+                yield key, key, condition
 
     def _units(self) -> Iterator[str]:
         for key, quantity, address in self.addresses():
