@@ -65,6 +65,13 @@ class Refined:
         """The windows `at` of the batch."""
         return Refined(**{name: getattr(self, name)[at] for name in Refined.__slots__})
 
+    def replaced(self, at: IntArray, others: Refined) -> Refined:
+        """With the windows `at` as in another batch."""
+        changed = {name: getattr(self, name).copy() for name in Refined.__slots__}
+        for name, values in changed.items():
+            values[at] = getattr(others, name)
+        return Refined(**changed)
+
 
 class Refiner:
     """Gauss-Newton for one system and one window length.
