@@ -96,6 +96,7 @@ bandit: install-dev
 	$(BIN)/bandit --quiet --recursive model replay service --severity-level medium --skip B104,B608
 
 docs: install-dev
+	$(BIN)/python docs/reference.py
 	$(BIN)/mkdocs build --quiet --site-dir site
 
 bench: install
