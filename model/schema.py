@@ -131,6 +131,7 @@ class Element(Strict):
     stiffness: Quantity = Value(value=0.0, fixed=True)  # N/m
     damping: Quantity = Value(value=0.0, fixed=True)  # N s/m
     laws: Laws = ()
+    depends_on: tuple[str, ...] = ()  # measured `signals` that its stiffness, damping and laws may follow
 
 
 class MotionSensor(Address):
@@ -162,6 +163,10 @@ def _as_speed(raw: Any) -> Any:
     return {"value": raw} if isinstance(raw, (int, float)) and not isinstance(raw, bool) else raw
 
 
+class Signal(Address):
+    """A measured signal that moves and weighs nothing: a valve's voltage, a temperature.  `unit` is only its name."""
+
+
 class SystemFile(Strict):
     """Everything a system file says, with references between its parts checked."""
 
@@ -178,11 +183,12 @@ class SystemFile(Strict):
     inputs: dict[Name, Input] = Field(default_factory=dict)
     elements: dict[Name, Element] = Field(default_factory=dict)
     sensors: dict[Name, Sensor] = Field(min_length=1)
+    signals: dict[Name, Signal] = Field(default_factory=dict)
     estimate: tuple[EstimatedQuantity, ...] = ("stiffness", "damping")
 
     @model_validator(mode="after")
     def _references_exist(self) -> SystemFile:
-        problems = list(Parts.of(self).problems())
+        problems = [*Parts.of(self).problems(), *self._unknown_signals()]
         if len(set(self.estimate)) != len(self.estimate):
             problems.append("estimate: a quantity is listed twice")
         if self.hop is not None and self.hop > self.window:
@@ -190,6 +196,14 @@ class SystemFile(Strict):
         if problems:
             raise ValueError("\n".join(problems))
         return self
+
+    def _unknown_signals(self) -> Iterator[str]:
+        for name, element in self.elements.items():
+            for signal in element.depends_on:
+                yield from _missing(signal, self.signals, f"elements.{name}.depends_on", "a signal")
+        for name in self.signals:
+            if name in {**self.bodies, **self.inputs, **self.elements, **self.sensors}:
+                yield f"signals.{name}: another part of the file has this name already"
 
 
 SI = {

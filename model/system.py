@@ -19,6 +19,8 @@ from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
 from sprung.model.schema import RUNNING, SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
 from sprung.model.signals import Channel, Conditions, FloatArray, TimeColumn
+from sprung.model.schema import SI, ForceInput, Signal, SupportInput, SystemFile, SystemFileError, TrackInput
+from sprung.model.signals import Channel, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 
 BUNDLED = Path(__file__).parent / "systems"
@@ -42,6 +44,12 @@ SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measure
 def _channel(name: str, quantity: str, at: Address) -> Channel:
     gain, offset = at.conversion(SI[quantity])
     return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset, at.range)
+
+
+def _signal_channel(name: str, at: Signal) -> Channel:
+    gain = at.sign * (1.0 if at.scale is None else at.scale)
+    unit = at.unit or "1"
+    return Channel(name, unit, at.noise, at.mcap, at.can, at.csv, at.column, gain, at.sign * at.offset, at.range)
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +192,11 @@ class System:
         pressure = tuple(values.get(f"{load.body}.pressure", math.nan) for load in self.loads)
         return Conditions(speed, values.get("temperature", math.nan), lateral, pressure)
 
+    @cached_property
+    def signals(self) -> tuple[Channel, ...]:
+        """Measured signals that parameters may follow; a diagnosis reads them after `channels`."""
+        return tuple(_signal_channel(name, at) for name, at in self.file.signals.items())
+
     @property
     def needed_inputs(self) -> int:
         """Leading channels without which a window is worthless; a speed that is missing is estimated."""
@@ -297,6 +310,9 @@ class System:
         for source in keep["inputs"].values():
             if source["kind"] == "support":
                 source["kind"] = "displacement"
+        keep.pop("signals")  # what no window sees
+        for element in keep["elements"].values():
+            element.pop("depends_on")
         added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
         for body in keep["bodies"].values():
             body.pop("load", None)  # what varies from ride to ride does not make another vehicle

@@ -19,9 +19,15 @@ def open_stream(path: Path, system: System, dbc: Path | None = None, start: int 
     return open_recording(path, system.channels, dbc=dbc, time=system.time, start=start, beside=system.auxiliary)
 
 
-def open_record(path: Path, system: System, dbc: Path | None = None, start: int | None = None) -> Record:
-    """A whole recording on one even grid.  Raises UnreadableRecording."""
-    return load_record(path, system.channels, system.sample_rate, dbc=dbc, time=system.time, start=start)
+def open_record(
+    path: Path, system: System, dbc: Path | None = None, start: int | None = None, *, signals: bool = False
+) -> Record:
+    """A whole recording on one even grid; with `signals` also what parameters may follow, after the channels.
+
+    Raises UnreadableRecording.
+    """
+    channels = (*system.channels, *system.signals) if signals else system.channels
+    return load_record(path, channels, system.sample_rate, dbc=dbc, time=system.time, start=start)
 
 
 def bundled_dbc(system: System) -> Path | None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sprung.model.diagnosis.ambient.decay import decay_begin
 from sprung.model.diagnosis.ambient.diagnose import diagnose_unforced
 from sprung.model.diagnosis.component.diagnose import diagnose_components
-from sprung.model.diagnosis.component.measured import is_component_test
+from sprung.model.diagnosis.component.measured import covariates, is_component_test
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.narrate import narrate
 from sprung.model.diagnosis.report.report import Finding, Report
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.following import Covariate, following_law
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -20,30 +22,49 @@ __all__ = ["DiagnosisError", "Finding", "Options", "Recorded", "Report", "TooLit
 
 
 @dataclass(frozen=True)
-class Trimmed:
-    """A recording from some sample on."""
+class RecordedPart:
+    """A part of a recording: some of its channels, from some sample on."""
 
-    sample_rate: float
-    values: FloatArray
+    sample_rate: float  # Hz
+    values: FloatArray  # (T, C)
     lost: int
+
+
+def following_laws(system: System, record: Recorded) -> list[ElementLaw]:
+    """What elements may do that follow a measured signal of the recording."""
+    signals: dict[str, Covariate] = {}
+    places: dict[str, tuple[str, ...]] = {}
+    for name in system.elements:
+        for signal in covariates(system, record.values, record.sample_rate, name, []):
+            signals[signal.name] = signal
+            places[signal.name] = (*places.get(signal.name, ()), name)
+    return [
+        following_law(quantity, signal, places[name])
+        for name, signal in signals.items()
+        for quantity in ("stiffness", "damping")
+    ]
 
 
 def diagnose(
     system: System, record: Recorded, options: Options | None = None, progress: Progress | None = None
 ) -> Report:
-    """Diagnose a recording whose columns are in the order of `system.channels`.
+    """Diagnose a recording whose columns are in the order of `system.channels`, then of `system.signals`.
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell, options = progress or (lambda share, text: None), options or Options()
-    if is_component_test(system, record.values):
+    channels = record.values[:, : len(system.channels)]
+    if is_component_test(system, channels):
         return diagnose_components(system, record, options, tell)
+    if system.signals:
+        options = replace(options, catalogue=(*options.catalogue, *following_laws(system, record)))
+        record = RecordedPart(record.sample_rate, channels, record.lost)
     if system.on_track or not system.file.inputs:
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate)
         begin = None if system.on_track else decay_begin(prepared.signals, system.sensor_noise)
         if begin is None:
             return diagnose_unforced(system, prepared, record, options, tell)
-        record = Trimmed(record.sample_rate, record.values[begin:], record.lost)
+        record = RecordedPart(record.sample_rate, record.values[begin:], record.lost)
     outcome = investigate(system, record, options, tell)
     tell(0.95, "report")
     report = narrate(outcome, record)

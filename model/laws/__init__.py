@@ -26,7 +26,10 @@ from sprung.model.laws.damping import (
     QUADRATIC_DAMPING,
 )
 from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
+from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
+from sprung.model.laws.gas import GAS_SPRING, PRELOAD
 from sprung.model.laws.hysteresis import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
+from sprung.model.laws.lost_motion import FRICTION_BACKLASH, PINCHED_HYSTERESIS
 from sprung.model.laws.own import LawFileError, load_laws
 from sprung.model.laws.running_gear import ANTI_ROLL_BAR, RAIL_JOINTS, WHEEL_FLAT
 from sprung.model.laws.sensor_faults import (
@@ -51,6 +54,13 @@ CATALOGUE: tuple[Law, ...] = (
     BOUC_WEN,
     TIME_VARYING_STIFFNESS,
     TIME_VARYING_DAMPING,
+    STRIBECK,
+    DAHL,
+    LUGRE,
+    PINCHED_HYSTERESIS,
+    FRICTION_BACKLASH,
+    GAS_SPRING,
+    PRELOAD,
     AIR_SPRING,
     ANTI_ROLL_BAR,
     WHEEL_FLAT,

@@ -21,6 +21,6 @@ def force_along(
     if law.memory == 0:
         return np.asarray(law.force(Motion(deflection, rate, time + CLOCK_LEAD), parameters, element))
     if law.path is not None:
-        return law.path(deflection, parameters)
+        return law.path(Motion(deflection, rate, time + CLOCK_LEAD), parameters)
     step = time[1] - time[0]
     return along(law, parameters, deflection, rate, sample_rate=1 / step, element=element, start=time[0] + CLOCK_LEAD)

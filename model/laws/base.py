@@ -192,11 +192,13 @@ class ElementLaw(Parametrised):
     odd: bool = True  # force(-d, -v) = -force(d, v)
     # A law that is a linear element with memory: parameters and the element's damping -> its branch
     branch: Callable[[Values, float], Maxwell] | None = None
-    # Force along a whole deflection (T,), quicker than step by step; None: as the memory's rate says
-    path: Callable[[FloatArray, Values], FloatArray] | None = None
+    # Force along a whole motion (T,), evenly sampled, quicker than step by step; None: as the memory's rate says
+    path: Callable[[Motion, Values], FloatArray] | None = None
     restarts: Callable[[FittedElement], tuple[Restart, ...]] | None = None  # besides the start that screening finds
     prior_cost: float = 0.0
     named: bool = True
+    screened: bool = True  # sought in systems of bodies; else only where the force of its element is measured
+    at: tuple[str, ...] = ()  # elements that it may act at; empty: all
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     knees: tuple[int, ...] = ()  # parameters that are rates at which the slope changes, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from sprung.model.signals import FloatArray
 
 
@@ -53,7 +55,18 @@ def _blowoff(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return (ratio - 1) * element.damping * (v - np.minimum(np.maximum(v, -knee), knee))
 
 
-DAMPER_BLOWOFF = ElementLaw(
+def _two_knees(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    knee, ratio, knee_compression, ratio_compression = p
+    v = motion.rate
+    extension, compression = np.maximum(v - knee, 0.0), np.minimum(v + knee_compression, 0.0)
+    return element.damping * ((ratio - 1) * extension + (ratio_compression - 1) * compression)
+
+
+def _knees(seen: Observed) -> FloatArray:
+    return seen.rate_quantile([0.35, 0.65, 0.9])
+
+
+_BLOWOFF = ElementLaw(
     name="damper_blowoff",
     title="damper blow-off",
     parameters=(
@@ -78,6 +91,30 @@ DAMPER_BLOWOFF = ElementLaw(
     sentence="the damper blows off beyond {knee}; its slope falls to {ratio} of the nominal one",
     strength=1,
     knees=(0,),
+)
+DAMPER_BLOWOFF = replace(
+    _BLOWOFF,
+    wider=replace(
+        _BLOWOFF,
+        parameters=(
+            *_BLOWOFF.parameters,
+            replace(_BLOWOFF.parameters[0], name="knee_compression"),
+            replace(_BLOWOFF.parameters[1], name="ratio_compression"),
+        ),
+        force=_two_knees,
+        formula=("c * ((ratio - 1) * max(v - knee, 0) + (ratio_compression - 1) * min(v + knee_compression, 0))"),
+        shapes=lambda seen: grid(_knees(seen), [0.3], _knees(seen), [0.3]),
+        absent=(100.0, 1.0, 100.0, 1.0),
+        sentence=(
+            "the damper blows off beyond {knee} in extension and {knee_compression} in compression; its slope falls to "
+            "{ratio} and {ratio_compression} of the nominal one"
+        ),
+        strength=None,
+        knees=(0, 2),
+        odd=False,
+        prior_cost=RARE,
+        screened=False,
+    ),
 )
 
 

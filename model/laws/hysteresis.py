@@ -19,6 +19,7 @@ from sprung.model.laws.base import (
     Values,
     grid,
 )
+from sprung.model.laws.paths import maxwell_path
 from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray
 
@@ -107,6 +108,11 @@ def _air_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return (stiffness * motion.rate - branch / tau)[None]
 
 
+def _air_path(motion: Motion, p: Values) -> FloatArray:
+    stiffness, tau = p
+    return stiffness * maxwell_path(motion.deflection, tau, float(motion.time[1] - motion.time[0]))
+
+
 def _air_decay(p: Values, element: SpringDamper) -> FloatArray:
     _, tau = p
     return np.asarray(1 / tau)[None]
@@ -133,6 +139,7 @@ AIR_SPRING = ElementLaw(
     memory_rate=_air_rate,
     memory_decay=_air_decay,
     branch=lambda p, damping: Maxwell(p[0], p[1], 0.0),
+    path=_air_path,
     prior_cost=RARE,
 )
 
@@ -152,9 +159,9 @@ def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     return (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
 
 
-def _bouc_wen_path(deflection: FloatArray, p: Values) -> FloatArray:
+def _bouc_wen_path(motion: Motion, p: Values) -> FloatArray:
     alpha, beta, exponent, *gamma = p
-    return alpha * bouc_wen_memory(deflection, beta, exponent, *gamma)
+    return alpha * bouc_wen_memory(motion.deflection, beta, exponent, *gamma)
 
 
 def _bouc_wen_shapes(seen: Observed) -> FloatArray:

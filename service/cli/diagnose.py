@@ -71,7 +71,8 @@ def load(file: Path, system: System, dbc: Path | None, start: int | None = None)
     """A recording on one even grid; or an excerpt that the service saved."""
     if file.suffix == ".npz":
         return load_excerpt(file)
-    return apart.load(apart.RecordRequest(file, system.channels, system.sample_rate, dbc, system.time, start))
+    channels = (*system.channels, *system.signals)
+    return apart.load(apart.RecordRequest(file, channels, system.sample_rate, dbc, system.time, start))
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:

@@ -49,9 +49,18 @@ TRIALS = {  # strong effects at the strut of the toy
     "time_varying_stiffness": (-0.3, 4.0),
     "time_varying_damping": (0.8, 2.0),
     "air_spring": (1e4, 0.05),
+    "stribeck": (40.0, 60.0, 0.1, 0.02),
+    "dahl": (60.0, 6e4),
+    "lugre": (40.0, 60.0, 0.1, 6e4),
+    "pinched_hysteresis": (60.0, 1e-3, 0.6, 2e-3),
+    "friction_backlash": (60.0, 2e-3, 6e4),
+    "gas_spring": (200.0, 0.05, 1.3),
+    "preload": (50.0,),
 }
 
-KINKED = ("bump_stop", "clearance", "damper_blowoff", "damper_asymmetry", "bouc_wen")  # second order at the kinks
+MEMORIES = ("dahl", "lugre", "pinched_hysteresis", "friction_backlash")
+# second order at the kinks
+KINKED = ("bump_stop", "clearance", "damper_blowoff", "damper_asymmetry", "bouc_wen", *MEMORIES)
 
 
 def toy() -> Mechanics:

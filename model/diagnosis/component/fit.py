@@ -17,9 +17,10 @@ import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.pieces import Piece, Seen, Values
+from sprung.model.diagnosis.component.pieces import Part, Seen, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import SpringDamper
+from sprung.model.laws.following import Covariate
 from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
@@ -43,6 +44,7 @@ class ComponentTask:
     split: int
     nominal: NominalValues = NominalValues(None, None)
     rules: ComponentRules = RULES.component
+    signals: tuple[Covariate, ...] = ()  # that its parameters may follow
 
     @cached_property
     def seen(self) -> Seen:
@@ -67,10 +69,10 @@ class ComponentTask:
 class ComponentModel:
     """Pieces and their shapes."""
 
-    pieces: tuple[Piece, ...] = ()
+    pieces: tuple[Part, ...] = ()
     shapes: tuple[tuple[float, ...], ...] = ()
 
-    def plus(self, piece: Piece, shape: tuple[float, ...]) -> ComponentModel:
+    def plus(self, piece: Part, shape: tuple[float, ...]) -> ComponentModel:
         return ComponentModel((*self.pieces, piece), (*self.shapes, shape))
 
     def without(self, index: int) -> ComponentModel:

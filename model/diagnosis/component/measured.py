@@ -13,6 +13,7 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import ComponentTask, NominalValues
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES, DiagnosisError, TooLittleError
+from sprung.model.laws.following import Covariate
 from sprung.model.schema import ElementSensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -94,7 +95,7 @@ def component_records(system: System, values: FloatArray, sample_rate: float, sh
             "a system without bodies is a component test: it needs an element between a support and ground (or two "
             "supports) and a sensor {kind: force, element: ...} on it"
         )
-    names = [channel.name for channel in system.channels]
+    names = [channel.name for channel in (*system.channels, *system.signals)]
     return [_record(system, values, names, sample_rate, e, s, share) for e, s in elements.items()]
 
 
@@ -162,9 +163,29 @@ def _record(
     run = slice(start, stop)
     motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
     nominal = NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
-    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal)
-    declared = system.file.sensors[sensor].noise
-    return ComponentRecord(element, sensor, task, declared, rest, white_noise(f[run]), tuple(notes))
+    signals = covariates(system, values, sample_rate, element, notes)
+    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals)
+    return ComponentRecord(
+        element, sensor, task, system.file.sensors[sensor].noise, rest, white_noise(f[run]), tuple(notes)
+    )
+
+
+def covariates(
+    system: System, values: FloatArray, sample_rate: float, element: str, notes: list[str]
+) -> tuple[Covariate, ...]:
+    """The signals that an element may follow, as far as a recording (T, C) has them; `notes` tells which it lacks."""
+    found = []
+    first = len(system.channels)
+    for index, channel in enumerate(system.signals):
+        if channel.name not in system.file.elements[element].depends_on:
+            continue
+        series = values[:, first + index] if first + index < values.shape[1] else np.full(len(values), np.nan)
+        signal = Covariate.of(channel.name, channel.unit, series, sample_rate)
+        if signal is None:
+            notes.append(f"{channel.name} does not change in this recording: nothing can be told to follow it")
+        else:
+            found.append(signal)
+    return tuple(found)
 
 
 def _fixed(system: System, element: str, quantity: str) -> float | None:

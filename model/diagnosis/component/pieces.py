@@ -1,10 +1,10 @@
-"""What a component's force may be made of: pieces that are linear in their strengths once a few shapes are fixed.
+"""What a component's force may be made of: laws of the catalogue, linear in their strengths once few shapes are fixed.
 
     F(t) = preload + k d + c v + sum over pieces of  strengths @ columns(motion; shapes)
 
 The strengths and k, c, preload follow by linear least squares for any shapes (variable projection, Golub and Pereyra
-1973), so that only one to three shapes per law are searched, on a grid first: no start can be far away.  A piece also
-says which values of the catalogue's law its strengths and shapes are.
+1973), so that only one to three shapes per law are searched, on a grid first: no start can be far away.  What a law
+is stands in `model.laws`; a piece says which of its numbers are strengths and where its shapes are sought.
 """
 
 from __future__ import annotations
@@ -15,12 +15,19 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.paths import bouc_wen_path, maxwell_path, presliding_path, stop_path
-from sprung.model.laws import SpringDamper, grid, reversal_step
+from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, find_law, grid, reversal_step
+from sprung.model.laws.along import force_along
+from sprung.model.laws.following import Covariate, following_law
+from sprung.model.laws.paths import stop_path
+from sprung.model.laws.reversals import GAMMA
 from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
+Shape = Sequence[float]
 _LOWEST_KNEE = 0.3  # of the median rate: a valve that opens far below usual rates acts as friction, and is called so
+_UNIT = SpringDamper(1.0, 1.0)
+_SHARPEST = 1e-6  # an exponent this close to 1 is 1
+_POLYTROPIC = 1.3  # of a gas: no test of usual rates tells it from the column's length
 
 
 @dataclass(frozen=True)
@@ -47,21 +54,169 @@ class Seen:
         return reversal_step(motion.rate)
 
 
+Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
+Named = Callable[[FloatArray, Shape, SpringDamper], Values]
+
+
 @dataclass(frozen=True)
 class Piece:
     """One law as a part of a component's force."""
 
-    effect: str  # the catalogue's or contract's word
-    title: str  # for sentences
+    law: ElementLaw
     shapes: tuple[str, ...]  # names of what the columns depend on
     grid: Callable[[Seen], FloatArray]  # trial shapes, (trials, shapes)
     limits: Callable[[Seen], list[tuple[float, float]]]  # of every shape
-    columns: Callable[[ElementMotion, Sequence[float]], FloatArray]  # (T, m)
-    signs: tuple[int, ...]  # of the m strengths: 1, -1, 0 for either
-    values: Callable[[FloatArray, Sequence[float], SpringDamper], Values]  # the law's own parameters
-    quoted: Callable[[FloatArray, Sequence[float], SpringDamper], Values] = lambda a, s, e: {}
-    kind: str = "static"  # "static", "hysteresis" or "linear": look-alikes within a kind are told apart last
+    signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
+    parameters: Parameters  # the law's, of strengths, shapes and the element; its force is linear in the strengths
+    shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # shapes of the law's parameters
+    quoted: Named = lambda a, s, e: {}
+    kind: str = (
+        "static"  # "static", "friction", "hysteresis" or "linear": look-alikes within a kind are told apart last
+    )
     plain: int = 0  # prior cost: how many commoner laws it contains
+    acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
+    acting_parameters: Parameters | None = None
+
+    @property
+    def effect(self) -> str:
+        return self.law.name
+
+    @property
+    def title(self) -> str:
+        return self.law.title
+
+    @property
+    def key(self) -> str:
+        """Apart from other pieces of the same law."""
+        return f"{self.law.name} {len(self.law.parameters)}"
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        """Force per strength along a motion, (T, m); deflections count from the middle of the travel."""
+        d = motion.deflection - motion.middle
+        law, of = self.acting or self.law, self.acting_parameters or self.parameters
+        total, found = np.zeros(len(d)), []
+        for count in range(1, len(self.signs) + 1):
+            strengths = (np.arange(len(self.signs)) < count).astype(float)
+            force = force_along(law, of(strengths, shape, _UNIT), d, motion.rate, motion.time, _UNIT)
+            found.append(force - total)
+            total = force
+        return np.column_stack(found)
+
+    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        """The law's parameters."""
+        numbers = self.parameters(strengths, shape, element)
+        return {spec.name: (float(x), spec.unit) for spec, x in zip(self.law.parameters, numbers, strict=True)}
+
+
+@dataclass(frozen=True)
+class Following:
+    """A law whose strengths follow a measured signal linearly, about its mean."""
+
+    piece: Piece
+    signal: Covariate
+
+    @property
+    def law(self) -> ElementLaw:
+        return self.piece.law
+
+    @property
+    def effect(self) -> str:
+        return self.piece.effect
+
+    @property
+    def title(self) -> str:
+        return f"{self.piece.title} that follows {self.signal.name}"
+
+    @property
+    def key(self) -> str:
+        return f"{self.piece.key} {self.signal.name}"
+
+    @property
+    def kind(self) -> str:
+        return self.piece.kind
+
+    @property
+    def plain(self) -> int:
+        return self.piece.plain + 1
+
+    @property
+    def shapes(self) -> tuple[str, ...]:
+        return self.piece.shapes
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        return (*self.piece.signs, *(0 for _ in self.piece.signs))
+
+    def grid(self, seen: Seen) -> FloatArray:
+        return self.piece.grid(seen)
+
+    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+        return self.piece.limits(seen)
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        steady = self.piece.columns(motion, shape)
+        above = self.signal.above(motion.time + CLOCK_LEAD) / self.signal.size
+        return np.column_stack([steady, steady * above[:, None]])
+
+    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        """The law's parameters at the signal's mean, and the relative change of its first strength per unit."""
+        count = len(self.piece.signs)
+        first = strengths[0] if strengths[0] != 0 else 1e-300
+        slope = float(strengths[count] / (first * self.signal.size))
+        found = self.piece.values(strengths[:count], shape, element)
+        return found | {f"{self.signal.name}_slope": (slope, self.signal.per_unit)}
+
+    def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        """What is quoted of the law, at the signal's mean and per unit of it."""
+        count = len(self.piece.signs)
+        steady = self.piece.quoted(strengths[:count], shape, element)
+        moved = self.piece.quoted(strengths[:count] + strengths[count:] / self.signal.size, shape, element)
+        per = {
+            f"{name}_per_{self.signal.name}": (moved[name][0] - value, f"{unit}/{self.signal.unit}")
+            for name, (value, unit) in steady.items()
+            if moved[name][0] != value
+        }
+        return steady | per
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
+
+    effect: str = "unknown"
+    title: str = "a force that no law explains"
+    key: str = "unknown"
+    kind: str = "static"
+    plain: int = 0
+    shapes: tuple[str, ...] = ()
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        return (0,) * (len(_REACHES) + len(_RATES) + 6)
+
+    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+        return []
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        seen = Seen.of(motion)
+        x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
+        columns = [stop_path(motion.deflection, reach * seen.travel) / (reach * seen.travel) for reach in _REACHES]
+        columns += [np.clip(motion.rate, -knee, knee) / knee for knee in _rates(seen, _RATES.tolist())]
+        columns += [np.maximum(v, 0.0), x**2, x**3, x * v, x**2 * v, v * np.abs(v)]
+        return np.column_stack(columns)
+
+    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        return {}
+
+    def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        return {}
+
+
+_REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
+_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
+SURFACE = Surface()
+LawPiece = Piece | Following  # what is searched among
+Part = LawPiece | Surface
 
 
 def _rates(seen: Seen, shares: Sequence[float]) -> FloatArray:
@@ -76,412 +231,275 @@ def _yield_limits(seen: Seen) -> tuple[float, float]:
     return (2e-4 * seen.travel, 0.8 * seen.travel)  # beyond it nothing yields: a spring that softens
 
 
+def _none(seen: Seen) -> FloatArray:
+    return np.zeros((1, 0))
+
+
+def _damping(element: SpringDamper) -> float:
+    return max(float(element.damping), 1e-300)
+
+
+def _wider(name: str) -> ElementLaw:
+    law = _law(name).wider
+    assert law is not None
+    return law
+
+
+def _law(name: str) -> ElementLaw:
+    law = find_law(name)
+    assert isinstance(law, ElementLaw)
+    return law
+
+
+def _yield_words(a: FloatArray, s: Shape, e: SpringDamper) -> Values:
+    return {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")}
+
+
 # --- friction and hysteresis ------------------------------------------------------------------------------------
 
-
-def _tanh(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return np.tanh(motion.rate / shape[0])[:, None]
-
-
-COULOMB = Piece(
-    "coulomb_friction",
-    "dry friction",
+_COULOMB = Piece(
+    _law("coulomb_friction"),
     ("smoothing",),
     lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.5, 7)),
     lambda seen: [(1e-3 * seen.rate_rms, 0.8 * seen.rate_rms)],
-    _tanh,
     (1,),
-    lambda a, s, e: {"force": (a[0], "N"), "smoothing": (s[0], "m/s")},
+    lambda a, s, e: (a[0], s[0]),
+    lambda p: (p[1],),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind="friction",
 )
-
-
-def _stribeck(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    slide = np.tanh(motion.rate / shape[0])
-    return np.column_stack([slide, slide * np.exp(-((motion.rate / shape[1]) ** 2))])
-
-
-STRIBECK = Piece(
-    "stribeck",
-    "friction that falls with the rate (Stribeck)",
+_STRIBECK = Piece(
+    _law("stribeck"),
     ("smoothing", "stribeck_rate"),
     lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.2, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 4)),
     lambda seen: [(1e-3 * seen.rate_rms, 0.5 * seen.rate_rms), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms)],
-    _stribeck,
     (1, 1),
-    lambda a, s, e: {
-        "force": (a[0], "N"),
-        "static_force": (a[0] + a[1], "N"),
-        "stribeck_rate": (s[1], "m/s"),
-        "smoothing": (s[0], "m/s"),
-    },
+    lambda a, s, e: (a[0], a[0] + a[1], s[1], s[0]),
+    lambda p: (p[3], p[2]),
+    lambda a, s, e: {"breakaway_force": (a[0] + a[1], "N")},
     kind="friction",
     plain=1,
 )
-
-
-def _dahl(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return presliding_path(motion.deflection, shape[0])[:, None]
-
-
-DAHL = Piece(
-    "dahl",
-    "friction with presliding (Dahl)",
+_DAHL = Piece(
+    _law("dahl"),
     ("yield_displacement",),
     lambda seen: grid(_yields(seen)),
     lambda seen: [_yield_limits(seen)],
-    _dahl,
     (1,),
-    lambda a, s, e: {"force": (a[0], "N"), "stiffness": (a[0] / s[0], "N/m")},
-    lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
+    lambda a, s, e: (a[0], a[0] / s[0]),
+    lambda p: (p[0] / p[1],),
+    _yield_words,
+    kind="hysteresis",
+    plain=1,
+)
+_LUGRE = Piece(
+    _law("lugre"),
+    ("yield_displacement", "stribeck_rate", "excess"),
+    lambda seen: grid(
+        seen.travel * np.geomspace(0.004, 0.3, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 3), [0.3, 1.5]
+    ),
+    lambda seen: [_yield_limits(seen), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms), (1e-3, 3.0)],
+    (1,),
+    lambda a, s, e: (a[0], a[0] * (1 + s[2]), s[1], a[0] / s[0]),
+    lambda p: (p[0] / p[3], p[2], p[1] / p[0] - 1),
+    _yield_words,
     kind="hysteresis",
     plain=1,
 )
 
 
-def _lugre(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    falling = np.exp(-((motion.rate / shape[1]) ** 2))
-    paths = [presliding_path(motion.deflection, shape[0], level) for level in (np.ones_like(falling), falling)]
-    return np.column_stack(paths)
+def _loop(a: FloatArray, s: Shape, e: SpringDamper) -> tuple[float, ...]:
+    """Of the Bouc-Wen law: strength and shapes are yield force, yield displacement, exponent and gamma."""
+    n = 1.0 if s[1] < 1 + _SHARPEST else s[1]
+    gamma = s[2] if len(s) > 2 else GAMMA
+    return (a[0] / s[0], 1 / ((1 + gamma) * s[0] ** n), n, *s[2:])
 
 
-LUGRE = Piece(
-    "lugre",
-    "friction with presliding that falls with the rate (LuGre)",
-    ("yield_displacement", "stribeck_rate"),
-    lambda seen: grid(seen.travel * np.geomspace(0.004, 0.3, 5), seen.rate_rms * np.geomspace(0.05, 0.8, 4)),
-    lambda seen: [_yield_limits(seen), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms)],
-    _lugre,
-    (1, 1),
-    lambda a, s, e: {
-        "force": (a[0], "N"),
-        "static_force": (a[0] + a[1], "N"),
-        "stribeck_rate": (s[1], "m/s"),
-        "stiffness": (a[0] / s[0], "N/m"),
-    },
-    lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
-    kind="hysteresis",
-    plain=1,
-)
+def _loop_shape(p: Sequence[float]) -> tuple[float, ...]:
+    gamma = p[3] if len(p) > 3 else GAMMA
+    return (((1 + gamma) * p[1]) ** (-1 / p[2]), p[2], *p[3:])
 
 
-def _bouc_wen(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return bouc_wen_path(motion.deflection, shape[0], shape[1])[:, None]
-
-
-def _bouc_wen_values(a: FloatArray, s: Sequence[float], element: SpringDamper) -> Values:
-    yields, n = s[0], s[1]
-    return {"alpha": (a[0] / yields, "N/m"), "beta": (1 / (1.5 * yields**n), "m^-n"), "n": (n, "1")}
-
-
-BOUC_WEN = Piece(
-    "bouc_wen",
-    "hysteresis (Bouc-Wen)",
+_BOUC_WEN = Piece(
+    _law("bouc_wen"),
     ("yield_displacement", "n"),
     lambda seen: grid(_yields(seen), [1.0, 2.0]),
     lambda seen: [_yield_limits(seen), (1.0, 8.0)],
-    _bouc_wen,
     (1,),
-    _bouc_wen_values,
-    lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
+    _loop,
+    _loop_shape,
+    _yield_words,
     kind="hysteresis",
 )
-
-
-def _free_bouc_wen(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return bouc_wen_path(motion.deflection, shape[0], shape[1], shape[2])[:, None]
-
-
-FREE_BOUC_WEN = Piece(
-    "bouc_wen",
-    "hysteresis (Bouc-Wen, loop of free shape)",
+_FREE_BOUC_WEN = Piece(
+    _wider("bouc_wen"),
     ("yield_displacement", "n", "gamma"),
     lambda seen: grid(_yields(seen)[::2], [1.0], [-0.6, 0.0, 1.5]),
     lambda seen: [_yield_limits(seen), (1.0, 8.0), (-0.95, 4.0)],
-    _free_bouc_wen,
     (1,),
-    lambda a, s, e: {
-        "alpha": (a[0] / s[0], "N/m"),
-        "beta": (1 / ((1 + s[2]) * s[0] ** s[1]), "m^-n"),
-        "n": (s[1], "1"),
-        "gamma": (s[2], "1"),
-    },
-    lambda a, s, e: {"yield_force": (a[0], "N"), "yield_displacement": (s[0], "m")},
+    _loop,
+    _loop_shape,
+    _yield_words,
     kind="hysteresis",
 )
-
-
-def _pinched(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    z = bouc_wen_path(motion.deflection, shape[0], 1.0)
-    near = np.exp(-(((motion.deflection - motion.middle) / shape[1]) ** 2))
-    return np.column_stack([z, -z * near])
-
-
-PINCHED = Piece(
-    "pinched_hysteresis",
-    "hysteresis pinched in the middle of the travel",
+_PINCHED = Piece(
+    _law("pinched_hysteresis"),
     ("yield_displacement", "pinching_width"),
     lambda seen: grid(seen.travel * np.geomspace(0.01, 0.4, 5), seen.travel * np.array([0.1, 0.25, 0.5])),
     lambda seen: [_yield_limits(seen), (0.03 * seen.travel, 1.0 * seen.travel)],
-    _pinched,
-    (1, 1),
-    lambda a, s, e: {
-        "force": (a[0], "N"),
-        "yield_displacement": (s[0], "m"),
-        "pinching": (a[1] / max(a[0], 1e-300), "1"),
-        "pinching_width": (s[1], "m"),
-    },
+    (1, -1),
+    lambda a, s, e: (a[0], s[0], -a[1] / max(a[0], 1e-300), s[1]),
+    lambda p: (p[1], p[3]),
     lambda a, s, e: {"yield_force": (a[0], "N")},
     kind="hysteresis",
     plain=2,
 )
 
 
-def _backlash(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    gap, reach = shape
-    u = stop_path(motion.deflection, 0.5 * gap + reach)
-    beyond = np.sign(u) * np.maximum(np.abs(u) - 0.5 * gap, 0.0) / reach
-    return np.column_stack([beyond, u / (0.5 * gap + reach)])
+def _inner(a: FloatArray, s: Shape) -> float:
+    """What still holds within the gap, N/m."""
+    return float(a[1] / (0.5 * s[0] + s[1]))
 
 
-def _backlash_values(a: FloatArray, s: Sequence[float], element: SpringDamper) -> Values:
-    gap, reach = s
-    inside = a[1] / (0.5 * gap + reach)  # N/m, of what still holds within the gap
-    return {"force": (a[0] + a[1], "N"), "gap": (gap, "m"), "stiffness": (a[0] / reach + inside, "N/m")}
-
-
-FRICTION_BACKLASH = Piece(
-    "friction_backlash",
-    "friction with backlash (slip, gap and stick in series)",
+_BACKLASH = Piece(
+    _wider("friction_backlash"),
     ("gap", "reach"),
     lambda seen: grid(seen.travel * np.geomspace(0.02, 0.9, 7), seen.travel * np.geomspace(0.01, 0.5, 6)),
     lambda seen: [(2e-3 * seen.travel, 1.8 * seen.travel), (1e-3 * seen.travel, 1.5 * seen.travel)],
-    _backlash,
     (1, 1),
-    _backlash_values,
-    lambda a, s, e: {
-        "slip_force": (a[0] + a[1], "N"),
-        "lost_motion": (s[0], "m"),
-        "stiffness_within_gap": (a[1] / (0.5 * s[0] + s[1]), "N/m"),
-    },
+    lambda a, s, e: (a[0] + a[1], s[0], a[0] / s[1] + _inner(a, s), _inner(a, s)),
+    lambda p: (p[1], (p[0] - 0.5 * p[1] * (p[3] if len(p) > 3 else 0.0)) / p[2]),
+    lambda a, s, e: {"slip_force": (a[0] + a[1], "N"), "lost_motion": (s[0], "m")},
     kind="hysteresis",
 )
 
 # --- dampers ----------------------------------------------------------------------------------------------------
 
-
-def _quadratic(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return (motion.rate * np.abs(motion.rate))[:, None]
-
-
-QUADRATIC = Piece(
-    "quadratic_damping",
-    "quadratic damping",
-    (),
-    lambda seen: np.zeros((1, 0)),
-    lambda seen: [],
-    _quadratic,
-    (1,),
-    lambda a, s, e: {"c2": (a[0], "N s^2/m^2")},
-)
-
-
-def _beyond(x: FloatArray, knee: float) -> FloatArray:
-    return x - np.clip(x, -knee, knee)
-
-
-def _blowoff(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return _beyond(motion.rate, shape[0])[:, None]
-
-
-BLOWOFF = Piece(
-    "damper_blowoff",
-    "damper blow-off",
+_QUADRATIC = Piece(_law("quadratic_damping"), (), _none, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
+_BLOWOFF = Piece(
+    _law("damper_blowoff"),
     ("knee",),
     lambda seen: grid(_rates(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
     lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))],
-    _blowoff,
     (-1,),
-    lambda a, s, e: {"knee": (s[0], "m/s"), "ratio": (1 + a[0] / max(float(e.damping), 1e-300), "1")},
+    lambda a, s, e: (s[0], 1 + a[0] / _damping(e)),
+    lambda p: (p[0],),
     lambda a, s, e: {"force_at_knee": (float(e.damping) * s[0], "N")},
 )
-
-
-def _two_knees(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    v = motion.rate
-    return np.column_stack([np.maximum(v - shape[0], 0.0), np.minimum(v + shape[1], 0.0)])
-
-
-TWO_KNEES = Piece(
-    "damper_blowoff",
-    "damper blow-off, different in extension and compression",
+_TWO_KNEES = Piece(
+    _wider("damper_blowoff"),
     ("knee", "knee_compression"),
     lambda seen: grid(_rates(seen, [0.2, 0.4, 0.7]), _rates(seen, [0.2, 0.4, 0.7])),
     lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))] * 2,
-    _two_knees,
     (-1, -1),
-    lambda a, s, e: {
-        "knee": (s[0], "m/s"),
-        "ratio": (1 + a[0] / max(float(e.damping), 1e-300), "1"),
-        "knee_compression": (s[1], "m/s"),
-        "ratio_compression": (1 + a[1] / max(float(e.damping), 1e-300), "1"),
-    },
+    lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),
+    lambda p: (p[0], p[2]),
     plain=1,
 )
-
-
-def _asymmetry(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return np.abs(motion.rate)[:, None]
-
-
-ASYMMETRY = Piece(
-    "damper_asymmetry",
-    "damper asymmetry",
-    (),
-    lambda seen: np.zeros((1, 0)),
-    lambda seen: [],
-    _asymmetry,
-    (0,),
-    lambda a, s, e: {"a": (a[0] / max(float(e.damping), 1e-300), "1")},
+_ASYMMETRY = Piece(
+    _law("damper_asymmetry"), (), _none, lambda seen: [], (0,), lambda a, s, e: (a[0] / _damping(e),), lambda p: ()
 )
-
-
-def _maxwell(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return maxwell_path(motion.deflection, shape[0], motion.step)[:, None]
-
-
-SERIES = Piece(
-    "series_stiffness",
-    "series stiffness of the damper",
+_SERIES = Piece(
+    _law("series_stiffness"),
     ("tau",),
     lambda seen: grid(np.geomspace(2 * seen.step, 0.1 * seen.seconds, 9)),
     lambda seen: [(0.5 * seen.step, seen.seconds)],
-    _maxwell,
     (1,),
-    lambda a, s, e: {"ks": (a[0], "N/m")},
+    lambda a, s, e: (a[0],),
+    lambda p: (0.1,),
     lambda a, s, e: {"relaxation_time": (s[0], "s")},
     kind="linear",
+    acting=_law("air_spring"),  # the branch of spring and damper in series, with a damper beside it that is free
+    acting_parameters=lambda a, s, e: (a[0], s[0]),
 )
 
 # --- springs ----------------------------------------------------------------------------------------------------
 
-
-def _cubic(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return ((motion.deflection - motion.middle) ** 3)[:, None]
-
-
-CUBIC = Piece(
-    "cubic_stiffness",
-    "progressive (cubic) spring",
-    (),
-    lambda seen: np.zeros((1, 0)),
-    lambda seen: [],
-    _cubic,
-    (0,),
-    lambda a, s, e: {"k3": (a[0], "N/m^3")},
-)
-
-
-def _stop(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return _beyond(motion.deflection - motion.middle, shape[0])[:, None]
-
-
-BUMP_STOP = Piece(
-    "bump_stop",
-    "bump stop",
+_CUBIC = Piece(_law("cubic_stiffness"), (), _none, lambda seen: [], (0,), lambda a, s, e: (a[0],), lambda p: ())
+_BUMP_STOP = Piece(
+    _law("bump_stop"),
     ("gap",),
     lambda seen: grid(seen.travel * np.array([0.3, 0.5, 0.65, 0.8, 0.9])),
     lambda seen: [(0.1 * seen.travel, 0.97 * seen.travel)],
-    _stop,
     (1,),
-    lambda a, s, e: {"gap": (s[0], "m"), "stiffness": (a[0], "N/m")},
+    lambda a, s, e: (s[0], a[0]),
+    lambda p: (p[0],),
 )
-
-
-def _clearance(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    return -np.clip(motion.deflection - motion.middle, -shape[0], shape[0])[:, None]
-
-
-CLEARANCE = Piece(
-    "clearance",
-    "clearance of the spring",
+_CLEARANCE = Piece(
+    _law("clearance"),
     ("gap",),
     lambda seen: grid(seen.travel * np.array([0.05, 0.1, 0.2, 0.35, 0.55, 0.75])),
     lambda seen: [(0.01 * seen.travel, 0.9 * seen.travel)],
-    _clearance,
     (1,),
-    lambda a, s, e: {"gap": (s[0], "m")},
+    lambda a, s, e: (s[0],),
+    lambda p: (p[0],),
+)
+_GAS_SPRING = Piece(
+    _law("gas_spring"),
+    ("length",),
+    lambda seen: grid(seen.travel * np.array([1.3, 2.0, 4.0, 10.0])),
+    lambda seen: [(1.1 * seen.travel, 30.0 * seen.travel)],
+    (1,),
+    lambda a, s, e: (a[0], s[0], _POLYTROPIC),
+    lambda p: (p[1],),
+    plain=1,
 )
 
 # --- drift ------------------------------------------------------------------------------------------------------
 
 
-def _warming(of: str) -> Callable[[ElementMotion, Sequence[float]], FloatArray]:
-    def columns(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-        return (getattr(motion, of) * -np.expm1(-motion.time / shape[0]))[:, None]
-
-    return columns
-
-
-def _drift(effect: str, of: str, quantity: str) -> Piece:
+def _drift(effect: str, quantity: str) -> Piece:
     return Piece(
-        effect,
-        f"{quantity} that changes with time",
+        _law(effect),
         ("tau",),
         lambda seen: grid(seen.seconds * np.array([0.1, 0.3, 1.0])),
         lambda seen: [(0.03 * seen.seconds, 3.0 * seen.seconds)],
-        _warming(of),
         (0,),
-        lambda a, s, e: {"p": (a[0] / max(float(getattr(e, quantity)), 1e-300), "1"), "tau": (s[0], "s")},
+        lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300), s[0]),
+        lambda p: (p[1],),
         plain=1,
     )
 
 
-# --- no name ----------------------------------------------------------------------------------------------------
-
-_REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
-_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
-
-
-def _surface(motion: ElementMotion, shape: Sequence[float]) -> FloatArray:
-    """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
-    seen = Seen.of(motion)
-    x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
-    columns = [stop_path(motion.deflection, reach * seen.travel) / (reach * seen.travel) for reach in _REACHES]
-    columns += [np.clip(motion.rate, -knee, knee) / knee for knee in _rates(seen, _RATES.tolist())]
-    columns += [np.maximum(v, 0.0), x**2, x**3, x * v, x**2 * v, v * np.abs(v)]
-    return np.column_stack(columns)
-
-
-SURFACE = Piece(
-    "unknown",
-    "a force that no law explains",
-    (),
-    lambda seen: np.zeros((1, 0)),
-    lambda seen: [],
-    _surface,
-    (0,) * (len(_REACHES) + len(_RATES) + 6),
-    lambda a, s, e: {},
-)
-
 PIECES: tuple[Piece, ...] = (
-    COULOMB,
-    STRIBECK,
-    DAHL,
-    LUGRE,
-    BOUC_WEN,
-    FREE_BOUC_WEN,
-    PINCHED,
-    FRICTION_BACKLASH,
-    QUADRATIC,
-    BLOWOFF,
-    TWO_KNEES,
-    ASYMMETRY,
-    SERIES,
-    CUBIC,
-    BUMP_STOP,
-    CLEARANCE,
-    _drift("time_varying_stiffness", "deflection", "stiffness"),
-    _drift("time_varying_damping", "rate", "damping"),
+    _COULOMB,
+    _STRIBECK,
+    _DAHL,
+    _LUGRE,
+    _BOUC_WEN,
+    _FREE_BOUC_WEN,
+    _PINCHED,
+    _BACKLASH,
+    _QUADRATIC,
+    _BLOWOFF,
+    _TWO_KNEES,
+    _ASYMMETRY,
+    _SERIES,
+    _CUBIC,
+    _BUMP_STOP,
+    _CLEARANCE,
+    _GAS_SPRING,
+    _drift("time_varying_stiffness", "stiffness"),
+    _drift("time_varying_damping", "damping"),
 )
+
+# --- what follows a measured signal -----------------------------------------------------------------------------
+
+_STRONG = (_COULOMB, _BOUC_WEN, _BACKLASH, _QUADRATIC)  # laws that a valve or a temperature makes stronger
+
+
+def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
+    """Spring, damper and laws as they may follow a signal."""
+
+    def linear(quantity: str) -> Piece:
+        return Piece(
+            following_law(quantity, signal),
+            (),
+            _none,
+            lambda seen: [],
+            (0,),
+            lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),
+            lambda p: (),
+        )
+
+    return (linear("stiffness"), linear("damping"), *(Following(piece, signal) for piece in _STRONG))

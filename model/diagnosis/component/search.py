@@ -17,13 +17,15 @@ from sprung.model.diagnosis.component.fit import (
     ComponentModel,
     ComponentTask,
     bounded_solution,
+    covariance,
     fitted,
     refined,
+    spread,
 )
-from sprung.model.diagnosis.component.paths import stop_path
-from sprung.model.diagnosis.component.pieces import PIECES, Piece
+from sprung.model.diagnosis.component.pieces import PIECES, LawPiece, Part, pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
+from sprung.model.laws.paths import stop_path
 
 Progress = Callable[[str], None]
 
@@ -38,7 +40,7 @@ class Ranked:
     count: float  # effective numbers
 
     @property
-    def last(self) -> Piece:
+    def last(self) -> Part:
         return self.fit.model.pieces[-1]
 
 
@@ -68,11 +70,12 @@ class Search:
 
 def search(
     task: ComponentTask,
-    pieces: tuple[Piece, ...] = PIECES,
+    pieces: tuple[LawPiece, ...] = PIECES,
     tell: Progress = lambda text: None,
 ) -> Search:
     """Grow a model of the component until the rest is noise, or nothing explains enough of it."""
     rules = task.rules
+    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)))
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = fitted(quick, ComponentModel())
@@ -80,7 +83,7 @@ def search(
     current = Ranked(base, 0.0, 0.0, count)
     steps: list[Step] = []
     screened: dict[str, float] = {}
-    for number in range(rules.most):
+    for number in range(rules.most + rules.per_signal * len(task.signals)):
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
         ranked = _next_laws(current.fit, pieces, rules)
         if number == 0:
@@ -112,7 +115,7 @@ def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules)
     return sorted(ranked, key=lambda r: -r.evidence)
 
 
-def _next_laws(current: ComponentFit, pieces: tuple[Piece, ...], rules: ComponentRules) -> list[Ranked]:
+def _next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> list[Ranked]:
     """Models with one more law, refined, best first."""
     used = {piece.effect for piece in current.model.pieces}
     kinds = {piece.kind for piece in current.model.pieces} & {"hysteresis", "friction"}
@@ -122,7 +125,7 @@ def _next_laws(current: ComponentFit, pieces: tuple[Piece, ...], rules: Componen
     seen: dict[str, int] = {}
     chosen = []
     for _error, model in trials:
-        name = model.pieces[-1].title
+        name = model.pieces[-1].key
         if name not in seen and len(seen) >= rules.close + 4:
             continue
         seen[name] = seen.get(name, 0) + 1
@@ -131,13 +134,13 @@ def _next_laws(current: ComponentFit, pieces: tuple[Piece, ...], rules: Componen
     fits = [refined(current.task, model) for model in chosen]
     best: dict[str, ComponentFit] = {}
     for fit in fits:
-        name = fit.model.pieces[-1].title
+        name = fit.model.pieces[-1].key
         if plausible(fit) and (name not in best or fit.error < best[name].error):
             best[name] = fit
     return _rank(list(best.values()), current, rules)
 
 
-def _trials(current: ComponentFit, piece: Piece, rules: ComponentRules) -> list[tuple[float, ComponentModel]]:
+def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> list[tuple[float, ComponentModel]]:
     """The best trial shapes of a law beside the present ones: sum of squares left and model."""
     task = current.task
     base, free, force = task.linear
@@ -182,12 +185,26 @@ def plausible(fit: ComponentFit) -> bool:
     return True
 
 
+def _determined(fit: ComponentFit) -> bool:
+    """Whether the last law's first quoted value, or its first parameter, is larger than its deviation."""
+    index = len(fit.model.pieces) - 1
+    sigma = spread(fit, index, *covariance(fit))
+    values = [fit.values(index), fit.quoted(index)]
+    told = [
+        abs(next(iter(of.values()))[0]) > fit.task.rules.told * float(s[0])
+        for of, s in zip(values, sigma, strict=True)
+        if of
+    ]
+    return all(told)
+
+
 def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> Step | None:
     """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
     near = [r for r in ranked if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin)]
     if not near:
         return None
-    # what the fitted part does not tell apart, the held-out part may
+    # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
+    near = [r for r in near if _determined(r.fit)] or near
     chosen, before = min(near, key=lambda r: r.fit.held_out), current
     rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
@@ -200,7 +217,7 @@ def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> S
     return Step(chosen, before, rivals, p_value)
 
 
-def _swapped(chosen: Ranked, pieces: tuple[Piece, ...], rules: ComponentRules) -> Ranked:
+def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> Ranked:
     """The same with one earlier law exchanged for another, where that is worth the margin."""
     model = chosen.fit.model
     if len(model.pieces) < 2:

@@ -14,6 +14,8 @@ from sprung.model.diagnosis.selection.evidence import bic
 from sprung.model.signals import FloatArray
 
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
+_MIDDLE = 0.3  # of the travel: the rod is then in the middle of it
+_FEWEST = 5  # samples that tell a force
 _NEAR_RATE = 0.05  # of a rate: samples this close to it tell the force there
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
 
@@ -99,16 +101,23 @@ def _loop_area(fit: ComponentFit) -> LawParameter:
 
 
 def _forces_at_rates(fit: ComponentFit) -> tuple[LawParameter, ...]:
-    """Total force less preload at data-sheet rates that the test reached, extension then compression."""
+    """Modelled force less preload at data-sheet rates that the test reached, extension then compression.
+
+    Read as on a dynamometer, while the rod passes the middle of its travel, where it does at that rate.  Deviation:
+    by how much the model errs there on average, and what is left of chance over so many passes.
+    """
     motion, rows = fit.task.motion, []
-    error = np.sqrt(fit.error)
+    central = np.abs(motion.deflection - motion.middle) < _MIDDLE * fit.task.seen.travel
     for rate in _DATA_SHEET_RATES:
         for side, word in ((1.0, "extension"), (-1.0, "compression")):
             near = np.abs(motion.rate - side * rate) < _NEAR_RATE * rate
-            if near.sum() >= 5:
+            near = near & central if np.sum(near & central) >= _FEWEST else near
+            if near.sum() >= _FEWEST:
                 value = float(np.mean(fit.force[near]) - fit.preload)
-                scatter = float(np.hypot(np.std(fit.force[near]), error))
-                rows.append(LawParameter(f"force_{word}_{rate:g}", value, scatter, "N"))
+                passes = int(np.sum(np.diff(near.astype(int), prepend=0) > 0))
+                left = fit.residual[near]
+                deviation = float(np.hypot(np.mean(left), np.std(left) / np.sqrt(passes)))
+                rows.append(LawParameter(f"force_{word}_{rate:g}", value, deviation, "N"))
     return tuple(rows)
 
 

@@ -162,6 +162,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
             for h in hits
             if h.family is not INPUT
             and not _repeats(state, h)
+            and not _hopeless(state, h)
             and harmonic(state.problem.part, h.term, plausible) is None
         ]
 
@@ -238,6 +239,22 @@ def _repeats(state: Investigation, hit: Candidate) -> bool:
         if hit.location == term.location and not term.law.named:
             return True
     return False
+
+
+def _hopeless(state: Investigation, hit: Candidate) -> bool:
+    """Whether a candidate beside a finding, where laws follow the sensors' motion, would be minor however well it fits.
+
+    Its score is the fall of chi-square that its first step promises, and so the share of the unmeasured forces.
+    """
+    if not state.problem.process_noise:
+        return False
+    beside = [found.trial for found in state.found if found.trial.term.location == hit.location]
+    if beside and not hit.term.law.named:
+        return True
+    rules = state.options.rules.acceptance
+    left = float(np.sum(state.fit.noise.force**2))
+    promised = rules.better_than_promised * left * hit.score / state.fit.chi_square
+    return any(promised < min(rules.minor_beside * trial.worth, rules.most_left * left) for trial in beside)
 
 
 def _minor(state: Investigation, trial: Trial) -> bool:

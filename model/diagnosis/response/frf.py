@@ -177,15 +177,20 @@ class Plant:
 
         Coefficients over t / length: load (DEGREE + 1, n) -> q (DEGREE + 1, n), by matching powers of t.
         """
+        return (self._polynomial_answers @ load.reshape(-1)).reshape(load.shape)
+
+    @cached_property
+    def _polynomial_answers(self) -> FloatArray:
+        """Coefficients of motion per coefficient of load, both flattened, of least size where many would do."""
         s, T = self.structure, self.grid.length
-        n, p = len(s.mass), DEGREE + 1
+        p = DEGREE + 1
         first = np.diag(np.arange(1, p), 1) / T  # coefficients of the derivative
         system = np.kron(np.eye(p), s.K) + np.kron(first, s.C) + np.kron(first @ first, np.diag(s.mass))
         scale = np.abs(system).max(axis=1)
         scale[scale == 0] = 1.0
         columns = np.tile(1 / np.sqrt(np.maximum(np.abs(np.diag(s.K)), s.mass / T**2)), p)
-        solution = np.linalg.lstsq(system * columns / scale[:, None], load.reshape(-1) / scale, rcond=1e-13)[0]
-        return (solution * columns).reshape(p, n)
+        inverse = np.linalg.pinv(system * columns / scale[:, None], rcond=1e-13)
+        return np.asarray(columns[:, None] * inverse / scale)
 
     def polynomial_sensors(self, q: FloatArray, support: FloatArray) -> FloatArray:
         """Sensor polynomials from motion (DEGREE + 1, n) and supports (DEGREE + 1, supports): (DEGREE + 1, S)."""

@@ -24,8 +24,8 @@ def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[
     system = projector.problem.system
     d_all, v_all = projector.fit.element_motion
     channels: dict[str, ScalarResponse] = {}
-    asked = [(law, "") for law in laws if isinstance(law, ElementLaw)]
-    asked += [(law.wider, WIDER) for law, _ in asked if law.wider is not None]
+    asked = [(law, "") for law in laws if isinstance(law, ElementLaw) and law.screened]
+    asked += [(law.wider, WIDER) for law, _ in asked if law.wider is not None and law.wider.screened]
     candidates = [Term(law, at, law.absent, variant) for law, variant in asked for at in places(system, law)]
     for absent in candidates:
         location = absent.location

@@ -12,7 +12,7 @@ def places(system: System, law: ElementLaw) -> list[str]:
     """Locations of an element law: elements, or pairs of elements between the same bodies at the same x."""
     elements = system.file.elements
     if law.where == "element":
-        return list(elements)
+        return [name for name in elements if not law.at or name in law.at]
     pairs = level_pairs(system, list(elements))
     return [f"{a}|{b}" for a, b in pairs if elements[a].lower == elements[b].lower]
 

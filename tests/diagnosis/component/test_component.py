@@ -10,7 +10,8 @@ from scipy.integrate import solve_ivp
 
 from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
-from sprung.model.diagnosis.component.paths import bouc_wen_path, maxwell_path, presliding_path, stop_path
+from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
+from sprung.model.laws.reversals import bouc_wen_memory
 from sprung.model.system import System, parse_system
 
 RATE = 200.0
@@ -219,9 +220,9 @@ def test_paths_of_memories_follow_their_differential_equations() -> None:
     reach = 0.004
     np.testing.assert_allclose(presliding_path(d, reach), solved(lambda v, z: (v - abs(v) * z) / reach), atol=3e-3)
     np.testing.assert_allclose(maxwell_path(d, 0.2, t[1]), solved(lambda v, z: v - z / 0.2), atol=2e-5)
-    beta = 1 / (1.5 * reach**2)
+    beta = 1 / (1.5 * reach**2)  # saturates at `reach`
     memory = solved(lambda v, z: v - beta * (abs(v) * abs(z) * z + 0.5 * v * z**2))
-    np.testing.assert_allclose(bouc_wen_path(d, reach, 2.0), memory / reach, atol=3e-3)
+    np.testing.assert_allclose(bouc_wen_memory(d, beta, 2.0), memory, atol=3e-3 * reach)
     stop = stop_path(d, reach)
     assert np.max(np.abs(stop)) == reach
     inside = np.abs(stop[1:]) < reach

@@ -1,0 +1,118 @@
+"""What real rigs do beside springs and dampers, named and with its values; truth by code of the test's own."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from sprung.model.diagnosis.api import Report, diagnose
+from sprung.model.system import parse_system
+from tests.diagnosis.component.test_component import RATE, C, K, RigRecording, sweep
+
+T, D, V = sweep()
+
+
+def diagnosed(force: np.ndarray, noise: float = 1.0, signals: dict[str, np.ndarray] | None = None) -> Report:
+    random = np.random.default_rng(0)
+    named = signals or {}
+    columns = [
+        D + 1e-6 * random.standard_normal(len(D)),
+        force + noise * random.standard_normal(len(D)),
+        *named.values(),
+    ]
+    listed = "".join(f"  {name}: {{csv: {name}, unit: V}}\n" for name in named)
+    more = f"signals:\n{listed}" if named else ""
+    system = parse_system(f"""
+name: damper on a test bench
+sample_rate: {RATE}
+window: 64
+inputs: {{rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}}}
+elements:
+  damper: {{upper: rod, lower: ground, stiffness: 4e4, damping: 1.5e3, depends_on: [{", ".join(named)}]}}
+sensors: {{cell: {{kind: force, element: damper, csv: F, noise: {noise}}}}}
+{more}""")
+    return diagnose(system, RigRecording(np.column_stack(columns)))
+
+
+def presliding(force: float, stiffness: float, static: float, fall: float) -> np.ndarray:
+    """LuGre's friction along the sweep; Dahl's where static is force."""
+
+    def rate(at: float, z: np.ndarray) -> np.ndarray:
+        v = np.interp(at, T, V)
+        return v - stiffness * abs(v) * z / (force + (static - force) * np.exp(-((v / fall) ** 2)))
+
+    return stiffness * solve_ivp(rate, (0, T[-1]), [0.0], t_eval=T, max_step=1e-3, rtol=1e-6).y[0]
+
+
+def named(report: Report, effect: str) -> dict[str, float]:
+    """Values of the finding of that name, which must lead or be in the leading family."""
+    first = next(f for f in report.findings if f.effect != "preload")
+    assert effect in (first.family or first.effect), first
+    return {p.name: p.value for p in (*first.parameters, *first.quoted)}
+
+
+def test_friction_that_falls_with_the_rate_is_of_stribecks_kind() -> None:
+    values = named(diagnosed(K * D + C * V + np.tanh(V / 5e-4) * (60 + 90 * np.exp(-((V / 0.012) ** 2)))), "stribeck")
+    assert values["breakaway_force"] == pytest.approx(150, rel=0.1)
+
+
+def test_presliding_is_dahls_with_its_force_and_stiffness() -> None:
+    report = diagnosed(K * D + C * V + presliding(120.0, 2.4e5, 120.0, 1.0))
+    values = named(report, "dahl")
+    assert values["yield_force"] == pytest.approx(120, rel=0.05)
+    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
+
+
+def test_presliding_that_falls_with_the_rate_is_lugres() -> None:
+    report = diagnosed(K * D + C * V + presliding(80.0, 4e5, 200.0, 0.015))
+    named(report, "lugre")
+    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
+
+
+def test_a_gas_strut_is_a_gas_spring_with_its_preload() -> None:
+    force, length, exponent = 800.0, 0.03, 1.3
+    report = diagnosed(K * D + C * V - force * (1 + (D - 0.5 * (D.max() + D.min())) / length) ** -exponent)
+    values = named(report, "gas_spring")
+    assert values["force"] == pytest.approx(force, rel=0.1)
+    assert values["length"] == pytest.approx(length, rel=0.1)
+    (preload,) = [f for f in report.findings if f.effect == "preload"]
+    assert preload.parameters[0].value == pytest.approx(-force, rel=0.05)
+
+
+def voltage() -> np.ndarray:
+    """Steps between 0 and 3 V, every 1.3 s."""
+    levels = np.random.default_rng(3).uniform(0, 3, 40)
+    return levels[(T / 1.3).astype(int)]
+
+
+def test_a_damper_that_a_voltage_controls_is_followed() -> None:
+    u = voltage()
+    report = diagnosed(K * D + C * (1 + 0.4 * (u - u.mean())) * V, signals={"valve": u})
+    assert report.verdict == "missing_physics"
+    finding = next(f for f in report.findings if f.effect == "damping_by_valve")
+    (slope,) = finding.parameters
+    assert slope.unit == "1/V"
+    assert abs(slope.value - 0.4) < max(4 * slope.std, 0.02)
+    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
+
+
+def test_friction_that_a_voltage_makes_stronger_is_followed() -> None:
+    u = voltage()
+    report = diagnosed(K * D + C * V + (30 + 50 * u) * np.tanh(V / 1e-3), signals={"valve": u})
+    first = next(f for f in report.findings if f.effect != "preload")
+    values = {q.name: q for q in (*first.parameters, *first.quoted)}
+    per_volt = next(q for name, q in values.items() if name.endswith("_force_per_valve"))
+    assert per_volt.value == pytest.approx(50, rel=0.1)
+    assert per_volt.unit == "N/V"
+
+
+def test_what_does_not_follow_a_signal_is_not_said_to() -> None:
+    report = diagnosed(K * D + C * V, signals={"valve": voltage()})
+    assert report.verdict == "consistent"
+    assert report.findings == ()
+
+
+def test_a_signal_that_does_not_change_tells_nothing_and_is_said_so() -> None:
+    report = diagnosed(K * D + C * V + 200 * V * np.abs(V) / C, signals={"valve": np.full(len(T), 2.0)})
+    assert not any("by_valve" in f.effect for f in report.findings)
