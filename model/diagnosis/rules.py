@@ -65,6 +65,7 @@ class SelectionRules:
     close_elsewhere: float = rule(0.6, "the same at other places; chosen", 0.4, 0.8)
     near: float = rule(45.0, "score or evidence to the best one that is close in any case; chosen", 25.0, 90.0)
     near_share: float = rule(0.3, "of the best evidence, the same; chosen", 0.15, 0.5)
+    again: float = rule(0.8, "of the best score, from which a law that leaves much starts once more; chosen", 0.6, 1.0)
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)

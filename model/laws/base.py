@@ -188,6 +188,8 @@ class ElementLaw(Parametrised):
     memory_start: Callable[[Motion, Values, SpringDamper], Any] = empty_memory  # at the first sample
     # Fast linear decay of each state, 1/s, shape (memory, ...): integrated exactly by the simulation
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
+    # Deflection over which a memory turns, m: a simulation takes no longer steps; None: as the element's modes need
+    turns_over: Callable[[Values], Any] | None = None
     passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
     odd: bool = True  # force(-d, -v) = -force(d, v)
     # A law that is a linear element with memory: parameters and the element's damping -> its branch
@@ -195,6 +197,8 @@ class ElementLaw(Parametrised):
     # Force along a whole motion (T,), evenly sampled, quicker than step by step; None: as the memory's rate says
     path: Callable[[Motion, Values], FloatArray] | None = None
     restarts: Callable[[FittedElement], tuple[Restart, ...]] | None = None  # besides the start that screening finds
+    # Other parameters that look alike on the whole, and from which a fit that leaves much starts once more
+    alike: Callable[[Values], tuple[tuple[float, ...], ...]] | None = None
     prior_cost: float = 0.0
     named: bool = True
     screened: bool = True  # sought in systems of bodies; else only where the force of its element is measured

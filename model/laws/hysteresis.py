@@ -177,6 +177,12 @@ def _free_shapes(seen: Observed) -> FloatArray:
     return grid([0.2 * seen.stiffness], 1 / (1.5 * yields), [1.0], [-1.4, -0.7, 0.0, 1.5])
 
 
+def _other_yields(p: Values) -> tuple[tuple[float, ...], ...]:
+    """The same force at yield over a quarter and over four times of the deflection."""
+    alpha, beta, n, *further = p
+    return tuple((alpha / factor, beta / factor**n, n, *further) for factor in (0.25, 4.0))
+
+
 _BOUC_WEN = ElementLaw(
     name="bouc_wen",
     title="hysteresis (Bouc-Wen)",
@@ -198,6 +204,7 @@ _BOUC_WEN = ElementLaw(
     memory=1,
     memory_rate=_bouc_wen_rate,
     path=_bouc_wen_path,
+    alike=_other_yields,
 )
 # The loop's shape free: gamma below -1 stiffens while it is loaded, above 1 it hardly yields while it is unloaded
 _FREE = ParameterSpec("gamma", "1", -4.0, 4.0, "in z' = v - beta (abs(v) z + gamma v abs(z))", lambda seen: GAMMA)

@@ -75,6 +75,7 @@ _FRICTION_BACKLASH = ElementLaw(
     strength=None,
     memory=1,
     memory_rate=_backlash_rate,
+    turns_over=lambda p: _limits(p)[1],
     path=_backlash_path,
     prior_cost=RARE,
     screened=False,

@@ -236,6 +236,8 @@ def _parts_for_laws(model: DiscreteSystem, known: FloatArray, start: float) -> i
         )
         slope = np.abs(there - back).max(initial=0.0) / (2 * small)
         fastest = max(fastest, compliance[i] * slope)
+        if site.law.turns_over is not None:
+            fastest = max(fastest, float(np.abs(v).max(initial=0.0) / np.min(site.law.turns_over(site.p))))
     return _power_of_two(fastest * model.dt / _STIFF)
 
 

@@ -164,7 +164,7 @@ def _record(
     motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
     nominal = NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
     signals = covariates(system, values, sample_rate, element, notes)
-    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals)
+    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals=signals)
     return ComponentRecord(
         element, sensor, task, system.file.sensors[sensor].noise, rest, white_noise(f[run]), tuple(notes)
     )

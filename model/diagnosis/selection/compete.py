@@ -105,8 +105,10 @@ def compete(
     places = sorted({hit.location for hit in hits})
     progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
 
+    again = rules.again * max((hit.strength for hit in hits), default=0.0)
+
     def begun(chosen: list[Candidate]) -> list[Trial]:
-        tried = share(lambda hit: _begun(problem, base, hit), chosen, WORKERS)
+        tried = share(lambda hit: _begun(problem, base, hit, hit.strength > again), chosen, WORKERS)
         return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
@@ -161,11 +163,34 @@ def runner_up(problem: Problem, base: Fit, hits: list[Candidate], chosen: Trial,
     return None
 
 
-def _begun(problem: Problem, base: Fit, hit: Candidate) -> Trial | None:
-    """A hit fitted far enough to see what it is worth, from the best of several starts."""
+def _begun(problem: Problem, base: Fit, hit: Candidate, again: bool = False) -> Trial | None:
+    """A hit fitted far enough to see what it is worth, from the best of several starts.
+
+    again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
+    """
     starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
     tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
-    return max(tried, key=lambda t: t.evidence, default=None)
+    best = max(tried, key=lambda t: t.evidence, default=None)
+    if again and (best is None or _leaves_much(problem, best)):
+        others = (_try(problem, base, hit, start, 3) for start in _alike_starts(base, hit))
+        best = max((t for t in (best, *others) if t is not None), key=lambda t: t.evidence, default=None)
+    return best
+
+
+def _leaves_much(problem: Problem, trial: Trial) -> bool:
+    """Whether a fit is no end: more than noise is left, or, where noise is what is fitted, it still falls."""
+    if problem.process_noise:
+        return not trial.fit.converged
+    return trial.fit.reduced > 1 + problem.rules.selection.chance * float(np.sqrt(2 / trial.fit.count))
+
+
+def _alike_starts(base: Fit, hit: Candidate) -> list[Point]:
+    """Starts at other parameters of the same law that look alike on the whole."""
+    law = hit.term.law
+    if not isinstance(law, ElementLaw) or law.alike is None:
+        return []
+    terms = [hit.term.at(law.clip(list(values))) for values in law.alike(hit.term.parameters)]
+    return [start_of(base, replace(hit, term=term)) for term in terms]
 
 
 def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
