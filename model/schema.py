@@ -163,7 +163,7 @@ def _as_speed(raw: Any) -> Any:
     return {"value": raw} if isinstance(raw, (int, float)) and not isinstance(raw, bool) else raw
 
 
-class Signal(Address):
+class FollowedSignal(Address):
     """A measured signal that moves and weighs nothing: a valve's voltage, a temperature.  `unit` is only its name."""
 
 
@@ -183,7 +183,7 @@ class SystemFile(Strict):
     inputs: dict[Name, Input] = Field(default_factory=dict)
     elements: dict[Name, Element] = Field(default_factory=dict)
     sensors: dict[Name, Sensor] = Field(min_length=1)
-    signals: dict[Name, Signal] = Field(default_factory=dict)
+    signals: dict[Name, FollowedSignal] = Field(default_factory=dict)
     estimate: tuple[EstimatedQuantity, ...] = ("stiffness", "damping")
 
     @model_validator(mode="after")

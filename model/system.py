@@ -17,10 +17,17 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
-from sprung.model.schema import RUNNING, SI, ForceInput, SupportInput, SystemFile, SystemFileError, TrackInput
+from sprung.model.schema import (
+    RUNNING,
+    SI,
+    FollowedSignal,
+    ForceInput,
+    SupportInput,
+    SystemFile,
+    SystemFileError,
+    TrackInput,
+)
 from sprung.model.signals import Channel, Conditions, FloatArray, TimeColumn
-from sprung.model.schema import SI, ForceInput, Signal, SupportInput, SystemFile, SystemFileError, TrackInput
-from sprung.model.signals import Channel, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 
 BUNDLED = Path(__file__).parent / "systems"
@@ -46,7 +53,7 @@ def _channel(name: str, quantity: str, at: Address) -> Channel:
     return Channel(name, SI[quantity], at.noise, at.mcap, at.can, at.csv, at.column, gain, offset, at.range)
 
 
-def _signal_channel(name: str, at: Signal) -> Channel:
+def _signal_channel(name: str, at: FollowedSignal) -> Channel:
     gain = at.sign * (1.0 if at.scale is None else at.scale)
     unit = at.unit or "1"
     return Channel(name, unit, at.noise, at.mcap, at.can, at.csv, at.column, gain, at.sign * at.offset, at.range)

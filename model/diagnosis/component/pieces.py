@@ -180,7 +180,7 @@ class Following:
 
 
 @dataclass(frozen=True)
-class Surface:
+class SliderSurface:
     """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
 
     effect: str = "unknown"
@@ -214,9 +214,9 @@ class Surface:
 
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
 _RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
-SURFACE = Surface()
+SURFACE = SliderSurface()
 LawPiece = Piece | Following  # what is searched among
-Part = LawPiece | Surface
+Part = LawPiece | SliderSurface
 
 
 def _rates(seen: Seen, shares: Sequence[float]) -> FloatArray:
