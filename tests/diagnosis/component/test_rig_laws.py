@@ -52,32 +52,11 @@ def named(report: Report, effect: str) -> dict[str, float]:
     return {p.name: p.value for p in (*first.parameters, *first.quoted)}
 
 
-def test_friction_that_falls_with_the_rate_is_of_stribecks_kind() -> None:
-    values = named(diagnosed(K * D + C * V + np.tanh(V / 5e-4) * (60 + 90 * np.exp(-((V / 0.012) ** 2)))), "stribeck")
-    assert values["breakaway_force"] == pytest.approx(150, rel=0.1)
-
-
 def test_presliding_is_dahls_with_its_force_and_stiffness() -> None:
     report = diagnosed(K * D + C * V + presliding(120.0, 2.4e5, 120.0, 1.0))
     values = named(report, "dahl")
     assert values["yield_force"] == pytest.approx(120, rel=0.05)
     assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
-
-
-def test_presliding_that_falls_with_the_rate_is_lugres() -> None:
-    report = diagnosed(K * D + C * V + presliding(80.0, 4e5, 200.0, 0.015))
-    named(report, "lugre")
-    assert report.augmented_validation.nrmse < 2 * report.noise_floor.nrmse
-
-
-def test_a_gas_strut_is_a_gas_spring_with_its_preload() -> None:
-    force, length, exponent = 800.0, 0.03, 1.3
-    report = diagnosed(K * D + C * V - force * (1 + (D - 0.5 * (D.max() + D.min())) / length) ** -exponent)
-    values = named(report, "gas_spring")
-    assert values["force"] == pytest.approx(force, rel=0.1)
-    assert values["length"] == pytest.approx(length, rel=0.1)
-    (preload,) = [f for f in report.findings if f.effect == "preload"]
-    assert preload.parameters[0].value == pytest.approx(-force, rel=0.05)
 
 
 def voltage() -> np.ndarray:
