@@ -35,6 +35,40 @@ class Mode:
     body: str  # the body that moves most (kinetic energy)
 
 
+def state_matrix(mass: FloatArray, stiffness: FloatArray, damping: FloatArray) -> FloatArray:
+    """A (2n, 2n) of x' = A x for a diagonal mass (n,), stiffness and damping matrices (n, n)."""
+    n = len(mass)
+    A = np.zeros((2 * n, 2 * n))
+    A[:n, n:] = np.eye(n)
+    A[n:, :n] = -stiffness / mass[:, None]
+    A[n:, n:] = -damping / mass[:, None]
+    return A
+
+
+def element_outputs(
+    kind: IntArray, L: FloatArray, stiffness: FloatArray, damping: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """What sensors of elements show per deflection and per rate of the elements, each (S, E)."""
+    of_deflection = np.where(kind[:, None] == FORCE, L * stiffness, np.where(kind[:, None] == DEFLECTION, L, 0.0))
+    return of_deflection, np.where(kind[:, None] == FORCE, L * damping, 0.0)
+
+
+def state_outputs(
+    kind: IntArray, S: FloatArray, H: FloatArray, A: FloatArray, of_elements: tuple[FloatArray, FloatArray]
+) -> FloatArray:
+    """Sensors over the state, (S, states): C of the state equations.
+
+    A (states, states): of [q, q', further states]; S (S, n): motion sensors over q; H (E, n): deflections over q.
+    """
+    n = S.shape[1]
+    rows = np.where(kind[:, None] == ACCELERATION, S @ A[n : 2 * n], 0.0)
+    rows[:, n : 2 * n] += np.where(kind[:, None] == VELOCITY, S, 0.0)
+    rows[:, :n] += np.where(kind[:, None] == DISPLACEMENT, S, 0.0)
+    rows[:, :n] += of_elements[0] @ H
+    rows[:, n : 2 * n] += of_elements[1] @ H
+    return rows
+
+
 @dataclass(frozen=True, slots=True)
 class Mechanics:
     """The constant matrices of a system; element values and masses multiply them."""
@@ -70,10 +104,7 @@ class Mechanics:
         c = self.damping if damping is None else damping
         m = self.mass if mass is None else mass
         n, H, G = self.n, self.H, self.G
-        A = np.zeros((2 * n, 2 * n))
-        A[:n, n:] = np.eye(n)
-        A[n:, :n] = -(H.T * k) @ H / m[:, None]
-        A[n:, n:] = -(H.T * c) @ H / m[:, None]
+        A = state_matrix(m, (H.T * k) @ H, (H.T * c) @ H)
         B = np.zeros((2 * n, self.drives))
         B[n:, self.support_drive] = -(H.T * k) @ G / m[:, None]
         B[n:, self.support_drive + 1] = -(H.T * c) @ G / m[:, None]
@@ -82,17 +113,9 @@ class Mechanics:
         return A, B, C, D
 
     def _outputs(self, A: FloatArray, B: FloatArray, k: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
-        n, kind = self.n, self.sensor_kind[:, None]
-        C = np.zeros((len(kind), 2 * n))
-        D = np.zeros((len(kind), self.drives))
-        C += np.where(kind == ACCELERATION, self.S @ A[n:], 0)
-        D += np.where(kind == ACCELERATION, self.S @ B[n:], 0)
-        C[:, n:] += np.where(kind == VELOCITY, self.S, 0)
-        C[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0)
-        of_deflection = np.where(kind == FORCE, self.L * k, np.where(kind == DEFLECTION, self.L, 0))
-        of_rate = np.where(kind == FORCE, self.L * c, 0)
-        C[:, :n] += of_deflection @ self.H
-        C[:, n:] += of_rate @ self.H
+        of_deflection, of_rate = element_outputs(self.sensor_kind, self.L, k, c)
+        C = state_outputs(self.sensor_kind, self.S, self.H, A, (of_deflection, of_rate))
+        D = np.where(self.sensor_kind[:, None] == ACCELERATION, self.S @ B[self.n :], 0)
         D[:, self.support_drive] += of_deflection @ self.G
         D[:, self.support_drive + 1] += of_rate @ self.G
         return C, D

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray
-from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, Mechanics
+from sprung.model.mechanics import FORCE, Mechanics, element_outputs, state_matrix, state_outputs
 from sprung.model.signals import FloatArray
 
 
@@ -82,9 +82,7 @@ class Structure:
         """A of the free motion, shape (2n + b, 2n + b)."""
         n = len(self.mass)
         A = np.zeros((self.states, self.states))
-        A[:n, n : 2 * n] = np.eye(n)
-        A[n : 2 * n, :n] = -self.K / self.mass[:, None]
-        A[n : 2 * n, n : 2 * n] = -self.C / self.mass[:, None]
+        A[: 2 * n, : 2 * n] = state_matrix(self.mass, self.K, self.C)
         for i, branch in enumerate(self.branches, 2 * n):
             h = self.H[branch.element]
             A[n : 2 * n, n : 2 * n] += branch.replaces * np.outer(h, h) / self.mass[:, None]
@@ -115,15 +113,8 @@ class Structure:
     def sensor_rows(self) -> FloatArray:
         """Sensors over the state of free motion, shape (S, 2n + b)."""
         n = len(self.mass)
-        kind = self.sensor_kind[:, None]
-        A = self.state_matrix()
-        rows = np.where(kind == ACCELERATION, self.S @ A[n : 2 * n], 0.0)
-        rows[:, n : 2 * n] += np.where(kind == VELOCITY, self.S, 0.0)
-        rows[:, :n] += np.where(kind == DISPLACEMENT, self.S, 0.0)
-        of_d = np.where(kind == FORCE, self.L * self.stiffness, np.where(kind == DEFLECTION, self.L, 0.0))
-        of_v = np.where(kind == FORCE, self.L * self.damping, 0.0)
-        rows[:, :n] += of_d @ self.H
-        rows[:, n : 2 * n] += of_v @ self.H
+        of_elements = element_outputs(self.sensor_kind, self.L, self.stiffness, self.damping)
+        rows = state_outputs(self.sensor_kind, self.S, self.H, self.state_matrix(), of_elements)
         for i, branch in enumerate(self.branches, 2 * n):
             at = np.where(self.sensor_kind == FORCE, self.L[:, branch.element], 0.0)
             rows[:, n : 2 * n] -= np.outer(at * branch.replaces, self.H[branch.element])
