@@ -275,7 +275,9 @@ class Attribution:
         if not members:
             return _closed(alarm, now)
         H = len(self.deviations)
-        off = float(np.mean((state.belief.mean[-H:] - state.calibration.reference)[members]))
+        apart = state.belief.mean[-H:] - state.calibration.reference
+        others = ~np.isin(np.arange(H), members)
+        off = float(np.mean((apart - self.model.common(apart, others))[members]))
         std = float(np.sqrt(np.diag(state.belief.covariance)[-H:][members].mean()))
         if abs(off) + 2 * std < dev.JUMPED[kind]:
             return _closed(replace(alarm, change=off, std=std), now)

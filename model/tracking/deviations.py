@@ -49,6 +49,18 @@ class DeviationModel:
     def size(self) -> int:
         return len(self.kinds)
 
+    def common(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
+        """The middle one of the gains, and of the delays, (H,): what all channels share cannot be known.
+
+        among: the deviations (H,) that tell it, all by default.
+        """
+        out = np.zeros(self.size)
+        for kind in ("gain", "delay"):
+            at = np.array([k == kind for k in self.kinds], dtype=bool)
+            telling = at if among is None or not (at & among).any() else at & among
+            out[at] = np.median(values[telling]) if at.any() else 0.0
+        return out
+
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     """Delays of one clock share most of their variance; everything else is independent."""

@@ -303,18 +303,9 @@ class Tracker:
             return tuple(stuck)
         value, std = state.belief.mean[-H:], np.sqrt(np.diag(state.belief.covariance)[-H:])
         least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
-        off = value - self._shared(state)
+        off = value - self.model.common(value)
         chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
-
-    def _shared(self, state: TrackerState) -> FloatArray:
-        """The middle gain, and the middle delay of the clocks: what all channels share cannot be known, (H,)."""
-        H = self.model.size
-        value, out = state.belief.mean[-H:], np.zeros(H)
-        for kind in ("gain", "delay"):
-            at = np.array([k == kind for k in self.model.kinds])
-            out[at] = np.median(value[at]) if at.any() else 0.0
-        return out
 
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
         """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
@@ -533,7 +524,9 @@ class Tracker:
         base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
         reference = calibration.reference
         if (state.used + 1) * self.settings.hop < dev.SETTLED:
-            reference = np.where(calibration.moved > 0, reference, belief.mean[-self.model.size :])
+            here, moved = belief.mean[-self.model.size :], calibration.moved > 0
+            # What all channels share cannot be known: where it wanders, the reference of one that jumped goes along.
+            reference = np.where(moved, reference + self.model.common(here - reference, ~moved), here)
         return replace(calibration, base_cross=base, reference=reference)
 
     def _baseline(self, state: TrackerState) -> FloatArray:
