@@ -119,8 +119,9 @@ class Jump:
 
 def weigh(
     calibration: DeviationRecord, model: DeviationModel, belief: Belief, found: Deviating, share: float, time: int
-) -> tuple[DeviationRecord, Belief, Jump | None]:
-    """After a window that says something about deviations: belief, evidence for jumps, and one that is certain.
+) -> tuple[DeviationRecord, Belief, Jump | None, bool]:
+    """After a window that says something about deviations: belief, evidence for jumps, one that is certain, and whether
+    the window and the belief agree now.
 
     share: of the window that no earlier weighed window saw.
     """
@@ -136,11 +137,12 @@ def weigh(
     largest = float(np.max(np.abs(along) / np.sqrt(information), initial=0.0))
     bounded = min(1.0, MOST / max(largest, 1e-12))
     calibration, jump = _judged(calibration, model, along, information, bounded, time)
+    agrees = bounded == 1.0 or jump is not None
     if jump is not None:
         belief = _loosened(belief, model, calibration.cross, jump)
         P = belief.covariance[-H:, -H:]
     elif bounded < 1.0:  # one window does not turn the belief over; several will, or a jump is found
-        M, u = M * bounded**2, u * bounded
+        M, u = M * bounded**2, u * bounded**2
     if jump is not None or bounded < 1.0:
         solved = np.linalg.solve(np.eye(H) + M @ P, np.column_stack([u, M]))
         slope, curvature = solved[:, 0], 0.5 * (solved[:, 1:] + solved[:, 1:].T)
@@ -158,6 +160,7 @@ def weigh(
         ),
         belief,
         jump,
+        agrees,
     )
 
 

@@ -341,9 +341,12 @@ class Tracker:
             found = replace(found, cross=gains, point=np.where(model.loads, found.point, 0.0))
         elif found is not None:
             apart = (time_ns - int(calibration.recent[-1])) * 1e-9
-            calibration, belief, jump = dev.weigh(
+            calibration, belief, jump, agrees = dev.weigh(
                 calibration, model, belief, found, min(1.0, apart / settings.window), time_ns
             )
+            if estimate.faults and not agrees:  # mended by what is not believed yet: its values are of neither
+                undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
+                return replace(undecided, belief=belief, calibration=calibration), None
             if jump is not None and self._armed(state):
                 calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
                 state = replace(state, changes=change_test.restarted(state.changes))
