@@ -165,8 +165,10 @@ class RideQuality:
 def foreseen(system: System, log_ratio: FloatArray, speed: float = 40.0) -> FloatArray:
     """W_b-weighted rms at the comfort sensors (S,), m/s^2, on an average track at `speed`, m/s, for given parameters.
 
-    All wheels of a side see one profile, after ERRI B176, and the sides are alike by half.
+    All wheels of a side see one profile, after ERRI B176, and the sides are alike by half.  Values of laws behind those
+    of the linear parameters are left out: what is foreseen is the linear vehicle.
     """
+    log_ratio = log_ratio[: len(system.parameters)]
     at = np.array(comfort_sensors(system))
     supports = [name for name, source in system.file.inputs.items() if source.kind != "force"]
     if len(at) == 0 or not supports:

@@ -218,7 +218,7 @@ def _letter(p: ParameterView) -> str:
 
 def physical(engine: Engine, log_ratio: FloatArray, std: FloatArray) -> list[tuple[float, float]]:
     """(value, standard deviation) of every parameter in its unit, from log-ratios."""
-    values = engine.system.nominal * np.exp(log_ratio)
+    values = np.array([p.nominal for p in engine.system.tracked]) * np.exp(log_ratio)
     return list(zip(values.tolist(), (values * std).tolist(), strict=True))
 
 

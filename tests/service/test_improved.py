@@ -45,6 +45,9 @@ sensors:
 """
 
 
+LAW = "{coulomb_friction: {force: 60, smoothing: {value: 0.01, fixed: true}}}"
+
+
 def report(laws: tuple[IdentifiedLaw, ...], findings: tuple[Finding, ...] = ()) -> Report:
     figures = FitFigures(0.1, {})
     values = (ReportedParameter("strut.stiffness", 20123.4567, 10.0, 18000.0, "N/m"),)
@@ -108,4 +111,20 @@ def test_the_loop_is_closed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert stiffness["value"] == pytest.approx(20000, abs=4 * stiffness["std"])
 
 
-LAW = "{coulomb_friction: {force: 60, smoothing: 0.01}}"
+def test_a_replay_with_a_law_in_the_file_tells_its_value(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = TEXT.replace("damping: 1800}", f"damping: 1800, laws: [{LAW}]}}")
+    system = parse_system(text)
+    rng, t = np.random.default_rng(6), np.arange(800) / 100.0
+    f, phase = rng.uniform(0.5, 12, 60), rng.uniform(0, 6.3, 60)
+    road = (2e-3 / f * np.sin(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
+    speed = (4e-3 * np.pi * np.cos(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
+    truth = np.stack([road, speed], axis=1)
+    ride = simulate_ride(system, truth, {"strut.stiffness": 20000.0, "strut.damping": 1500.0}, noise=rng)
+    measured = truth + rng.normal(0, [1e-5, 5e-4], truth.shape)
+    write_recording(tmp_path / "ride.csv", system.channels, np.hstack([measured, ride.sensors]), 100.0, 10**18)
+    (tmp_path / "car.yaml").write_text(text)
+    assert main(["replay", str(tmp_path / "ride.csv"), "--system", str(tmp_path / "car.yaml"), "--json"]) == 0
+    *windows, last = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert all("strut.coulomb_friction.force" in window["estimate"] for window in windows)
+    found = {p["name"]: p for p in last["summary"]["parameters"]}["strut.coulomb_friction.force"]
+    assert found["value"] == pytest.approx(60, abs=4 * found["std"]) and found["unit"] == "N"
