@@ -7,11 +7,15 @@ the complete model known: mass 95.11 kg, viscous 203.50 N s/m, Coulomb 20.39 N, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from sprung.benchmarks.inverse_dynamics import force_error
 from sprung.benchmarks.silverbox import data_file, diagnosis_of
+from sprung.model.signals import FloatArray
 from sprung.model.system import load_system
 from sprung.replay.record import load_record
 
@@ -24,9 +28,8 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
     """Yields the diagnosis and every published value beside the identified one."""
     system = load_system(SYSTEM)
     path = data_file(data, "closed_loop.csv")
-    said = diagnosis_of(
-        system, load_record(path, system.channels, system.sample_rate, time=system.time), path.name, out
-    )
+    record = load_record(path, system.channels, system.sample_rate, time=system.time)
+    said = diagnosis_of(system, record, path.name, out)
     yield {
         "verdict": said["verdict"],
         "findings": said["findings"],
@@ -34,6 +37,7 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
         "viscous_without_friction": identified(said, "baseline").get("viscous"),
     }
     found = identified(said, "augmented")
+    yield {"value": "force_rmse"} | force_errors(record.values, record.sample_rate, found)
     for name, target in PUBLISHED.items():
         value = found.get(name)
         error = None if value is None else value / target - 1
@@ -44,6 +48,14 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             "relative_error": error,
             "met": error is not None and abs(error) <= TOLERANCE,
         }
+
+
+def force_errors(values: FloatArray, rate: float, found: Mapping[str, float | None]) -> dict[str, float]:
+    """RMS of the force (N) that the identified and the published model leave, of columns force and position."""
+    known = {name: value for name, value in found.items() if value is not None}
+    force, position = values[np.isfinite(values).all(axis=1)].T
+    models = {"identified": known, "published": PUBLISHED}
+    return {name: force_error(force, position, rate, model) for name, model in models.items()}
 
 
 def identified(said: dict[str, Any], key: str) -> dict[str, float]:

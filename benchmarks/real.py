@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import spearmanr
 
+from sprung.benchmarks.emps import force_errors, identified
 from sprung.benchmarks.real_picture import loops
 from sprung.benchmarks.real_records import MeasuredRecord, records
 from sprung.benchmarks.real_reference import bouc_wen, linear
@@ -45,6 +46,9 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             line["met"] = line["held_out"] <= best or report.verdict == "unknown_physics"
         if record.witness is not None and report.track:
             line["track"] = followed(record, report)
+        if record.system.name == "emps":  # columns force and position
+            found = identified(report.to_dict(), "augmented")
+            line["force_rmse"] = force_errors(record.values, record.sample_rate, found)
         if out is not None and record.component:
             line["picture"] = str(loops(report, record.name, out))
         yield line
