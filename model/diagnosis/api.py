@@ -60,7 +60,8 @@ def diagnose(
         options = replace(options, catalogue=(*options.catalogue, *following_laws(system, record)))
         record = RecordedPart(record.sample_rate, channels, record.lost)
     if system.on_track or not system.file.inputs:
-        prepared = prepare(system, system.undistorted(record.values), record.sample_rate)
+        whole = replace(options.rules.record, longest=len(record.values))
+        prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
         begin = None if system.on_track else decay_begin(prepared.signals, system.sensor_noise)
         if begin is None:
             return diagnose_unforced(system, prepared, record, options, tell)

@@ -25,6 +25,7 @@ class RecordRules:
     minimum_samples: int = rule(200, "derived: two periods of the slowest mode of a vehicle at 100 Hz", 100, 400)
     gap: float = rule(0.05, "s; derived: a period of the highest frequency compared at 100 Hz loses nothing", 0.02, 0.1)
     moves: float = rule(2.0, "noise deviations by which one sensor has to move; chosen: 1 is noise alone", 1.5, 3.0)
+    longest: int = rule(18_000, "samples; chosen: three minutes of a vehicle, 2 to 3 GB of memory", 12_000, 60_000)
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
     wanders: float = rule(0.3, "of the supports' relative motion, noise of an integral; chosen", 0.15, 0.5)
     held_at_most: float = rule(1.0, "Hz; derived: a car body's slowest mode must still be driven", 0.5, 1.5)

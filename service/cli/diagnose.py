@@ -97,4 +97,5 @@ def text(report: Report) -> str:
         f"{100 * report.augmented_validation.nrmse:.1f} % with the findings, "
         f"{100 * report.noise_floor.nrmse:.1f} % is noise"
     )
-    return "\n".join([*lines, *report.changes, *report.advice])
+    used = [report.recording.used] if report.recording.used else []
+    return "\n".join([*lines, *used, *report.changes, *report.advice])

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import SupportInput
@@ -34,6 +35,7 @@ class Prepared:
     signals: Signals
     stuck: tuple[tuple[str, float], ...]  # channel, s from the start of the recording at which it froze
     notes: tuple[str, ...]
+    used: str = ""  # in words: the stretch of the recording that is diagnosed, where that is not all of it
 
 
 def prepare(system: System, values: FloatArray, sample_rate: float, rules: RecordRules = RULES.record) -> Prepared:
@@ -48,6 +50,12 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     notes: list[str] = []
     resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
     notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
+    still = standstill(values, max(int(sample_rate), 20))
+    if still.any() and not still.all():
+        values[still] = np.nan
+        notes.append(
+            f"standstill of {still.sum() / sample_rate:.1f} s is left out: the longest stretch that moves is used"
+        )
     stuck = _blank_stuck(values, names, sample_rate, resting, rules.stuck)
     first, last = _usable_stretch(values, max(1, int(rules.gap * sample_rate)))
     if last - first < rules.minimum_samples:
@@ -59,12 +67,31 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
         notes.append(
             f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
         )
+    first, last, used = _affordable(system, values, sample_rate, (first, last), rules.longest)
     values = _close_gaps(values[first:last])
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
     prepared = replace(prepared, signals=_held(system, values, prepared.signals, rules))
     _require_motion(system, prepared.signals, rules)
     _require_accelerometers(system, prepared.signals)
-    return prepared
+    return replace(prepared, used=used)
+
+
+def _affordable(
+    system: System, values: FloatArray, sample_rate: float, stretch: tuple[int, int], longest: int
+) -> tuple[int, int, str]:
+    """The stretch that is diagnosed, and what of the recording that is, in words."""
+    first, last = stretch
+    if last - first <= longest:
+        return first, last, ""
+    sensors = values[first:last, len(system.inputs) :]
+    present = np.isfinite(sensors).any(axis=0)
+    start, stop = liveliest(_close_gaps(sensors[:, present].copy()), longest)
+    used = (
+        f"{(first + start) / sample_rate:.0f} s to {(first + stop) / sample_rate:.0f} s of "
+        f"{len(values) / sample_rate:.0f} s were diagnosed, where the sensors move most: memory and time grow with the "
+        "length, and the rest would tell the same values a little more exactly"
+    )
+    return first + start, first + stop, used
 
 
 def _require_motion(system: System, signals: Signals, rules: RecordRules) -> None:

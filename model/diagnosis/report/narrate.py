@@ -55,7 +55,11 @@ def narrate(outcome: Outcome, record: Recorded) -> Report:
     return Report(
         system=course.system.name,
         recording=RecordingFacts(
-            course.options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
+            course.options.file,
+            len(record.values) / record.sample_rate,
+            len(record.values),
+            int(record.lost),
+            course.prepared.used,
         ),
         verdict=said.verdict,
         baseline=_parameters(course.system, course.base),

@@ -135,6 +135,7 @@ class RecordingFacts:
     seconds: float
     samples: int
     lost: int
+    used: str = ""  # in words: the stretch that was diagnosed, where that is not all of it
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,34 @@
+"""Which stretch of a recording is diagnosed: without standstill, and no longer than what is affordable."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import uniform_filter1d
+
+from sprung.model.signals import BoolArray, FloatArray
+
+MOST_CHANNELS = 0.5  # of all, that repeat one value together where a recording stands still
+
+
+def standstill(values: FloatArray, least: int) -> BoolArray:
+    """Samples at which more than half of the channels (T, C) are in runs of `least` equal values or more, (T,)."""
+    present = np.isfinite(values).any(axis=0)
+    resting = np.zeros(len(values))
+    for series in values[:, present].T:
+        changes = np.flatnonzero(np.diff(series) != 0) + 1
+        edges = np.concatenate([[0], changes, [len(series)]])
+        long = np.flatnonzero(np.diff(edges) >= least)
+        for run in long:
+            resting[edges[run] : edges[run + 1]] += 1
+    return np.asarray(resting > MOST_CHANNELS * present.sum())
+
+
+def liveliest(sensors: FloatArray, longest: int) -> tuple[int, int]:
+    """The stretch of `longest` samples in which the sensors (T, S) move most, each over its own mean."""
+    power = (sensors - np.mean(sensors, axis=0)) ** 2
+    mean = power.mean(axis=0)
+    level = (power[:, mean > 0] / mean[mean > 0]).mean(axis=1) if np.any(mean > 0) else np.zeros(len(sensors))
+    around = uniform_filter1d(np.minimum(level, 9.0), longest, mode="nearest")  # a single shock is no motion
+    half = longest // 2
+    middle = half + int(np.argmax(around[half : len(sensors) - longest + half + 1]))
+    return middle - half, middle - half + longest
