@@ -21,6 +21,7 @@ from sprung.service.condition import Condition
 from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
 from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
+from sprung.service.fleet.ingest import Ingest
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
@@ -33,6 +34,7 @@ from sprung.service.recordings import RecordingJobs
 from sprung.service.ring import Rings
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status
+from sprung.service.store.archive import Archive, open_archive
 from sprung.service.store.windows import latest_window
 from sprung.service.tokens import Tokens
 from sprung.service.views import VehicleView, vehicle_view
@@ -63,6 +65,8 @@ class Core:
     notices: Notices
     tokens: Tokens
     stopping: threading.Event
+    ingest: Ingest
+    archive: Archive | None = None
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
     requests: Histogram | None = None  # durations of requests
 
@@ -78,6 +82,7 @@ class Core:
         self.jobs.start()
         self.housekeeping.start()
         self.notices.start()
+        self.ingest.start()
         # what lives as long as the service is not looked through again: 320 000 objects, a pause for every client
         gc.collect()
         gc.freeze()
@@ -91,11 +96,13 @@ class Core:
             stack.callback(self.jobs.close)
             stack.callback(self.housekeeping.close)
             stack.callback(self.notices.close)
+            stack.callback(self.ingest.close)
 
 
 def build_core(settings: Settings, engine: Engine) -> Core:
     """Wire the application.  Raises UserError when the store cannot be opened."""
     store = open_store(settings.store_url)
+    archive = open_archive(settings.archive)
     compute = Compute(settings.compute_queue)
     board = Board(engine, settings.vehicles_in_memory)
     metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
@@ -136,11 +143,13 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         housekeeping,
         hub,
         Condition(settings, store),
-        Operations(settings, pipeline, board),
+        Operations(settings, pipeline, board, archive),
         batcher,
         notices,
         Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
         stopping,
+        Ingest(pipeline, settings.late_seconds),
+        archive,
         feeds,
     )
     waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}

@@ -10,10 +10,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from sqlalchemy import ColumnElement, Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.service.errors import UserError
 from sprung.service.settings import Settings
 from sprung.service.store import Store, retention, work
+from sprung.service.store.archive import open_archive
 from sprung.service.times import NANOSECONDS, now_ns
 
 log = logging.getLogger("sprung.housekeeping")
@@ -112,8 +115,14 @@ class Housekeeping:
             settings.retention_store_bytes,
             round(0.8 * settings.max_uploads_bytes),  # so that the next upload finds room
         )
+        archive = open_archive(settings.archive) if keep else None
+
+        def archived(connection: Connection, *which: ColumnElement[bool]) -> None:
+            if archive is not None:
+                archive.keep(connection, now, *which)
+
         with self._store.write() as connection:
-            forgotten = retention.forget(connection, limits)
+            forgotten = retention.forget(connection, limits, archived)
             if not keep:
                 connection.get_transaction().rollback()  # type: ignore[union-attr]
                 return forgotten
@@ -130,7 +139,7 @@ class Housekeeping:
         while True:
             try:
                 self.once(self.clock.now())
-            except (SQLAlchemyError, OSError):
+            except (SQLAlchemyError, OSError, UserError):
                 log.exception("housekeeping failed; it tries again in an hour")
             if self._stopping.wait(PERIOD_SECONDS):
                 return

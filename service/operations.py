@@ -10,6 +10,7 @@ from sprung.service.errors import NotFound
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import audit, fleet, marks, status
+from sprung.service.store.archive import Archive
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.marks import MarkRow
 from sprung.service.times import now_ns
@@ -20,11 +21,12 @@ MOST_ALARMS = 10_000
 class Operations:
     """Safe to share between threads."""
 
-    def __init__(self, settings: Settings, pipeline: Pipeline, board: Board) -> None:
+    def __init__(self, settings: Settings, pipeline: Pipeline, board: Board, archive: Archive | None = None) -> None:
         self._settings = settings
         self._pipeline = pipeline
         self._store = pipeline.store
         self._board = board
+        self._archive = archive
 
     def acknowledge(self, actor: str, vehicle: str, alarm: int | None = None) -> int:
         """Write down that somebody has seen a vehicle's alarm, or all that are active; how many.  Raises NotFound."""
@@ -101,6 +103,8 @@ class Operations:
             removed = marks.remove(connection, vehicle)
             audit.record(connection, actor, "delete", vehicle, None, now_ns())
         self._board.forget(vehicle)
+        if self._archive is not None:
+            self._archive.remove(vehicle)
         for name in removed.upload_files:
             (self._settings.uploads / name).unlink(missing_ok=True)
         for report in removed.reports:

@@ -17,6 +17,7 @@ from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
+from sprung.service.store.partitions import prepare
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
 from sprung.service.times import now_ns
 from sprung.service.views import vehicle_view
@@ -67,6 +68,14 @@ class _Vehicle:
     revision: int
     last_window_ns: int
     state: TrackerState
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """Windows that are tracked and stored in a transaction which may not be committed yet."""
+
+    batch: Batch
+    after: _Vehicle
 
 
 class Pipeline:
@@ -162,24 +171,44 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         recording_id: str | None,
     ) -> Batch:
+        prepare(self.store, (window.start for window in windows))
+        with self.store.write() as connection:
+            folded = self.fold(connection, vehicle, windows, estimates, recording_id)
+            done = time.perf_counter()
+        self._remember(vehicle, folded.after)
+        folded.batch.seconds["store"] += time.perf_counter() - done
+        return folded.batch
+
+    def fold(
+        self,
+        connection: Connection,
+        vehicle: str,
+        windows: list[Window],
+        estimates: Sequence[Estimate | None],
+        recording_id: str | None = None,
+    ) -> Folded:
+        """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
+
+        The vehicle is held until the transaction ends: whoever folds several takes them in the order of their ids, and
+        calls `partitions.prepare` before.
+        """
         now = self._clock()
         started = time.perf_counter()
-        with self.store.write() as connection:
-            fleet.ensure_vehicle(connection, vehicle, now)
-            at = self._current(connection, vehicle)
-            # another process may have stored some of them while this one was identifying
-            raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
-            records, after = self._follow(at, windows, estimates, set(raced), now)
-            new = [record for record in records if record.start not in raced]
-            tracked = time.perf_counter()
-            if new:
-                add_windows(connection, vehicle, self.model_id, new, now, recording_id)
-                history.add_to_rollups(connection, vehicle, self.model_id, new, now)
-                after = replace(after, revision=at.revision + 1)
-                self._save(connection, vehicle, after, now, new)
-        self._remember(vehicle, after)
+        fleet.ensure_vehicle(connection, vehicle, now)
+        fleet.hold_vehicle(connection, vehicle)
+        at = self._current(connection, vehicle)
+        # another process may have stored some of them while this one was identifying
+        raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+        records, after = self._follow(at, windows, estimates, set(raced), now)
+        new = [record for record in records if record.start not in raced]
+        tracked = time.perf_counter()
+        if new:
+            add_windows(connection, vehicle, self.model_id, new, now, recording_id)
+            history.add_to_rollups(connection, vehicle, self.model_id, new, now)
+            after = replace(after, revision=at.revision + 1)
+            self._save(connection, vehicle, after, now, new)
         done = time.perf_counter()
-        return Batch(
+        batch = Batch(
             vehicle,
             [raced.get(record.start, record) for record in records],
             [w for w in windows if w.start not in raced],
@@ -187,6 +216,16 @@ class Pipeline:
             after.state,
             {"track": tracked - started, "store": done - tracked},
         )
+        return Folded(batch, after)
+
+    def settle(self, folded: Folded) -> None:
+        """The transaction of `fold` is committed: remember the tracker and tell every listener."""
+        self._remember(folded.batch.vehicle, folded.after)
+        self.tell(folded.batch)
+
+    def last_window(self, connection: Connection, vehicle: str) -> int:
+        """Start of the newest window that the vehicle's tracker has seen, ns; -1 before the first."""
+        return self._current(connection, vehicle).last_window_ns
 
     def _follow(
         self,
@@ -240,9 +279,10 @@ class Pipeline:
         transaction is committed.
         """
         now = self._clock()
+        fleet.ensure_vehicle(connection, vehicle, now)
+        fleet.hold_vehicle(connection, vehicle)
         at = self._current(connection, vehicle)
         after = replace(at, state=self.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
-        fleet.ensure_vehicle(connection, vehicle, now)
         self._save(connection, vehicle, after, now, [])
         return Batch(vehicle, [], [], 0, after.state)
 
@@ -257,6 +297,7 @@ class Pipeline:
             missing = status.outdated(connection, self.model_id)
         for vehicle in missing:
             with self.store.write() as connection:
+                fleet.hold_vehicle(connection, vehicle)
                 at = self._current(connection, vehicle)
                 self._save_status(connection, vehicle, at, self._clock(), [])
         return len(missing)

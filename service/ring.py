@@ -79,7 +79,7 @@ class Rings:
             while len(self._rings) > self._limit:
                 self._rings.popitem(last=False)
             for window in windows:
-                if window.outcome != "dropped":
+                if window.outcome != "dropped" and len(window.values):  # without: the samples stayed on board
                     ring.add(window)
 
     def excerpt(self, vehicle: str) -> Excerpt | None:

@@ -76,6 +76,9 @@ class Settings(BaseSettings):
     ring_vehicles: int = Field(default=16, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
     ring_seconds: float = Field(default=60.0, gt=0)
 
+    late_seconds: float = Field(
+        default=10.0, ge=0
+    )  # that an estimate waits for those before it: POST /ingest/estimates
     silent_seconds: float = Field(default=600.0, gt=0)  # nothing heard for so long: the vehicle is shown as silent
 
     public_url: str = ""  # where people reach the pages, as in https://sprung.example.org; for links in notifications
@@ -93,11 +96,12 @@ class Settings(BaseSettings):
     misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 
-    retention_store_bytes: int | None = Field(default=None, gt=0)  # of an SQLite store; the oldest windows make room
+    retention_store_bytes: int | None = Field(default=None, gt=0)  # the oldest windows (PostgreSQL: months) go
     retention_windows_days: float = Field(
         default=30.0, gt=0
     )  # by the time of the data and of storing, whichever is later
     retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
+    archive: str | None = None  # folder or address (s3://...) for windows that are old, as Parquet; None: they are gone
     retention_uploads_days: float = Field(default=7.0, gt=0)
 
     @field_validator("admin_token")

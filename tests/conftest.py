@@ -13,6 +13,7 @@ from sprung.service.compute import Compute
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
+from tests import postgres as postgres_tests
 from tests.service_fakes import FakeIdentifier
 
 # a process for every file that a test reads would cost a second each; tests/service/test_apart.py has them
@@ -37,6 +38,27 @@ def engine(system: System, identifier: FakeIdentifier) -> Engine:
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     opened = open_store(f"sqlite:///{tmp_path}/test.db")
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[postgres_tests.Server]:
+    """A PostgreSQL server of this run's own."""
+    if reason := postgres_tests.missing():
+        pytest.skip(reason)
+    with postgres_tests.server() as running:
+        yield running
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def any_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Store]:
+    """The store, once on every database."""
+    if request.param == "sqlite":
+        url = f"sqlite:///{tmp_path}/test.db"
+    else:
+        url = request.getfixturevalue("postgres").database()
+    opened = open_store(url)
     yield opened
     opened.close()
 

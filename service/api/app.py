@@ -19,6 +19,7 @@ from sprung.service.api import (
     health,
     history,
     identify,
+    ingest,
     lists,
     problems,
     recordings,
@@ -69,7 +70,21 @@ def create_app(
     app.state.core = core
     problems.install(app)
     describe(app)
-    parts = (identify, admin, fleet, history, signals, actions, lists, events, recordings, diagnose, health, docs)
+    parts = (
+        identify,
+        ingest,
+        admin,
+        fleet,
+        history,
+        signals,
+        actions,
+        lists,
+        events,
+        recordings,
+        diagnose,
+        health,
+        docs,
+    )
     for router in (*(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)), admin.pages):
         app.include_router(router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
     app.mount("/static", assets(), name="static")

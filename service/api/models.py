@@ -62,6 +62,15 @@ class IdentifyAnswer(BaseModel):
     posterior: list[WindowParameter] | None = None
 
 
+class IngestAnswer(BaseModel):
+    """Answer to `POST /ingest/estimates`: what became of the windows."""
+
+    vehicle: str
+    folded: int = Field(description="tracked or counted now, those that had waited among them")
+    waiting: int = Field(description="of the message, kept until the gap before them is filled or given up")
+    known: int = Field(description="were there before")
+
+
 class ParameterAnswer(BaseModel):
     """One parameter as tracked."""
 

@@ -11,6 +11,7 @@ from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.settings import settings_with
 from sprung.service.store import fleet, history, open_store
+from sprung.service.store.archive import open_archive
 from sprung.service.times import from_iso
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
@@ -50,7 +51,16 @@ def run(
             model = fleet.known_model(connection, engine.digest, engine.description())
             if model is None:
                 raise UserError(f"{settings.store_url}: nothing was stored with this system")
-            found = history.series(connection, vehicle, model, begin, end, _seconds(resolution), FOREVER)
+            found = history.series(
+                connection,
+                vehicle,
+                model,
+                begin,
+                end,
+                _seconds(resolution),
+                FOREVER,
+                history.older_windows(open_archive(settings.archive), vehicle, engine.digest),
+            )
     body = history_file(engine, vehicle, parameters or known, found, kind)
     if out is None:
         sys.stdout.buffer.write(body)

@@ -1,4 +1,8 @@
-"""Opening a store: the engine, SQLite's pragmas, migrations, and transactions."""
+"""Opening a store: the engine, SQLite's pragmas, migrations, and transactions.
+
+SQLite has one writer, so a process lets one transaction write at a time.  On PostgreSQL many write at once, and who
+reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehicle`).
+"""
 
 from __future__ import annotations
 
@@ -10,7 +14,7 @@ from typing import Any
 
 from alembic import command
 from alembic.config import Config
-from sqlalchemy import Connection, Engine, Table, create_engine, event, text
+from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, NoSuchModuleError
@@ -19,6 +23,9 @@ from sprung.service.errors import UserError
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 PROBE_SECONDS = 2.0
+MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others wait
+MIGRATING = 0x5B_70_72_74  # of the advisory lock
+STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: its caller tries again
 UPSERT_DIALECTS = ("sqlite", "postgresql")
 
 
@@ -27,13 +34,19 @@ class Store:
 
     def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self._writing = threading.Lock()  # one writer a process: SQLite has one anyway, and waiting is fair here
+        self.many_writers = engine.dialect.name == "postgresql"
+        # one writer a process where the database has one anyway: waiting is fair here
+        self._writing = threading.BoundedSemaphore(MOST_WRITERS if self.many_writers else 1)
+        self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
     @contextmanager
     def read(self) -> Iterator[Connection]:
         """A consistent snapshot."""
-        with self.engine.connect() as connection, connection.begin():
-            yield connection
+        with self.engine.connect() as connection:
+            if self.many_writers:  # SQLite's readers have one by themselves
+                connection.execution_options(isolation_level="REPEATABLE READ", postgresql_readonly=True)
+            with connection.begin():
+                yield connection
 
     @contextmanager
     def write(self) -> Iterator[Connection]:
@@ -76,20 +89,24 @@ def open_store(url: str) -> Store:
     """
     if "://" not in url:
         url = f"sqlite:///{url}"
+    shown = url
     try:
         parsed = make_url(url)
+        shown = parsed.render_as_string(hide_password=True)
         if parsed.get_backend_name() not in UPSERT_DIALECTS:
-            raise UserError(f"store {url}: only {' and '.join(UPSERT_DIALECTS)} URLs are supported")
+            raise UserError(f"store {shown}: only {' and '.join(UPSERT_DIALECTS)} URLs are supported")
         if parsed.get_backend_name() == "sqlite":
             engine = _sqlite_engine(url, parsed.database)
         else:
-            engine = create_engine(parsed)
+            engine = _postgresql_engine(parsed)
         store = Store(engine)
         migrate(store)
-    except (ArgumentError, NoSuchModuleError, ModuleNotFoundError) as error:
-        raise UserError(f"store {url}: not a usable database URL ({_first_line(error)})") from error
+    except ModuleNotFoundError as error:
+        raise UserError(f"store {shown}: {error.name} is missing; pip install 'sprung[fleet]'") from error
+    except (ArgumentError, NoSuchModuleError) as error:
+        raise UserError(f"store {shown}: not a usable database URL ({_first_line(error)})") from error
     except (DatabaseError, OSError) as error:
-        raise UserError(f"store {url}: cannot be opened ({_first_line(error)})") from error
+        raise UserError(f"store {shown}: cannot be opened ({_first_line(error)})") from error
     return store
 
 
@@ -99,6 +116,9 @@ def migrate(store: Store) -> None:
     config.set_main_option("script_location", "sprung.service:migrations")
     config.set_main_option("path_separator", "os")
     with store.write() as connection:
+        if store.many_writers:  # processes that start together migrate one after the other, however long it takes
+            connection.execute(text("SET LOCAL statement_timeout = 0"))
+            connection.execute(text("SELECT pg_advisory_xact_lock(:key)"), {"key": MIGRATING})
         config.attributes["connection"] = connection
         command.upgrade(config, "head")
 
@@ -123,6 +143,19 @@ def upsert(connection: Connection, table: Table, rows: Sequence[dict[str, Any]],
 
 def _dialect_insert(connection: Connection) -> Any:
     return {"sqlite": sqlite.insert, "postgresql": postgresql.insert}[connection.dialect.name]
+
+
+def _postgresql_engine(url: URL) -> Engine:
+    if url.drivername == "postgresql":  # what that stands for differs between versions of SQLAlchemy
+        url = url.set(drivername="postgresql+psycopg")
+    options = f"-c statement_timeout={STATEMENT_MILLISECONDS} -c timezone=UTC"
+    return create_engine(
+        url,
+        pool_size=MOST_WRITERS,
+        max_overflow=2 * MOST_WRITERS,  # readers
+        pool_pre_ping=True,  # the server may have been started anew since a connection was used last
+        connect_args={"options": options, "connect_timeout": 10},
+    )
 
 
 def _sqlite_engine(url: str, database: str | None) -> Engine:

@@ -62,6 +62,14 @@ def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
         insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
 
 
+def hold_vehicle(connection: Connection, vehicle: str) -> None:
+    """Keep other transactions from folding windows of the vehicle until this one ends; SQLite has one writer anyway.
+
+    Whoever holds several takes them in the order of their ids.
+    """
+    connection.execute(select(vehicles.c.id).where(vehicles.c.id == vehicle).with_for_update(key_share=True))
+
+
 def ensure_model(connection: Connection, digest: str, system: str, description: dict[str, Any], now: int) -> int:
     """The row number of a model, stored when it is new; see `known_model`."""
     there = known_model(connection, digest, description)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import heapq
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from sqlalchemy import Column, Connection, Table, func, literal, select
 
 from sprung.model.signals import FloatArray, IntArray
+from sprung.service.store.archive import Archive, ArchivedPosterior
 from sprung.service.store.engine import upsert
-from sprung.service.store.schema import posteriors, rollups, windows
+from sprung.service.store.schema import rollups, windows
 from sprung.service.store.windows import WindowRecord, pack, unpack
 from sprung.service.times import NANOSECONDS
 
+Older = Callable[[int, int], Iterable[ArchivedPosterior]]  # of since and until
 LEVELS = (60, 3600)  # s
 NICE = (1.0, 2.0, 5.0, 10.0, 30.0, 60.0, 300.0, 900.0, 3600.0, 6 * 3600.0, 86400.0)  # s per point
 
@@ -111,17 +115,19 @@ def series(
     until: int,
     resolution: float,
     limit: int,
+    older: Older = lambda since, until: (),
 ) -> Series:
     """The newest `limit` points with since <= time < until, oldest first.
 
     resolution: seconds per point; below a minute made from raw windows, above from roll-ups; 0 gives raw windows.
+    older: windows that the store has no more, as (start, mean, std), newest first (`older_windows`).
     """
     level = max((level for level in LEVELS if level <= resolution), default=None)
     if level is None:
-        query = (
-            select(windows.c.start_ns, literal(1), posteriors.c.log_ratio, posteriors.c.std)
-            .join(posteriors, posteriors.c.window_id == windows.c.id)
+        query: Any = (
+            select(windows.c.start_ns, literal(1), windows.c.posterior, windows.c.posterior_std)
             .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+            .where(windows.c.posterior.is_not(None))
             .where(windows.c.start_ns >= since, windows.c.start_ns < until)
             .order_by(windows.c.start_ns.desc())
         )
@@ -133,17 +139,40 @@ def series(
             .where(table.c.resolution_s == level, table.c.bucket_ns >= since, table.c.bucket_ns < until)
             .order_by(table.c.bucket_ns.desc())
         )
-    if resolution == (level or 0):
-        return _of_rows(connection.execute(query.limit(limit)).all())
+    exact = resolution == (level or 0)
+    query = query.limit(limit) if exact else query
+    if level is not None:
+        rows_newest_first: Iterable[Any] = connection.execute(query)
+    else:
+        rows_newest_first = _together(connection.execute(query), older(since, until))
+    if exact:
+        return _of_rows(list(islice(rows_newest_first, limit)))
     width = round(resolution * NANOSECONDS)
     rows: list[Any] = []
     buckets = 0
-    for row in connection.execute(query):
+    for row in rows_newest_first:
         buckets += not rows or rows[-1][0] // width != row[0] // width
         if buckets > limit:
             break
         rows.append(row)
     return _merged(_of_rows(rows), width)
+
+
+def older_windows(archive: Archive | None, vehicle: str, digest: str) -> Older:
+    """What `series` reads when the store's own windows are at their end."""
+    if archive is None:
+        return lambda since, until: ()
+    return lambda since, until: archive.posteriors(vehicle, digest, since, until)
+
+
+def _together(stored: Iterable[Any], older: Iterable[ArchivedPosterior]) -> Iterator[tuple[Any, ...]]:
+    """Rows of the store and of the archive, newest first, each start once."""
+    archived = ((one.start, 1, one.mean, one.std) for one in older)
+    last = None
+    for row in heapq.merge((tuple(row) for row in stored), archived, key=lambda row: -row[0]):
+        if row[0] != last:
+            last = row[0]
+            yield row
 
 
 def _arrays(found: Series) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

@@ -12,6 +12,7 @@ from sprung.service.store.schema import (
     fleet_status,
     jobs,
     marks,
+    pending,
     recordings,
     reports,
     rollups,
@@ -78,7 +79,7 @@ def remove(connection: Connection, vehicle: str) -> Removed:
     own = recordings.c.vehicle_id == vehicle
     files = connection.execute(select(recordings.c.file).where(own, recordings.c.file.is_not(None))).scalars().all()
     pages = connection.execute(select(reports.c.id).where(reports.c.vehicle_id == vehicle)).scalars().all()
-    for table in (alarms, marks, fleet_status, window_reasons, tracker_states, rollups, windows, reports):
+    for table in (alarms, marks, fleet_status, window_reasons, tracker_states, rollups, pending, windows, reports):
         connection.execute(delete(table).where(table.c.vehicle_id == vehicle))
     ids = select(recordings.c.id).where(own)
     for table in (jobs, reports, windows):  # of other vehicles or none, from the same file

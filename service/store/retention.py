@@ -3,19 +3,25 @@
 A window goes when it is old by both clocks: by the time of its data and by the time at which it was stored.  An archive
 of last year that is replayed today is kept as long as today's measurements, and a host whose clock was wrong for a
 while, in either direction, loses nothing.
+
+On PostgreSQL whole months go at once, by dropping their partition: deleting a tenth of a large table row by row would
+cost more than storing it did.  There a window is kept until the last one of its month is old.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 from sqlalchemy import Connection, delete, func, select, text, update
 
+from sprung.service.store import partitions
 from sprung.service.store.schema import jobs, recordings, rollups, windows
 from sprung.service.store.work import UNFINISHED
 
 CLOCK_WAS_SET_NS = 1_577_836_800_000_000_000  # 2020: before it, a clock was not set, and says nothing about age
+Keep = Callable[..., Any]  # of a connection and the conditions of windows
 AT_ONCE = 5000  # windows that are deleted together when there are too many
 
 
@@ -40,15 +46,15 @@ class Forgotten:
     windows_for_room: int = 0  # of the windows, those that were not old
 
 
-def forget(connection: Connection, limits: RetentionLimits) -> Forgotten:
-    """Delete what is past the limits.  One-hour roll-ups and alarms stay."""
-    old = delete(windows).where(  # posteriors go with their windows
-        windows.c.stored_ns < limits.windows_before,
-        windows.c.stored_ns >= CLOCK_WAS_SET_NS,
-        windows.c.start_ns < limits.windows_before,
-    )
-    removed = connection.execute(old).rowcount
-    for_room = 0 if limits.store_bytes is None else _make_room(connection, limits.store_bytes)
+def forget(connection: Connection, limits: RetentionLimits, keep: Keep = lambda connection, *which: None) -> Forgotten:
+    """Delete what is past the limits.  One-hour roll-ups and alarms stay.
+
+    keep: told of windows, by their conditions, before they are deleted.
+    """
+    if connection.dialect.name == "postgresql":
+        connection.execute(text("SET LOCAL statement_timeout = 0"))  # a month of a fleet takes its time
+    removed = _forget_windows(connection, limits.windows_before, keep)
+    for_room = 0 if limits.store_bytes is None else _make_room(connection, limits.store_bytes, keep)
     minutes = delete(rollups).where(
         rollups.c.resolution_s == 60,
         rollups.c.updated_ns < limits.minutes_before,
@@ -62,6 +68,32 @@ def forget(connection: Connection, limits: RetentionLimits) -> Forgotten:
     return Forgotten(removed + for_room, removed_minutes, tuple(files), for_room)
 
 
+def _forget_windows(connection: Connection, before: int, keep: Keep) -> int:
+    if connection.dialect.name == "postgresql":
+        return sum(_drop(connection, month, keep) for month in old_months(connection, before))
+    old = (windows.c.stored_ns < before, windows.c.stored_ns >= CLOCK_WAS_SET_NS, windows.c.start_ns < before)
+    keep(connection, *old)
+    return connection.execute(delete(windows).where(*old)).rowcount
+
+
+def _drop(connection: Connection, month: partitions.Month, keep: Keep) -> int:
+    keep(connection, windows.c.start_ns >= month.begin, windows.c.start_ns < month.end)
+    return partitions.drop(connection, month)
+
+
+def old_months(connection: Connection, before: int) -> list[partitions.Month]:
+    """Partitions all of whose windows are old by both clocks."""
+    found = []
+    for month in partitions.months(connection):
+        inside = (windows.c.start_ns >= month.begin, windows.c.start_ns < month.end)
+        kept = select(windows.c.stored_ns).where(
+            *inside, (windows.c.stored_ns >= before) | (windows.c.stored_ns < CLOCK_WAS_SET_NS)
+        )
+        if month.end <= before and connection.execute(kept.limit(1)).first() is None:
+            found.append(month)
+    return found
+
+
 def newest(connection: Connection) -> int | None:
     """When the last window was stored by a clock that was set, ns since epoch."""
     query = select(func.max(windows.c.stored_ns)).where(windows.c.stored_ns >= CLOCK_WAS_SET_NS)
@@ -71,6 +103,8 @@ def newest(connection: Connection) -> int | None:
 
 def used_bytes(connection: Connection) -> int | None:
     """Bytes that the store's content takes, free pages left out; None where the database does not tell."""
+    if connection.dialect.name == "postgresql":
+        return int(connection.execute(text("SELECT pg_database_size(current_database())")).scalar_one())
     if connection.dialect.name != "sqlite":
         return None
     pages, free, size = (
@@ -80,14 +114,29 @@ def used_bytes(connection: Connection) -> int | None:
     return (pages - free) * size
 
 
-def _make_room(connection: Connection, limit: int) -> int:
+def _make_room(connection: Connection, limit: int, keep: Keep) -> int:
+    if connection.dialect.name == "postgresql":
+        return _drop_for_room(connection, limit, keep)
     removed = 0
     while (used := used_bytes(connection)) is not None and used > limit:
-        oldest = select(windows.c.id).order_by(windows.c.start_ns).limit(AT_ONCE).scalar_subquery()
-        count = connection.execute(delete(windows).where(windows.c.id.in_(oldest))).rowcount
-        if count == 0:
+        starts = select(windows.c.start_ns).order_by(windows.c.start_ns).limit(AT_ONCE).subquery()
+        last = connection.execute(select(func.max(starts.c.start_ns))).scalar()
+        if last is None:
             break
+        oldest = windows.c.start_ns <= last
+        keep(connection, oldest)
+        count = connection.execute(delete(windows).where(oldest)).rowcount
         removed += count
+    return removed
+
+
+def _drop_for_room(connection: Connection, limit: int, keep: Keep) -> int:
+    """Whole months, the oldest first; never the newest one."""
+    removed = 0
+    for month in partitions.months(connection)[:-1]:
+        if (used_bytes(connection) or 0) <= limit:
+            break
+        removed += _drop(connection, month, keep)
     return removed
 
 

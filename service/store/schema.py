@@ -104,14 +104,12 @@ recordings = Table(
     Column("finished_ns", BigInteger, nullable=True),
 )
 
-windows = Table(
+windows = Table(  # PostgreSQL keeps a partition a month (`service.store.partitions`): the key holds the time
     "windows",
     metadata,
-    # SQLite numbers rows by itself only for the type INTEGER
-    Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True),
-    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
-    Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("start_ns", BigInteger, primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), primary_key=True),
     Column("stored_ns", BigInteger, nullable=False),
     Column("recording_id", String(36), ForeignKey("recordings.id"), nullable=True),
     Column("outcome", String(16), nullable=False),  # used, repaired, dropped, uninformative
@@ -127,21 +125,21 @@ windows = Table(
     Column("std", LargeBinary, nullable=True),  # of log_ratio, shape (P,)
     Column("identifiable", LargeBinary, nullable=True),  # one byte each, shape (P,)
     Column("per_sensor", LargeBinary, nullable=True),  # nrmse, shape (S,)
-    UniqueConstraint("vehicle_id", "start_ns", "model_id"),
+    Column("posterior", LargeBinary, nullable=True),  # log-ratios that the tracker believed after it, shape (P,)
+    Column("posterior_std", LargeBinary, nullable=True),  # shape (P,)
     Index("ix_windows_stored_ns", "stored_ns"),
+    postgresql_partition_by="RANGE (start_ns)",
 )
 
-posteriors = Table(  # what the tracker believed after that window
-    "posteriors",
+pending = Table(  # estimates that were received and wait for the windows before them
+    "pending",
     metadata,
-    Column(
-        "window_id",
-        BigInteger().with_variant(Integer, "sqlite"),
-        ForeignKey("windows.id", ondelete="CASCADE"),
-        primary_key=True,
-    ),
-    Column("log_ratio", LargeBinary, nullable=False),  # shape (P,)
-    Column("std", LargeBinary, nullable=False),  # shape (P,)
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("model_id", Integer, ForeignKey("models.id"), primary_key=True),
+    Column("start_ns", BigInteger, primary_key=True),
+    Column("received_ns", BigInteger, nullable=False),
+    Column("message", LargeBinary, nullable=False),
+    Index("ix_pending_received_ns", "received_ns"),
 )
 
 rollups = Table(  # posteriors over long ranges

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from sqlalchemy import Connection, Row, select
 
 from sprung.model.signals import BoolArray, Estimate, FloatArray
-from sprung.service.store.engine import insert_or_ignore
-from sprung.service.store.schema import posteriors, windows
+from sprung.service.store.partitions import ensure_months, insert_new
+from sprung.service.store.schema import windows
 
 IN_LIMIT = 500  # values in one IN (...): below every dialect's bound on parameters
 
@@ -83,20 +83,8 @@ def add_windows(
         "stored_ns": stored_ns,
         "recording_id": recording_id,
     }
-    insert_or_ignore(connection, windows, [shared | _window_row(record) for record in records])
-    tracked = {record.start: record.posterior for record in records if record.posterior is not None}
-    insert_or_ignore(
-        connection,
-        posteriors,
-        [
-            {
-                "window_id": window_id,
-                "log_ratio": pack(tracked[start].log_ratio),
-                "std": pack(tracked[start].std),
-            }
-            for start, window_id in _ids(connection, vehicle, model_id, tracked).items()
-        ],
-    )
+    ensure_months(connection, (record.start for record in records))
+    insert_new(connection, windows, [shared | _window_row(record) for record in records])
 
 
 def known_windows(
@@ -104,11 +92,7 @@ def known_windows(
 ) -> dict[int, WindowRecord]:
     """Those of the windows that are stored already, by start."""
     found: dict[int, WindowRecord] = {}
-    query = (
-        select(windows, posteriors.c.log_ratio.label("posterior"), posteriors.c.std.label("posterior_std"))
-        .join(posteriors, posteriors.c.window_id == windows.c.id, isouter=True)
-        .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
-    )
+    query = select(windows).where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
     for part in _parts(starts):
         for row in connection.execute(query.where(windows.c.start_ns.in_(part))):
             found[row.start_ns] = _record(row)
@@ -118,8 +102,7 @@ def known_windows(
 def latest_window(connection: Connection, vehicle: str, model_id: int) -> WindowRecord | None:
     """The newest window of a vehicle that was identified."""
     query = (
-        select(windows, posteriors.c.log_ratio.label("posterior"), posteriors.c.std.label("posterior_std"))
-        .join(posteriors, posteriors.c.window_id == windows.c.id, isouter=True)
+        select(windows)
         .where(
             windows.c.vehicle_id == vehicle,
             windows.c.model_id == model_id,
@@ -146,11 +129,11 @@ def _window_row(record: WindowRecord) -> dict[str, Any]:
     row: dict[str, Any] = {
         "start_ns": record.start,
         "outcome": record.outcome,
-        "reason": record.reason,
+        "reason": None if record.reason is None else record.reason[:200],
         "repaired_samples": record.repaired_samples,
         "tracked": record.tracked,
     }
-    solved = record.solved
+    solved, posterior = record.solved, record.posterior
     return row | {
         "nrmse": None if solved is None else solved.nrmse,
         "chi_square": None if solved is None else solved.chi_square,
@@ -161,6 +144,8 @@ def _window_row(record: WindowRecord) -> dict[str, Any]:
         "std": None if solved is None else pack(solved.std),
         "identifiable": None if solved is None else np.asarray(solved.identifiable, np.uint8).tobytes(),
         "per_sensor": None if solved is None else pack(solved.per_sensor),
+        "posterior": None if posterior is None else pack(posterior.log_ratio),
+        "posterior_std": None if posterior is None else pack(posterior.std),
     }
 
 
@@ -181,17 +166,6 @@ def _record(row: Row[Any]) -> WindowRecord:
         )
     posterior = None if row.posterior is None else Posterior(unpack(row.posterior), unpack(row.posterior_std))
     return WindowRecord(row.start_ns, row.outcome, row.reason, row.repaired_samples, row.tracked, solved, posterior)
-
-
-def _ids(connection: Connection, vehicle: str, model_id: int, starts: Iterable[int]) -> dict[int, int]:
-    query = select(windows.c.start_ns, windows.c.id).where(
-        windows.c.vehicle_id == vehicle, windows.c.model_id == model_id
-    )
-    return {
-        row.start_ns: row.id
-        for part in _parts(starts)
-        for row in connection.execute(query.where(windows.c.start_ns.in_(part)))
-    }
 
 
 def _parts(starts: Iterable[int]) -> Iterable[list[int]]:

@@ -1,0 +1,224 @@
+"""Estimates from elsewhere into trackers and store: in order of time, each window once, whoever brings it how often.
+
+At-least-once delivery becomes one effect: a transaction holds the vehicle, leaves out what is stored or waits already,
+folds what is due, keeps the rest waiting, and commits all of it together.  The sender is told after that.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from sqlalchemy import Connection
+from sqlalchemy.exc import SQLAlchemyError
+
+from sprung.model.signals import Window
+from sprung.service.errors import UserError
+from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
+from sprung.service.pipeline import Folded, Pipeline
+from sprung.service.store import fleet, pending
+from sprung.service.store.partitions import prepare
+from sprung.service.store.pending import Waiting
+from sprung.service.store.windows import known_windows
+from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
+
+log = logging.getLogger("sprung.ingest")
+SWEEP_SECONDS = 1.0
+FIRST_TIME = 946_684_800 * NANOSECONDS  # 2000: before it no clock of a vehicle was right
+CONTIGUOUS = 1.01  # hops: a window that begins so long after the last one follows it
+
+
+class OtherModel(UserError):
+    """Estimates of another system file or estimator than this service has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Taken:
+    """What became of one message."""
+
+    vehicle: str
+    folded: int  # windows that were tracked or counted now
+    waiting: int  # of the message, kept until the gap before them is filled or given up
+    known: int  # that were there before
+
+
+class Ingest:
+    """Takes messages.  Safe to share between threads; several processes may do the same on one PostgreSQL store."""
+
+    def __init__(self, pipeline: Pipeline, late_seconds: float, clock: Callable[[], int] = now_ns) -> None:
+        """late_seconds: how long a window waits for those before it, in the data's time or this machine's."""
+        system = pipeline.engine.system
+        self._pipeline = pipeline
+        self._late = round(late_seconds * NANOSECONDS)
+        self._hop = CONTIGUOUS * system.hop / system.sample_rate * NANOSECONDS
+        self._clock = clock
+        self._stopping = threading.Event()
+        self._sweeper = threading.Thread(target=self._sweep_on, name="sprung-sweep", daemon=True)
+        self._sizes = len(system.tracked), len(system.sensors), len(pipeline.engine.tracker.deviations)
+
+    def take(self, messages: Sequence[Message]) -> list[Taken]:
+        """Fold messages of any vehicles in one transaction; they are stored when this returns.
+
+        Raises UserError for a message that cannot be folded, before anything is stored.
+        """
+        now = self._clock()
+        for message in messages:
+            self._check(message, now)
+        prepare(self._pipeline.store, (w.start for message in messages for w in message.windows))
+        by_vehicle: dict[str, list[int]] = {}
+        for i, message in enumerate(messages):
+            by_vehicle.setdefault(message.vehicle, []).append(i)
+        taken: dict[int, Taken] = {}
+        folded = []
+        with self._pipeline.store.write() as connection:
+            for vehicle in sorted(by_vehicle):  # in the order of their ids: nobody waits in a circle
+                for i in by_vehicle[vehicle]:
+                    taken[i] = self._one(connection, messages[i], now, folded)
+        self._settle(folded)
+        return [taken[i] for i in range(len(messages))]
+
+    def start(self) -> None:
+        """Sweep from time to time, in a thread."""
+        self._sweeper.start()
+
+    def close(self) -> None:
+        """Stop sweeping."""
+        self._stopping.set()
+        if self._sweeper.is_alive():
+            self._sweeper.join()
+
+    def _sweep_on(self) -> None:
+        while not self._stopping.wait(max(self._late / NANOSECONDS / 2, SWEEP_SECONDS)):
+            try:
+                self.sweep()
+            except (SQLAlchemyError, OSError):
+                log.exception("windows that wait could not be folded; trying again")
+
+    def sweep(self) -> int:
+        """Fold what has waited for long enough though nothing came after it; how many windows."""
+        now = self._clock()
+        with self._pipeline.store.read() as connection:
+            overdue = pending.overdue(connection, self._pipeline.model_id, now - self._late)
+        count = 0
+        for vehicle in overdue:
+            folded: list[Folded] = []
+            with self._pipeline.store.write() as connection:
+                self._hold(connection, vehicle, now)
+                count += self._fold_due(connection, vehicle, [], now, folded)
+            self._settle(folded)
+        return count
+
+    def _settle(self, folded: Sequence[Folded]) -> None:
+        for one in folded:
+            self._pipeline.settle(one)
+
+    def _hold(self, connection: Connection, vehicle: str, now: int) -> None:
+        fleet.ensure_vehicle(connection, vehicle, now)
+        fleet.hold_vehicle(connection, vehicle)
+
+    def _one(self, connection: Connection, message: Message, now: int, folded: list[Folded]) -> Taken:
+        vehicle, model = message.vehicle, self._pipeline.model_id
+        self._hold(connection, vehicle, now)
+        known = known_windows(connection, vehicle, model, [w.start for w in message.windows])
+        fresh = [w for w in message.windows if w.start not in known]
+        count = self._fold_due(connection, vehicle, fresh, now, folded)
+        left = {row.start for row in pending.waiting(connection, vehicle, model)}
+        waits = sum(w.start in left for w in fresh)
+        return Taken(vehicle, count, waits, len(message.windows) - len(fresh))
+
+    def _fold_due(
+        self, connection: Connection, vehicle: str, fresh: Sequence[WindowEstimate], now: int, folded: list[Folded]
+    ) -> int:
+        """Fold what is due of what waited and what came; keep the rest.  How many were folded."""
+        model = self._pipeline.model_id
+        waited = pending.waiting(connection, vehicle, model)
+        held = {row.start: row for row in waited}
+        came = {w.start: w for w in fresh if w.start not in held}
+        last = self._pipeline.last_window(connection, vehicle)
+        stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
+        if stepped_back is not None:  # the clock was set: what waits is from before, then the rest as it came
+            due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))
+            due += [w.start for w in fresh[stepped_back:] if w.start in came]
+        else:
+            received = {start: held[start].received if start in held else now for start in (*held, *came)}
+            due = due_windows(received, last, self._hop, self._late, now)
+        order = [came[start] if start in came else _restored(held[start]) for start in due]
+        if order:
+            width = len(self._pipeline.engine.system.channels)
+            windows = [_window(w, self._pipeline.engine.system.sample_rate, width) for w in order]
+            one = self._pipeline.fold(connection, vehicle, windows, [w.estimate for w in order])
+            folded.append(one)
+        pending.release(connection, vehicle, model, [start for start in due if start in held])
+        digest = self._pipeline.engine.digest
+        rest = set(came) - set(due)
+        rows = [Waiting(s, now, encode(Message(vehicle, digest, (came[s],)), "exact")) for s in sorted(rest)]
+        pending.keep(connection, vehicle, model, rows)
+        return len(order)
+
+    def _check(self, message: Message, now: int) -> None:
+        digest = self._pipeline.engine.digest
+        if message.model != digest:
+            raise OtherModel(
+                f"the estimates are of model {message.model[:80]!r}, this service has {digest!r}: give both the same "
+                "system file and weights"
+            )
+        P, S, H = self._sizes
+        for window in message.windows:
+            if not FIRST_TIME <= window.start <= now + AHEAD:
+                raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
+            e = window.estimate
+            if e is None:
+                continue
+            if e.log_ratio.shape != (P,) or e.per_sensor.shape != (S,):
+                raise UserError(f"an estimate of {e.log_ratio.size} parameters and {e.per_sensor.size} sensors came")
+            d = e.deviating
+            if d is not None and (d.cross.shape != (P, H) or d.information.shape != (H, H) or d.point.shape != (H,)):
+                raise UserError(f"an estimate of {d.point.size} deviations came; the model has {H}")
+            if not (np.isfinite(e.log_ratio).all() and np.isfinite(e.covariance).all() and np.isfinite(e.chi_square)):
+                raise UserError(f"window {to_iso(window.start)}: numbers that are not finite")
+
+
+def due_windows(received: dict[int, int], last: int, hop: float, late: int, now: int) -> list[int]:
+    """Starts that may be folded now, in order of time.
+
+    received: when the windows that are there came, by their starts, ns.  One that follows the last window without a
+    gap, or is older, waits for nothing; behind a gap it waits until a window came that starts `late` ns after it, or
+    until it has waited for so long itself.
+    """
+    order = sorted(received)
+    newest = order[-1] if order else 0
+    due = []
+    for start in order:
+        if start - last > hop and newest - start < late and now - received[start] < late:
+            break
+        due.append(start)
+        last = max(last, start)
+    return due
+
+
+def read_messages(bodies: Sequence[bytes]) -> list[Message]:
+    """Messages as they were sent.  Raises UserError for what is none."""
+    try:
+        return [decode(body) for body in bodies]
+    except UnreadableMessage as error:
+        raise UserError(str(error)) from None
+
+
+def _restored(row: Waiting) -> WindowEstimate:
+    return decode(row.message).windows[0]
+
+
+def _window(window: WindowEstimate, sample_rate: float, channels: int) -> Window:
+    """A window whose samples stayed where they were measured."""
+    return Window(
+        window.start,
+        sample_rate,
+        np.empty((0, channels)),
+        window.outcome,
+        window.reason,
+        window.repaired_samples,
+        window.new_segment,
+    )

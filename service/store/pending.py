@@ -1,0 +1,56 @@
+"""Estimates that were received and wait for the windows before them: kept with the acknowledgement, folded in order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from sqlalchemy import Connection, delete, select
+
+from sprung.service.store.engine import insert_or_ignore
+from sprung.service.store.schema import pending
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """One window as it came."""
+
+    start: int  # ns since epoch
+    received: int  # ns since epoch, by this machine's clock
+    message: bytes  # as `service.fleet.message` writes one window
+
+
+def waiting(connection: Connection, vehicle: str, model_id: int) -> list[Waiting]:
+    """What waits of a vehicle, in order of time."""
+    query = (
+        select(pending.c.start_ns, pending.c.received_ns, pending.c.message)
+        .where(pending.c.vehicle_id == vehicle, pending.c.model_id == model_id)
+        .order_by(pending.c.start_ns)
+    )
+    return [Waiting(*row) for row in connection.execute(query)]
+
+
+def keep(connection: Connection, vehicle: str, model_id: int, rows: Iterable[Waiting]) -> None:
+    """Store what is to wait; what waits already is left as it is."""
+    shared = {"vehicle_id": vehicle, "model_id": model_id}
+    values = [shared | {"start_ns": row.start, "received_ns": row.received, "message": row.message} for row in rows]
+    insert_or_ignore(connection, pending, values)
+
+
+def release(connection: Connection, vehicle: str, model_id: int, starts: Iterable[int]) -> None:
+    """Forget what was folded."""
+    mine = (pending.c.vehicle_id == vehicle, pending.c.model_id == model_id)
+    chosen = list(starts)
+    for first in range(0, len(chosen), 500):
+        connection.execute(delete(pending).where(*mine, pending.c.start_ns.in_(chosen[first : first + 500])))
+
+
+def overdue(connection: Connection, model_id: int, before: int) -> list[str]:
+    """Vehicles of which something has waited since before a time, ns, in the order of their ids."""
+    query = (
+        select(pending.c.vehicle_id)
+        .where(pending.c.model_id == model_id, pending.c.received_ns < before)
+        .distinct()
+        .order_by(pending.c.vehicle_id)
+    )
+    return list(connection.execute(query).scalars())
