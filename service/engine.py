@@ -34,6 +34,7 @@ class Engine:
     identifier: Identifies
     tracker: Tracker
     dbc: Path | None = None
+    weighed_of: int = WEIGHED_OF  # windows, one is weighed for gains, delays and loads
 
     @property
     def digest(self) -> str:
@@ -66,9 +67,9 @@ class Engine:
         return estimates, {"estimate": times.estimate, "refine": times.refine}
 
     def _weighed(self, start: int) -> bool:
-        """Whether a window's evidence on gains and delays is computed: one of four, whoever brings it and when."""
+        """Whether a window's evidence on gains and delays is computed: one of `weighed_of`."""
         number = start // round(self.tracker.settings.hop * 1e9)
-        return bool(number * _SCATTERED % 2**32 < 2**32 // WEIGHED_OF)
+        return bool(number * _SCATTERED % 2**32 < 2**32 // self.weighed_of)
 
     def load_state(self, data: dict[str, Any]) -> TrackerState:
         """A stored tracker state; one of an older format starts anew rather than stopping the service."""

@@ -12,7 +12,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -21,9 +21,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.replay.beside import Beside
 from sprung.service.compute import Priority
+from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.feed import OnTally
-from sprung.service.pipeline import Pipeline
 from sprung.service.reading import windower_of
 
 log = logging.getLogger("sprung.live")
@@ -52,6 +52,19 @@ class Source(Protocol):
         """Samples in the order in which they come."""
 
 
+class TakesWindows(Protocol):
+    """Where windows go: a pipeline, or what an edge has in its place."""
+
+    @property
+    def engine(self) -> Engine:
+        """The model that they are cut for."""
+
+    def process(
+        self, vehicle: str, windows: Sequence[Window], recording_id: str | None = None, priority: Priority = ...
+    ) -> object:
+        """Take windows in order of time; they are safe when this returns."""
+
+
 @dataclass(frozen=True, slots=True)
 class FeedStatus:
     """How a feed does."""
@@ -77,7 +90,7 @@ class LiveFeed:
     """Feeds one source.  `start` it once; it ends when `stopping` is set and what was received is stored."""
 
     def __init__(
-        self, pipeline: Pipeline, source: Source, vehicle: str, stopping: threading.Event, on_tally: OnTally
+        self, pipeline: TakesWindows, source: Source, vehicle: str, stopping: threading.Event, on_tally: OnTally
     ) -> None:
         self.source = source
         self.vehicle = vehicle

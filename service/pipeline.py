@@ -18,7 +18,7 @@ from sprung.service.engine import Engine
 from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.partitions import prepare
-from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows, latest_window
 from sprung.service.times import now_ns
 from sprung.service.views import vehicle_view
 
@@ -90,8 +90,12 @@ class Pipeline:
         vehicles_in_memory: int = FORGET_BEYOND,
         clock: Callable[[], int] = now_ns,
         on_alarms: OnAlarms = lambda connection, vehicle, changes: None,
+        staging: str | None = None,
     ) -> None:
-        """on_alarms: told of alarms that open, change or close, inside the transaction that stores them."""
+        """on_alarms: told of alarms that open, change or close, inside the transaction that stores them.
+
+        staging: digest under which everything is kept unseen (`service.store.staging`).
+        """
         self.engine = engine
         self.store = store
         self._compute = compute
@@ -99,11 +103,12 @@ class Pipeline:
         self._limit = vehicles_in_memory
         self._clock = clock
         self._on_alarms = on_alarms
+        self._shown = staging is None
         self._vehicles: OrderedDict[str, _Vehicle] = OrderedDict()
         self._lock = threading.Lock()
         with store.write() as connection:
             self.model_id = fleet.ensure_model(
-                connection, engine.digest, engine.system.name, engine.description(), clock()
+                connection, staging or engine.digest, engine.system.name, engine.description(), clock()
             )
 
     def process(
@@ -194,7 +199,7 @@ class Pipeline:
         """
         now = self._clock()
         started = time.perf_counter()
-        fleet.ensure_vehicle(connection, vehicle, now)
+        fleet.ensure_vehicle(connection, vehicle, now, listed=self._shown)
         fleet.hold_vehicle(connection, vehicle)
         at = self._current(connection, vehicle)
         # another process may have stored some of them while this one was identifying
@@ -302,6 +307,16 @@ class Pipeline:
                 self._save_status(connection, vehicle, at, self._clock(), [])
         return len(missing)
 
+    def show(self, connection: Connection, vehicle: str) -> None:
+        """Make the vehicle's line in the fleet's list anew from what is stored; hold the vehicle before."""
+        now, at = self._clock(), self._current(connection, vehicle)
+        fleet.ensure_vehicle(connection, vehicle, now)
+        view = vehicle_view(self.engine, vehicle, at.state, latest_window(connection, vehicle, self.model_id))
+        status.forget_counts(connection, vehicle)
+        counts = status.count_windows(connection, vehicle, self.model_id)
+        found = view.status(self.engine.system.elements)
+        status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
+
     def _save_status(
         self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]
     ) -> None:
@@ -324,6 +339,8 @@ class Pipeline:
         row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
         fleet.save_tracker(connection, vehicle, self.model_id, row, now)
         changes = fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+        if not self._shown:
+            return
         if changes:
             self._on_alarms(connection, vehicle, changes)
         self._save_status(connection, vehicle, at, now, new)

@@ -43,7 +43,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[postgres_tests.Server]:
+def postgres() -> Iterator[postgres_tests.PostgresServer]:
     """A PostgreSQL server of this run's own."""
     if reason := postgres_tests.missing():
         pytest.skip(reason)

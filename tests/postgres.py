@@ -44,7 +44,7 @@ def missing() -> str:
 
 
 @dataclass
-class Server:
+class PostgresServer:
     """A cluster in a folder; `start` and `kill` as often as a test likes."""
 
     folder: Path
@@ -102,13 +102,13 @@ class Server:
 
 
 @contextmanager
-def server(durable: bool = False) -> Iterator[Server]:
+def server(durable: bool = False) -> Iterator[PostgresServer]:
     """A running server; it is gone afterwards."""
     with tempfile.TemporaryDirectory(prefix="sprung-pg-", dir="/tmp") as name:
         folder = Path(name)
         if os.geteuid() == 0:
             shutil.chown(folder, user=_user())
-        found = Server(folder, _free_port(), durable)
+        found = PostgresServer(folder, _free_port(), durable)
         found.initdb()
         found.start()
         try:

@@ -11,14 +11,14 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
 from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem
-from sprung.service.api.scopes import ESTIMATES
 from sprung.service.fleet.ingest import OtherModel, read_messages
+from sprung.service.fleet.message import MEDIA_TYPE
 
 router = APIRouter(tags=["identify"])
 BODY = {
     "requestBody": {
         "required": True,
-        "content": {ESTIMATES: {"schema": {"type": "string", "format": "binary"}}},
+        "content": {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
     }
 }
 _ID: TypeAdapter[str] = TypeAdapter(VehicleId)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
+from sprung.service.fleet.message import MEDIA_TYPE
+
 PUBLIC = ""
 
 
@@ -17,7 +19,6 @@ class Need:
     body: tuple[str, ...] = ("application/json",)  # types of body that it takes
 
 
-ESTIMATES = "application/vnd.sprung.estimates"  # `service.fleet.message`
 FORM = ("multipart/form-data",)
 NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/health/live"): Need(PUBLIC),
@@ -29,7 +30,8 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/docs"): Need("read", by_fleet=True),
     ("GET", "/openapi.json"): Need("read", by_fleet=True),
     ("POST", "/identify"): Need("ingest", by_fleet=True),
-    ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(ESTIMATES,)),
+    ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(MEDIA_TYPE,)),
+    ("POST", "/ingest/windows"): Need("ingest", by_fleet=True),
     ("POST", "/recordings"): Need("ingest", by_fleet=True, body=FORM),
     ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", *FORM)),
     ("GET", "/jobs/{id}"): Need("read", by_fleet=True),

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from sprung import __version__
+from sprung.service.cli import fleet_commands
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.threads import hand_over_often, one_thread_each
 
@@ -393,6 +394,8 @@ def restore(
     return run(source, data_dir, store)
 
 
+app.command()(fleet_commands.edge)
+app.add_typer(fleet_commands.fleet, name="fleet")
 token = PlainTyper(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
 app.add_typer(token, name="token")
 

@@ -72,7 +72,7 @@ class Ingest:
         for i, message in enumerate(messages):
             by_vehicle.setdefault(message.vehicle, []).append(i)
         taken: dict[int, Taken] = {}
-        folded = []
+        folded: list[Folded] = []
         with self._pipeline.store.write() as connection:
             for vehicle in sorted(by_vehicle):  # in the order of their ids: nobody waits in a circle
                 for i in by_vehicle[vehicle]:

@@ -32,6 +32,7 @@ from sprung.service.fleet.coding import (
     unpack_spd,
 )
 
+MEDIA_TYPE = "application/vnd.sprung.estimates"
 FORMAT = 1
 MOST_BYTES = 50_000_000  # of a message when it is unpacked: a small one may not grow beyond
 MOST_WINDOWS = 2000  # of one message
@@ -129,7 +130,9 @@ def _estimates(found: Sequence[Estimate], coding: Coding) -> dict[str, Any]:
         "scalars": pack_floats(scalars) if coding == "exact" else pack_ints(log_steps(scalars)),
         "sensors": pack_floats(sensors) if coding == "exact" else pack_ints(log_steps(sensors)),
         "flags": pack_ints(np.array(flags, dtype=np.int64)),
-        "faults": {i: [[f.channel, f.kind, f.value, f.std] for f in e.faults] for i, e in enumerate(found) if e.faults},
+        "faults": [
+            [i, [[f.channel, f.kind, f.value, f.std] for f in e.faults]] for i, e in enumerate(found) if e.faults
+        ],
         "deviating": _deviating(deviating, coding) if deviating else None,
     }
 
@@ -151,7 +154,7 @@ def _read_estimates(data: dict[str, Any], coding: Coding) -> list[Estimate]:
     deviating = _read_deviating(data["deviating"], coding) if data["deviating"] is not None else {}
     faults = {
         int(i): tuple(MeasurementFault(str(c), k, float(v), float(s)) for c, k, v, s in some)
-        for i, some in data["faults"].items()
+        for i, some in data["faults"]
     }
     return [
         Estimate(

@@ -6,11 +6,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from sqlalchemy import Connection, and_, func, or_, select, update
+from sqlalchemy import Connection, Select, and_, func, or_, select, update
 
 from sprung.model.tracking.tracker import Alarm
 from sprung.service.store.engine import insert_or_ignore, upsert
-from sprung.service.store.schema import alarms, fleet_status, models, tracker_states, vehicles
+from sprung.service.store.schema import STAGING, alarms, fleet_status, models, tracker_states, vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,15 +51,21 @@ class AlarmChange:
     before: str | None  # severity as it was
 
 
-def ensure_vehicle(connection: Connection, vehicle: str, now: int) -> None:
+def ensure_vehicle(connection: Connection, vehicle: str, now: int, listed: bool = True) -> None:
     """Make the vehicle known, and list it, though nothing was identified of it yet."""
     insert_or_ignore(connection, vehicles, [{"id": vehicle, "created_ns": now}])
-    model = connection.execute(select(func.max(models.c.id))).scalar()
+    shown = models.c.id.not_in(staging_models())
+    model = connection.execute(select(func.max(models.c.id)).where(shown)).scalar() if listed else None
     if model is not None:
         counted = ("used", "repaired", "dropped", "uninformative", "unfitting")
         numbers = ("revision", "urgency", "alarms", "warnings", "unacknowledged", "earlier", "learned", *counted)
         blank = {"vehicle_id": vehicle, "model_id": model, "health": "ok", "elements": "", "received_ns": now}
         insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
+
+
+def staging_models() -> Select[tuple[int]]:
+    """Models whose history is not shown yet."""
+    return select(models.c.id).where(models.c.digest.startswith(STAGING))
 
 
 def hold_vehicle(connection: Connection, vehicle: str) -> None:
@@ -203,6 +209,7 @@ def list_alarms(
     more = ("report_id", "id", "vehicle_id", "acknowledged_ns", "acknowledged_by")
     query = (
         select(*(table.c[name] for name in (*names, *more)))
+        .where(table.c.model_id.not_in(staging_models()))
         .order_by(table.c.opened_ns.desc(), table.c.id.desc())
         .limit(limit)
     )

@@ -11,7 +11,8 @@ from typing import Any, Literal
 from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
 
 from sprung.service.store.engine import upsert
-from sprung.service.store.schema import alarms, fleet_status, tracker_states, vehicles, window_reasons
+from sprung.service.store.fleet import staging_models
+from sprung.service.store.schema import alarms, fleet_status, tracker_states, vehicles, window_reasons, windows
 
 HEALTHS = ("ok", "maintenance_required", "out_of_specification", "check_function", "failure")  # NE 107, worse last
 COUNTED = ("used", "repaired", "dropped", "uninformative", "unfitting")
@@ -151,6 +152,49 @@ def add_reasons(connection: Connection, vehicle: str, model_id: int, found: Iter
     upsert(connection, table, rows, key=("vehicle_id", "model_id", "outcome", "reason"))
 
 
+def count_reasons(connection: Connection, vehicle: str, model_id: int, further: Sequence[Any]) -> None:
+    """Count why windows are as they are anew; `further` are rows whose kinds cannot be told from the windows."""
+    table, mine = window_reasons, (windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    counted = select(windows.c.outcome, windows.c.reason, func.count(), func.max(windows.c.start_ns))
+    counted = counted.where(*mine, windows.c.reason.is_not(None)).group_by(windows.c.outcome, windows.c.reason)
+    found: dict[tuple[str, str], list[int]] = {}
+    for outcome, reason, count, last in connection.execute(counted):
+        entry = found.setdefault((outcome, without_numbers(reason)), [0, 0])
+        entry[0], entry[1] = entry[0] + count, max(entry[1], last)
+    for row in further:
+        if row.outcome == "unfitting":
+            found[row.outcome, row.reason] = [row.windows, row.last_ns]
+    most = sorted(found.items(), key=lambda item: -item[1][0])[:MOST_REASONS]
+    rows = [
+        {"vehicle_id": vehicle, "model_id": model_id, "outcome": key[0], "reason": key[1]}
+        | {"windows": count, "last_ns": last}
+        for key, (count, last) in most
+    ]
+    upsert(connection, table, rows, key=("vehicle_id", "model_id", "outcome", "reason"))
+
+
+def count_windows(connection: Connection, vehicle: str, model_id: int) -> Counter[str]:
+    """Windows of a vehicle by what became of them."""
+    mine = (windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    query = select(windows.c.outcome, func.count()).where(*mine).group_by(windows.c.outcome)
+    counts = Counter({outcome: count for outcome, count in connection.execute(query)})
+    misfits = select(func.count()).where(*mine, windows.c.adequate.is_(False), windows.c.outcome != "uninformative")
+    counts["unfitting"] = connection.execute(misfits).scalar_one()
+    return counts
+
+
+def fleet_model(connection: Connection, vehicle: str) -> int | None:
+    """The model under which a vehicle is listed with something that was identified; None before."""
+    query = select(fleet_status.c.model_id).where(fleet_status.c.vehicle_id == vehicle, fleet_status.c.revision > 0)
+    return connection.execute(query).scalar()
+
+
+def forget_counts(connection: Connection, vehicle: str) -> None:
+    """Set the windows of a vehicle's row to 0: they are counted anew."""
+    table = fleet_status
+    connection.execute(table.update().where(table.c.vehicle_id == vehicle).values(**dict.fromkeys(COUNTED, 0)))
+
+
 def reasons_of(connection: Connection, vehicle: str, model_id: int) -> list[Reason]:
     """Why windows were dropped, repaired or did not fit; the most frequent first."""
     table = window_reasons
@@ -207,12 +251,19 @@ def alarmed_vehicles(connection: Connection) -> list[str]:
 
 
 def outdated(connection: Connection, model_id: int) -> list[str]:
-    """Vehicles whose row is older than their tracker (a store of an earlier version, or restored in part)."""
+    """Vehicles whose row is older than their tracker (a store of an earlier version, restored in part, or of a model
+    that was in use before)."""
     query = (
         select(tracker_states.c.vehicle_id)
         .join(fleet_status, fleet_status.c.vehicle_id == tracker_states.c.vehicle_id, isouter=True)
         .where(tracker_states.c.model_id == model_id)
-        .where(or_(fleet_status.c.revision.is_(None), fleet_status.c.revision == 0))
+        .where(
+            or_(
+                fleet_status.c.revision.is_(None),
+                fleet_status.c.revision == 0,
+                fleet_status.c.model_id != model_id,  # of the model before
+            )
+        )
     )
     return list(connection.execute(query).scalars())
 
@@ -274,13 +325,17 @@ def _fleet_row(row: Any) -> FleetRow:
 
 def _open_of_other_models(connection: Connection, vehicle: str, model_id: int) -> int:
     query = select(func.count()).where(
-        alarms.c.vehicle_id == vehicle, alarms.c.model_id != model_id, alarms.c.closed_ns.is_(None)
+        alarms.c.vehicle_id == vehicle,
+        alarms.c.model_id != model_id,
+        alarms.c.closed_ns.is_(None),
+        alarms.c.model_id.not_in(staging_models()),
     )
     return int(connection.execute(query).scalar_one())
 
 
 def _urgency(connection: Connection, vehicle: str, health: str) -> dict[str, int]:
-    open_ = (alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None))
+    shown = alarms.c.model_id.not_in(staging_models())
+    open_ = (alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None), shown)
     unseen = func.count().filter(alarms.c.acknowledged_ns.is_(None))
     total, unacknowledged = connection.execute(select(func.count(), unseen).where(*open_)).one()
     rank = HEALTHS.index(health) if health in HEALTHS else 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -97,6 +97,22 @@ def known_windows(
         for row in connection.execute(query.where(windows.c.start_ns.in_(part))):
             found[row.start_ns] = _record(row)
     return found
+
+
+def windows_between(
+    connection: Connection, vehicle: str, model_id: int, since: int, until: int, together: int
+) -> Iterator[list[WindowRecord]]:
+    """Windows with since <= start < until in order of time, some at once."""
+    query = (
+        select(windows)
+        .where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+        .where(windows.c.start_ns < until)
+        .order_by(windows.c.start_ns)
+        .limit(together)
+    )
+    while records := [_record(row) for row in connection.execute(query.where(windows.c.start_ns >= since))]:
+        yield records
+        since = records[-1].start + 1
 
 
 def latest_window(connection: Connection, vehicle: str, model_id: int) -> WindowRecord | None:

@@ -19,7 +19,7 @@ from sprung.service.store import Store, fleet, history, open_store, partitions, 
 from sprung.service.store.schema import metadata, windows
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
-from tests.postgres import Server
+from tests.postgres import PostgresServer
 
 P, S = 3, 2
 START = 1_790_000_000 * NANOSECONDS
@@ -161,15 +161,6 @@ def test_hours_are_told_from_hourly_rollups(any_store: Store) -> None:
     assert chosen >= 47 * 3600 / 10
 
 
-<<<<<<< HEAD:tests/service/test_store.py
-def test_forgetting_counts_from_when_a_window_was_stored(store: Store) -> None:
-    late = START + 100 * HOP
-    fill(store, [record(0)], stored_ns=START)
-    fill(store, [record(1)], stored_ns=late)
-    with store.write() as connection:
-        forgotten = retention.forget(connection, retention.RetentionLimits(late, 0, 0))
-    assert forgotten.windows == 1
-=======
 def test_forgetting_counts_from_when_a_window_was_stored(any_store: Store) -> None:
     """Windows of one month, one stored at once and one long after, and of two months later."""
     later, day = START + 200 * DAY, DAY // HOP
@@ -202,10 +193,9 @@ def test_the_oldest_windows_make_room(any_store: Store) -> None:
     assert left == 301 - forgotten.windows_for_room
 
 
-def test_months_are_partitions_made_when_they_are_needed(postgres: Server) -> None:
+def test_months_are_partitions_made_when_they_are_needed(postgres: PostgresServer) -> None:
     store = open_store(postgres.database())
     fill(store, [record(0), record(61 * DAY // HOP)])
->>>>>>> a598836 (Store on PostgreSQL: the same tables and migrations, windows by month, COPY, retention by dropping months, Parquet archive; estimates from elsewhere are folded in order, once):tests/test_store.py
     with store.read() as connection:
         found = partitions.months(connection)
     assert [month.name for month in found] == ["windows_2026_09", "windows_2026_11"]

@@ -1,0 +1,112 @@
+"""The door of the fleet variant: estimates and windows in, handed to whoever identifies and folds.
+
+It is the same guard, the same bodies and the same answers as in the single process; behind it is anything that
+implements `Behind`, such as Ray Serve (`service.fleet.ray_serving`).
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from fastapi import FastAPI, Request
+from fastapi.concurrency import run_in_threadpool
+from fastapi.responses import Response
+from pydantic import TypeAdapter, ValidationError
+from sqlalchemy.exc import SQLAlchemyError
+
+from sprung import __version__
+from sprung.model.signals import FloatArray
+from sprung.service.api import models, problems
+from sprung.service.api.access import ActorOf, json_response, own_vehicle
+from sprung.service.api.bodies import VehicleId, read_window, start_of
+from sprung.service.api.guard import Guard
+from sprung.service.api.limits import BodyLimit
+from sprung.service.api.problems import ApiProblem
+from sprung.service.engine import Engine
+from sprung.service.errors import Busy
+from sprung.service.fleet.ingest import OtherModel, Taken, read_messages
+from sprung.service.settings import Settings
+from sprung.service.store import Store
+from sprung.service.times import now_ns
+from sprung.service.tokens import Tokens
+
+_ID: TypeAdapter[str] = TypeAdapter(VehicleId)
+
+
+class Behind(Protocol):
+    """Who does the work.  Raises Busy when too much waits."""
+
+    async def fold(self, body: bytes) -> Taken:
+        """Fold a message of estimates; it is stored when this returns."""
+
+    async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
+        """Identify a window, values (T, C), and fold what it tells."""
+
+
+def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind) -> FastAPI:
+    """`POST /ingest/estimates`, `POST /ingest/windows` and the health of a replica."""
+    app = FastAPI(title="Sprung ingest", version=__version__, docs_url=None, redoc_url=None)
+    problems.install(app)
+
+    @app.post("/ingest/estimates", response_model=models.IngestAnswer)
+    async def estimates(request: Request, actor: ActorOf) -> Response:
+        """One message of an edge."""
+        body = await request.body()
+        message = (await run_in_threadpool(read_messages, [body]))[0]
+        _check_id(message.vehicle)
+        own_vehicle(actor, message.vehicle)
+        try:
+            return _answer(await behind.fold(body))
+        except OtherModel as error:
+            raise ApiProblem(409, str(error)) from error
+        except Busy as error:
+            raise _too_many(error) from error
+
+    @app.post("/ingest/windows", response_model=models.IngestAnswer)
+    async def windows(request: Request, actor: ActorOf) -> Response:
+        """One window, as `POST /identify` takes it, with vehicle and start."""
+        head, values = await run_in_threadpool(read_window, await request.body(), engine)
+        start = start_of(head, now_ns())
+        if head.vehicle is None or start is None:
+            raise ApiProblem(422, "vehicle and start are needed")
+        own_vehicle(actor, head.vehicle)
+        try:
+            return _answer(await behind.identify_and_fold(head.vehicle, start, values))
+        except Busy as error:
+            raise _too_many(error) from error
+
+    @app.get("/health/live")
+    async def live() -> Response:
+        """The replica answers."""
+        return json_response({"status": "ok"})
+
+    @app.get("/health/ready")
+    async def ready() -> Response:
+        """The store can be written."""
+        try:
+            await run_in_threadpool(store.probe)
+        except (SQLAlchemyError, OSError, TimeoutError) as error:
+            raise ApiProblem(503, "the store does not take anything at the moment") from error
+        return json_response({"status": "ok"})
+
+    app.add_middleware(BodyLimit, limit=settings.max_body_bytes, paths={})
+    secret = None if settings.admin_token is None else settings.admin_token.get_secret_value()
+    app.add_middleware(Guard, settings=settings, tokens=Tokens(store, secret))
+    return app
+
+
+def _check_id(vehicle: str) -> None:
+    try:
+        _ID.validate_python(vehicle)
+    except ValidationError:
+        raise ApiProblem(422, "vehicle: letters, digits and . _ : - only, at most 128") from None
+
+
+def _answer(taken: Taken) -> Response:
+    return json_response(
+        {"vehicle": taken.vehicle, "folded": taken.folded, "waiting": taken.waiting, "known": taken.known}
+    )
+
+
+def _too_many(error: Busy) -> ApiProblem:
+    return ApiProblem(429, str(error), headers={"Retry-After": str(error.retry_after)})

@@ -1,0 +1,133 @@
+"""`sprung edge`."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import sys
+import threading
+import time
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from sprung.replay import UnreadableRecording
+from sprung.replay.bus import parse_bus
+from sprung.replay.live import LiveBus
+from sprung.service.cli.replay import readable
+from sprung.service.engine import Engine, load_engine
+from sprung.service.errors import UserError
+from sprung.service.feed import vehicle_of
+from sprung.service.fleet.onboard import Onboard, OnboardSettings
+from sprung.service.fleet.sending import HttpLink, Sending
+from sprung.service.fleet.spool import Spool
+from sprung.service.live import LiveFeed
+from sprung.service.logs import set_up
+from sprung.service.reading import Here, ReadRequest
+from sprung.service.settings import Settings, settings_with
+
+log = logging.getLogger("sprung.edge")
+LAST_SECONDS = 20.0  # to send what is left when it stops
+
+
+def run(
+    options: dict[str, Any],
+    files: list[Path],
+    bus: str | None,
+    server: str,
+    token: str | None,
+    vehicle: str | None,
+    spool_file: Path | None,
+    spool_bytes: int,
+    speed: float,
+    rates: OnboardSettings,
+    json_lines: bool,
+) -> int:
+    """Identify on board and send, until the files end or somebody stops it."""
+    if bool(files) == (bus is not None):
+        raise UserError("give recordings or --can, one of both")
+    for path in files:
+        readable(path)
+    settings = settings_with(options)
+    set_up(settings.log_format, settings.log_level)
+    engine = load_engine(settings)
+    name = vehicle_of(vehicle, None, files[0].name if files else (bus or ""))
+    started, cpu = time.perf_counter(), time.process_time()
+    with ExitStack() as stack:
+        spool = Spool(spool_file or settings.data_dir / "edge.db", spool_bytes)
+        stack.callback(spool.close)
+        link = HttpLink(server, token, name)
+        stack.callback(link.close)
+        sending = Sending(spool, link)
+        onboard = Onboard(engine, name, spool, rates)
+        sending.start()
+        if files:
+            _from_files(onboard, engine, files, name, speed, sending)
+        else:
+            _from_bus(onboard, engine, bus or "", name, settings)
+        onboard.flush()
+        empty = sending.close(LAST_SECONDS)
+    seconds = onboard.counts.windows * engine.system.hop / engine.system.sample_rate
+    told = {
+        "vehicle": name,
+        "windows": onboard.counts.windows,
+        "alarms": onboard.counts.alarms,
+        "messages": onboard.counts.messages,
+        "sent": sending.sent,
+        "refused": sending.refused,
+        "given_up": onboard.counts.made_room,
+        "waiting": spool_left(sending, empty),
+        "estimate_bytes_per_second": round(onboard.counts.message_bytes / seconds, 1) if seconds else None,
+        "raw_bytes": onboard.counts.raw_bytes,
+        "cpu_share": round((time.process_time() - cpu) / seconds, 4) if seconds else None,
+        "wall_seconds": round(time.perf_counter() - started, 1),
+    }
+    print(json.dumps({"edge": told}) if json_lines else _line(told), flush=True)
+    return 0 if empty and not sending.refused and not onboard.counts.made_room else 1
+
+
+def spool_left(sending: Sending, empty: bool) -> str:
+    """Why something waits still; empty where nothing does."""
+    return "" if empty else sending.trouble or "the server takes its time"
+
+
+def _line(told: dict[str, Any]) -> str:
+    left = f"; some wait in the spool: {told['waiting']}" if told["waiting"] else ""
+    return (
+        f"{told['vehicle']}: {told['windows']} windows, {told['sent']} of {told['messages']} messages sent, "
+        f"{told['estimate_bytes_per_second'] or 0:.0f} B/s of estimates, "
+        f"{told['raw_bytes'] / 1e3:.0f} kB of raw samples, {100 * (told['cpu_share'] or 0):.1f} % of a core{left}"
+    )
+
+
+def _from_files(onboard: Onboard, engine: Engine, files: list[Path], name: str, speed: float, sending: Sending) -> None:
+    for path in files:
+        reading = Here(ReadRequest(path, engine.system, engine.dbc, 32, speed))
+        for piece in reading.pieces(lambda: None):
+            onboard.process(name, piece.windows)
+            sending.wake()
+        for problem in reading.ending.problems:
+            print(f"sprung: {path}: {problem}", file=sys.stderr)
+
+
+def _from_bus(onboard: Onboard, engine: Engine, bus: str, name: str, settings: Settings) -> None:
+    """Follow a bus until SIGINT or SIGTERM."""
+    if engine.dbc is None:
+        raise UserError(f"--can {bus}: a CAN bus needs a CAN database; name it with --dbc")
+    try:
+        address = parse_bus(bus)
+        stopping = threading.Event()
+        source = LiveBus(
+            address.interface, address.channel, engine.system.channels, engine.dbc, stop=stopping, **address.options
+        )
+    except UnreadableRecording as error:
+        raise UserError(f"--can: {error}") from None
+    feed = LiveFeed(onboard, source, name, stopping, lambda tally: None)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
+    feed.start()
+    print(f"sprung edge: {name} on {bus}; Ctrl-C stops", flush=True)
+    while not stopping.wait(1.0):
+        pass
+    feed.join(settings.shutdown_seconds)

@@ -1,0 +1,124 @@
+"""`sprung edge` and `sprung fleet ...`: their options; each imports what it needs when it runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sprung.service.threads import one_thread_each
+
+System = Annotated[
+    Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
+]
+Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE", help="CAN database; default: the bundled system's.")]
+Weights = Annotated[
+    Path | None,
+    typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),
+]
+StoreUrl = Annotated[
+    str | None,
+    typer.Option("--store", metavar="URL", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
+]
+Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
+Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
+On = Annotated[str, typer.Option("--on", help="here, ray, or auto: Ray where it is installed.")]
+Workers = Annotated[
+    int | None, typer.Option("--workers", min=1, help="Cores of a Ray that is started for this; default: all.")
+]
+
+fleet = typer.Typer(help="Many vehicles, many recordings, many machines.", no_args_is_help=True)
+
+
+def edge(
+    server: Annotated[str, typer.Option("--server", metavar="URL", help="Where estimates go.")],
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings, instead of a bus.", metavar="[FILE...]")
+    ] = None,
+    can: Annotated[str | None, typer.Option("--can", metavar="INTERFACE:CHANNEL", help="The bus to follow.")] = None,
+    token: Annotated[
+        str | None, typer.Option("--token", envvar="SPRUNG_TOKEN", help="With scope ingest; better in SPRUNG_TOKEN.")
+    ] = None,
+    vehicle: Annotated[
+        str | None, typer.Option("--vehicle", metavar="NAME", help="What this vehicle is called.")
+    ] = None,
+    spool: Annotated[
+        Path | None, typer.Option("--spool", metavar="FILE", help="What waits to be sent; default: in the data folder.")
+    ] = None,
+    spool_bytes: Annotated[
+        int, typer.Option("--spool-bytes", min=1_000_000, help="Beyond, the oldest is given up.")
+    ] = 200_000_000,
+    message_seconds: Annotated[
+        float, typer.Option("--message-seconds", min=1, help="Of windows in one message.")
+    ] = 60.0,
+    weigh_seconds: Annotated[
+        float, typer.Option("--weigh-seconds", min=1, help="Between windows that tell of gains, delays and loads.")
+    ] = 30.0,
+    raw_seconds: Annotated[
+        float, typer.Option("--raw-seconds", min=0, help="Of raw samples around an alarm; 0: none.")
+    ] = 60.0,
+    speed: Annotated[
+        float, typer.Option("--speed", metavar="FACTOR", min=0, help="Of recordings, times real time; 0: no pause.")
+    ] = 0.0,
+    system: System = None,
+    dbc: Dbc = None,
+    weights: Weights = None,
+    json_lines: Json = False,
+) -> int:
+    """On board: identify, send estimates, keep what cannot be sent.
+
+    Estimates with covariance go to a service's POST /ingest/estimates, raw samples around alarms to POST /recordings.
+    """
+    one_thread_each()
+    from sprung.service.cli.edge import run
+    from sprung.service.fleet.onboard import OnboardSettings
+
+    rates = OnboardSettings(message_seconds=message_seconds, weigh_seconds=weigh_seconds, raw_seconds=raw_seconds)
+    options: dict[str, Any] = {"system": system, "dbc": dbc, "weights": weights}
+    return run(options, files or [], can, server, token, vehicle, spool, spool_bytes, speed, rates, json_lines)
+
+
+@fleet.command("backfill")
+def backfill(
+    place: Place,
+    since: Annotated[
+        str | None, typer.Option("--since", metavar="TIME", help="RFC 3339; windows before are left.")
+    ] = None,
+    until: Annotated[
+        str | None, typer.Option("--until", metavar="TIME", help="RFC 3339; windows from then are.")
+    ] = None,
+    on: On = "auto",
+    workers: Workers = None,
+    store: StoreUrl = None,
+    system: System = None,
+    dbc: Dbc = None,
+    weights: Weights = None,
+    json_lines: Json = False,
+) -> int:
+    """Make the history of many recordings anew, in parallel, and put it in the place of what was there.
+
+    Started again it goes on where it stopped.  Files that cannot be read are told at the end.
+    """
+    one_thread_each()
+    from sprung.service.cli.fleet import run_backfill
+
+    options: dict[str, Any] = {"system": system, "dbc": dbc, "weights": weights, "store": store}
+    return run_backfill(options, place, since, until, on, workers, json_lines)
+
+
+@fleet.command("diagnose")
+def diagnose(
+    place: Place,
+    out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="A folder of its own for every report.")],
+    on: On = "auto",
+    workers: Workers = None,
+    system: System = None,
+    dbc: Dbc = None,
+    json_lines: Json = False,
+) -> int:
+    """Diagnose many recordings, in parallel; exit status 1 when one is not consistent or cannot be read."""
+    one_thread_each()
+    from sprung.service.cli.fleet import run_diagnose
+
+    return run_diagnose({"system": system, "dbc": dbc}, place, out, on, workers, json_lines)

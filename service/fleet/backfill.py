@@ -1,0 +1,366 @@
+"""Back-fill: recordings -> windows -> estimates, in any order and anywhere; then every vehicle's fold in order of time.
+
+A file's estimates are a pure function of the file, and a vehicle's fold of one file depends on the fold of the file
+before it: that is all that is said to whoever does the work (`service.fleet.tasks`).  What is made lies under a model
+of its own (`staging:...`), unseen, until `swap` puts it in place vehicle by vehicle.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
+from functools import cache
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sprung.model.signals import Window
+from sprung.replay import open_recording
+from sprung.service.compute import Compute
+from sprung.service.engine import Engine, load_engine
+from sprung.service.errors import UserError
+from sprung.service.feed import vehicle_of
+from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
+from sprung.service.fleet.tasks import Tasks
+from sprung.service.pipeline import Pipeline
+from sprung.service.reading import Apart, ReadRequest
+from sprung.service.settings import Settings
+from sprung.service.store import Store, fleet, open_store, status, work
+from sprung.service.store.partitions import prepare
+from sprung.service.store.staging import staging_digest, swap
+from sprung.service.store.work import RecordingRow
+from sprung.service.times import now_ns
+from sprung.service.worker import ProcessLimits
+
+TOGETHER = 64  # windows that are identified, and folded, together
+KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
+AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk
+
+
+@dataclass(frozen=True, slots=True)
+class BackfillPlan:
+    """What every piece of the work needs to know; travels with it."""
+
+    settings: Settings
+    place: str  # folder, or an address such as s3://bucket/folder
+    since: int  # ns; windows before are left out
+    until: int
+
+    @property
+    def name(self) -> str:
+        """Tells this back-fill from others: started again, it goes on where it stopped."""
+        return hashlib.sha256(f"{self.place} {self.since} {self.until}".encode()).hexdigest()[:12]
+
+
+@dataclass(frozen=True, slots=True)
+class FoundFile:
+    """A recording in its place."""
+
+    path: str
+    size: int
+    modified_ns: int
+    vehicle: str = ""
+    first_ns: int = 0  # of its samples
+    problem: str = ""  # why it cannot be read
+
+    @property
+    def id(self) -> str:
+        """The recording's id in the store; another one when the file changes."""
+        return hashlib.sha256(f"{self.path} {self.size} {self.modified_ns}".encode()).hexdigest()[:36]
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifiedFile:
+    """A file's estimates."""
+
+    file: FoundFile
+    messages: tuple[bytes, ...]  # exact ones, of TOGETHER windows each
+    incomplete: bool = False
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FoldedFile:
+    """What became of a file."""
+
+    file: FoundFile
+    windows: int = 0
+    incomplete: bool = False
+    problem: str = ""
+    before: bool = False  # it was done in an earlier run
+
+
+@dataclass(slots=True)
+class Backfilled:
+    """What a back-fill came to."""
+
+    files: int = 0
+    windows: int = 0
+    done_before: int = 0
+    vehicles: list[str] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)  # one line each
+    swapped: int = 0
+
+
+OnFile = Callable[[FoldedFile, int, int], None]  # with how many are done, of how many
+
+
+def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> Backfilled:
+    """Do it all; what cannot be read is collected, everything else goes on."""
+    found = list_files(plan.place)
+    if not found:
+        raise UserError(f"{plan.place}: no recordings ({' '.join(KINDS)})")
+    looked = [tasks.result(one) for one in [tasks.submit(look, plan, file) for file in found]]
+    told = Backfilled(files=len(found))
+    told.problems += [f"{file.path}: {file.problem}" for file in looked if file.problem]
+    files = sorted((f for f in looked if not f.problem), key=lambda f: (f.first_ns, f.vehicle, f.path))
+    with opened_store(plan.settings) as store, store.read() as connection:
+        rows = {file.id: work.get_recording(connection, _row_id(plan, file)) for file in files}
+    last: dict[str, Any] = {}
+    waiting: list[Any] = []
+    done = 0
+
+    def settle(most: int) -> None:
+        nonlocal done
+        while len(waiting) > most:
+            folded = tasks.result(waiting.pop(0))
+            done += 1
+            told.windows += folded.windows
+            if folded.problem:
+                told.problems.append(f"{folded.file.path}: {folded.problem}")
+            on_file(folded, done, len(files))
+
+    for file in files:
+        row = rows[file.id]
+        if row is not None and row.finished_ns is not None:
+            told.done_before += 1
+            done += 1
+            on_file(FoldedFile(file, before=True), done, len(files))
+            continue
+        identified = tasks.submit(identify_file, plan, file)
+        last[file.vehicle] = tasks.submit(fold_file, plan, identified, last.get(file.vehicle))
+        waiting.append(last[file.vehicle])
+        settle(AHEAD * cores)
+    settle(0)
+    told.vehicles = sorted({file.vehicle for file in files})
+    for one in [tasks.submit(swap_vehicle, plan, vehicle) for vehicle in told.vehicles]:
+        told.swapped += tasks.result(one)
+    return told
+
+
+def list_files(place: str) -> list[FoundFile]:
+    """Recordings in a folder and those below it.  Raises UserError for a place that cannot be listed."""
+    if "://" not in place:
+        folder = Path(place)
+        if not folder.is_dir():
+            raise UserError(f"{place}: no such folder")
+        paths = sorted(path for path in folder.rglob("*") if path.suffix.lower() in KINDS and path.is_file())
+        return [FoundFile(str(path), path.stat().st_size, path.stat().st_mtime_ns) for path in paths]
+    try:
+        from pyarrow import fs
+
+        files, root = fs.FileSystem.from_uri(place)
+        infos = files.get_file_info(fs.FileSelector(root, recursive=True))
+    except ModuleNotFoundError as error:
+        raise UserError("addresses need pyarrow: pip install 'sprung[fleet]'") from error
+    except (OSError, ValueError) as error:
+        raise UserError(f"{place}: {str(error).splitlines()[0]}") from error
+    prefix = place[: place.index("://") + 3]
+    return sorted(
+        (
+            FoundFile(f"{prefix}{info.path}", info.size, info.mtime_ns or 0)
+            for info in infos
+            if info.is_file and Path(info.path).suffix.lower() in KINDS
+        ),
+        key=lambda file: file.path,
+    )
+
+
+def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
+    """Whose recording it is and when it began: its head is read, no more."""
+    engine = engine_of(plan.settings)
+    try:
+        with local_copy(file) as path:
+            system = engine.system
+            recording = open_recording(
+                path, system.channels, dbc=engine.dbc, time=system.time, start=file.modified_ns or None
+            )
+            first = None
+            for block in recording.at_rate(system.sample_rate):
+                if len(block.time):
+                    first = int(block.time.min())
+                    break
+        if first is None:
+            return replace(file, problem="no samples of the system's channels")
+        return replace(file, vehicle=vehicle_of(None, recording.vehicle, Path(file.path).name), first_ns=first)
+    except (ValueError, OSError) as error:
+        return replace(file, problem=_line(error))
+
+
+def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
+    """Estimates of a file's windows."""
+    engine = engine_of(plan.settings)
+    messages: list[bytes] = []
+
+    def add(windows: list[Window]) -> None:
+        chosen = [w for w in windows if plan.since <= w.start < plan.until]
+        whole = [w for w in chosen if w.outcome != "dropped"]
+        found: Iterator[Any] = iter(())
+        if whole:
+            estimates, _ = engine.identify(np.stack([w.values for w in whole]), starts=[w.start for w in whole])
+            found = iter(estimates)
+        sent = [
+            WindowEstimate(
+                w.start,
+                w.outcome,
+                w.reason,
+                w.repaired_samples,
+                w.new_segment,
+                None if w.outcome == "dropped" else next(found),
+            )
+            for w in chosen
+        ]
+        if sent:
+            messages.append(encode(Message(file.vehicle, engine.digest, tuple(sent)), "exact"))
+
+    try:
+        with local_copy(file) as path, ExitStack() as stack:
+            request = ReadRequest(path, engine.system, engine.dbc, TOGETHER, start=file.modified_ns or None)
+            reading = Apart(request, ProcessLimits(inf, inf, plan.settings.worker_memory_bytes))
+            stack.callback(reading.close)
+            for piece in reading.pieces(lambda: None):
+                add(piece.windows)
+            ending = reading.ending
+    except (ValueError, OSError) as error:
+        return IdentifiedFile(file, tuple(messages), True, _line(error))
+    problem = "; ".join(ending.problems[:3]) if ending.incomplete else ""
+    return IdentifiedFile(file, tuple(messages), ending.incomplete, problem)
+
+
+def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | None) -> FoldedFile:
+    """Fold a file's estimates into its vehicle's tracker, after those of the file `before`."""
+    count = 0
+    with staging_pipeline(plan) as pipeline:
+        row = RecordingRow(
+            _row_id(plan, found.file),
+            None,
+            Path(found.file.path).name[:255],
+            "backfill",
+            None,
+            found.file.size,
+            None,
+            now_ns(),
+            None,
+        )
+        with pipeline.store.write() as connection:
+            if work.get_recording(connection, row.id) is None:
+                work.add_recording(connection, row)
+        for body in found.messages:
+            message = decode(body)
+            windows = [_bare(w, pipeline.engine) for w in message.windows]
+            prepare(pipeline.store, (w.start for w in windows))
+            with pipeline.store.write() as connection:
+                folded = pipeline.fold(
+                    connection, found.file.vehicle, windows, [w.estimate for w in message.windows], row.id
+                )
+            pipeline.settle(folded)
+            count += len(windows)
+        if not found.problem or found.messages:
+            with pipeline.store.write() as connection:
+                tally = {"windows": count, "incomplete": found.incomplete, "problem": found.problem}
+                vehicle = found.file.vehicle if count else None
+                work.finish_recording(connection, row.id, vehicle, tally, now_ns())
+    return FoldedFile(found.file, count, found.incomplete, found.problem)
+
+
+def swap_vehicle(plan: BackfillPlan, vehicle: str) -> bool:
+    """Put what was made of a vehicle in the place of what was there; whether there was anything."""
+    with staging_pipeline(plan) as made, shown_pipeline(plan, made.store) as shown:
+        with made.store.write() as connection:
+            fleet.hold_vehicle(connection, vehicle)
+            if not swap(connection, vehicle, made.model_id, shown.model_id, now_ns()):
+                return False
+            in_use = status.fleet_model(connection, vehicle)
+            if in_use in (None, shown.model_id):  # else another model is in use: `serve` shows this one when it starts
+                shown.show(connection, vehicle)
+        return True
+
+
+@cache
+def engine_of(settings: Settings) -> Engine:
+    """The engine of a process that does pieces of the work, loaded once."""
+    return load_engine(settings)
+
+
+@contextmanager
+def opened_store(settings: Settings) -> Iterator[Store]:
+    """The store, for a while."""
+    store = open_store(settings.store_url)
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+@contextmanager
+def staging_pipeline(plan: BackfillPlan) -> Iterator[Pipeline]:
+    """A pipeline whose model nobody sees yet."""
+    engine = engine_of(plan.settings)
+    with opened_store(plan.settings) as store, ExitStack() as stack:
+        compute = Compute(1)
+        stack.callback(compute.close)
+        yield Pipeline(engine, store, compute, staging=staging_digest(engine.digest, plan.name))
+
+
+@contextmanager
+def shown_pipeline(plan: BackfillPlan, store: Store) -> Iterator[Pipeline]:
+    """The pipeline of the model itself."""
+    compute = Compute(1)
+    try:
+        yield Pipeline(engine_of(plan.settings), store, compute)
+    finally:
+        compute.close()
+
+
+@contextmanager
+def local_copy(file: FoundFile) -> Iterator[Path]:
+    """A file that readers can open; one from an address is fetched for a while."""
+    if "://" not in file.path:
+        yield Path(file.path)
+        return
+    from pyarrow import fs
+
+    files, inner = fs.FileSystem.from_uri(file.path)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / Path(inner).name
+        with files.open_input_stream(inner) as source, path.open("wb") as copy:
+            shutil.copyfileobj(source, copy)
+        yield path
+
+
+def _row_id(plan: BackfillPlan, file: FoundFile) -> str:
+    """One row a file, back-fill and model."""
+    key = f"{file.id} {plan.name} {engine_of(plan.settings).digest}"
+    return hashlib.sha256(key.encode()).hexdigest()[:36]
+
+
+def _bare(window: WindowEstimate, engine: Engine) -> Window:
+    return Window(
+        window.start,
+        engine.system.sample_rate,
+        np.empty((0, len(engine.system.channels))),
+        window.outcome,
+        window.reason,
+        window.repaired_samples,
+        window.new_segment,
+    )
+
+
+def _line(error: Exception) -> str:
+    return (str(error) or type(error).__name__).splitlines()[0]

@@ -1,0 +1,54 @@
+"""Kafka before the service, through aiokafka (`pip install aiokafka`): the same interface as NATS has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sprung.service.fleet.broker import Delivery
+
+
+class KafkaBroker:
+    """A consumer group.  Offsets are committed up to what is done, partition by partition, never beyond a record that
+    is to come again."""
+
+    def __init__(self, consumer: Any) -> None:
+        """consumer: a started AIOKafkaConsumer with enable_auto_commit=False."""
+        self.consumer = consumer
+        self.again: dict[Any, int] = {}  # by partition: the first record that is to come again
+
+    async def fetch(self, most: int, seconds: float) -> Sequence[Delivery]:
+        """What is there, records that are to come again first."""
+        for place, offset in self.again.items():
+            self.consumer.seek(place, offset)
+        self.again.clear()
+        found = await self.consumer.getmany(timeout_ms=round(1000 * seconds), max_records=most)
+        return [KafkaDelivery(self, place, one) for place, records in found.items() for one in records]
+
+    async def close(self) -> None:
+        """Leave the group."""
+        await self.consumer.stop()
+
+
+class KafkaDelivery:
+    """A record of a partition."""
+
+    def __init__(self, broker: KafkaBroker, place: Any, record: Any) -> None:
+        self._broker = broker
+        self._place = place
+        self._record = record
+
+    @property
+    def body(self) -> bytes:
+        """As it was sent."""
+        return bytes(self._record.value)
+
+    async def done(self) -> None:
+        """Go on behind it, unless a record before it is to come again: then this one comes again, too."""
+        if self._record.offset < self._broker.again.get(self._place, self._record.offset + 1):
+            await self._broker.consumer.commit({self._place: self._record.offset + 1})
+
+    async def again(self) -> None:
+        """Read on from it."""
+        known = self._broker.again.get(self._place, self._record.offset)
+        self._broker.again[self._place] = min(known, self._record.offset)

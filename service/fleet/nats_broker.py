@@ -1,0 +1,141 @@
+"""NATS JetStream before the service: vehicles store and forward into a stream on disk, whoever folds takes from it."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+from collections.abc import Sequence
+from typing import Any
+
+from sprung.service.errors import UserError
+from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, Delivery
+from sprung.service.fleet.sending import Answer
+from sprung.service.fleet.spool import SpoolEntry
+
+SUBJECT = "sprung.estimates"
+STREAM = "SPRUNG"
+DURABLE = "sprung-fold"
+
+
+class NatsDelivery:
+    """A message of a JetStream pull consumer."""
+
+    def __init__(self, message: Any) -> None:
+        self._message = message
+
+    @property
+    def body(self) -> bytes:
+        """As it was sent."""
+        return bytes(self._message.data)
+
+    async def done(self) -> None:
+        """Acknowledge, and wait until the server knows."""
+        await self._message.ack_sync()
+
+    async def again(self) -> None:
+        """Ask for it later."""
+        await self._message.nak(delay=AGAIN_SECONDS)
+
+
+class NatsBroker:
+    """NATS JetStream: a stream on disk, a durable consumer that several processes may share."""
+
+    def __init__(self, connection: Any, subscription: Any) -> None:
+        self._connection = connection
+        self._subscription = subscription
+
+    @classmethod
+    async def open(cls, servers: str, ack_seconds: float = 30.0) -> NatsBroker:
+        """Connect, and make stream and consumer where they are missing.  Raises UserError."""
+        connection = await _connected(servers)
+        from nats.js.api import AckPolicy, ConsumerConfig
+
+        stream = connection.jetstream()
+        await _ensure_stream(stream)
+        config = ConsumerConfig(
+            durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=ack_seconds, max_ack_pending=4 * TOGETHER
+        )
+        subscription = await stream.pull_subscribe(f"{SUBJECT}.>", durable=DURABLE, stream=STREAM, config=config)
+        return cls(connection, subscription)
+
+    async def fetch(self, most: int, seconds: float) -> Sequence[Delivery]:
+        """What is there; none while the server is away: the client connects again by itself."""
+        from nats.errors import Error
+
+        try:
+            return [NatsDelivery(one) for one in await self._subscription.fetch(most, timeout=seconds)]
+        except (Error, TimeoutError):
+            await asyncio.sleep(0.05)
+            return []
+
+    async def close(self) -> None:
+        """Leave."""
+        await self._connection.close()
+
+
+class NatsLink:
+    """An edge's way to NATS instead of HTTP (`--server nats://...`); `Nats-Msg-Id` lets the server drop repetitions."""
+
+    def __init__(self, servers: str, vehicle: str) -> None:
+        self._servers = servers
+        self._subject = f"{SUBJECT}.{vehicle.replace('.', '_')}"
+        self._loop = asyncio.new_event_loop()
+        self._stream: Any = None
+
+    def send(self, entry: SpoolEntry) -> Answer:
+        """Publish and wait until the server has it on disk; raw recordings are for HTTP."""
+        if entry.kind != "estimates":
+            return Answer(False, refused="raw recordings go over HTTP only")
+        try:
+            self._loop.run_until_complete(self._publish(entry.body))
+        except Exception as error:
+            self._stream = None
+            return Answer(False, trouble=f"{type(error).__name__}: {error}")
+        return Answer(True)
+
+    def close(self) -> None:
+        """Leave."""
+        if self._stream is not None:
+            self._loop.run_until_complete(self._connection.close())
+        self._loop.close()
+
+    async def _publish(self, body: bytes) -> None:
+        if self._stream is None:
+            self._connection = await _connected(self._servers)
+            self._stream = self._connection.jetstream()
+            await _ensure_stream(self._stream)
+        headers = {"Nats-Msg-Id": hashlib.sha256(body).hexdigest()}
+        await self._stream.publish(self._subject, body, headers=headers, timeout=10.0)
+
+
+async def _connected(servers: str) -> Any:
+    try:
+        import nats
+        from nats.errors import Error
+    except ModuleNotFoundError as error:
+        raise UserError("NATS needs nats-py: pip install 'sprung[fleet]'") from error
+
+    async def quiet(_error: Exception) -> None:
+        """Reconnecting says it."""
+
+    try:
+        return await nats.connect(servers, max_reconnect_attempts=-1, error_cb=quiet, connect_timeout=5)
+    except (Error, OSError) as error:
+        raise UserError(f"{servers}: no NATS server answers ({type(error).__name__})") from error
+
+
+async def _ensure_stream(stream: Any) -> None:
+    from nats.js.api import StorageType, StreamConfig
+    from nats.js.errors import NotFoundError
+
+    try:
+        await stream.stream_info(STREAM)
+    except NotFoundError:
+        config = StreamConfig(
+            name=STREAM,
+            subjects=[f"{SUBJECT}.>"],
+            storage=StorageType.FILE,
+            duplicate_window=3600.0,
+            max_age=7 * 86_400.0,
+        )
+        await stream.add_stream(config)

@@ -1,0 +1,208 @@
+"""Live windows on Ray Serve: a door, identification batched over vehicles, folding in one transaction a batch.
+
+Three deployments, each with as many replicas as its queue asks for.  None holds anything that the store does not: a
+replica that dies takes only requests with it that nobody was told were stored, and their senders send them again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sprung.model.signals import Estimate, FloatArray
+from sprung.service.compute import Compute
+from sprung.service.engine import load_engine
+from sprung.service.errors import Busy, UserError
+from sprung.service.fleet.ingest import Ingest, Taken, read_messages
+from sprung.service.fleet.message import Message, WindowEstimate
+from sprung.service.fleet.tasks import OBJECT_STORE_BYTES
+from sprung.service.pipeline import Pipeline
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
+from sprung.service.threads import one_thread_each
+
+APPLICATION = "sprung"
+
+
+@dataclass(frozen=True, slots=True)
+class ServingSizes:
+    """How much, at most."""
+
+    replicas: int = 8  # of each of the two that compute
+    cores: float = 1.0  # of a replica that identifies
+    batch_windows: int = 32
+    batch_messages: int = 64
+    batch_wait_seconds: float = 0.02
+    queued: int = 256  # requests of one replica that wait; more are 429
+
+
+class IdentifyReplica:
+    """Windows of any vehicles -> estimates."""
+
+    def __init__(self, settings: Settings, sizes: ServingSizes) -> None:
+        from ray import serve
+
+        one_thread_each()
+        self._engine = load_engine(settings)
+
+        @serve.batch(max_batch_size=sizes.batch_windows, batch_wait_timeout_s=sizes.batch_wait_seconds)
+        async def together(asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
+            return await asyncio.to_thread(self._identify, asked)
+
+        self._together = together
+
+    async def identify(self, start: int, values: FloatArray) -> Estimate:
+        """The estimate of one window, values (T, C)."""
+        found: Estimate = await self._together((start, values))
+        return found
+
+    def _identify(self, asked: Sequence[tuple[int, FloatArray]]) -> list[Estimate]:
+        values = np.stack([values for _, values in asked])
+        return self._engine.identify(values, starts=[start for start, _ in asked])[0]
+
+
+class FoldReplica:
+    """Messages of any vehicles -> trackers and store."""
+
+    def __init__(self, settings: Settings, sizes: ServingSizes) -> None:
+        from ray import serve
+
+        one_thread_each()
+        store = open_store(settings.store_url)
+        pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
+        self._ingest = Ingest(pipeline, settings.late_seconds)
+        self._ingest.start()
+
+        @serve.batch(max_batch_size=sizes.batch_messages, batch_wait_timeout_s=sizes.batch_wait_seconds)
+        async def together(messages: list[Message]) -> list[Taken | UserError]:
+            return await asyncio.to_thread(self._fold, messages)
+
+        self._together = together
+
+    async def fold(self, message: Message | bytes) -> Taken:
+        """What became of a message; it is stored."""
+        if isinstance(message, bytes):
+            message = (await asyncio.to_thread(read_messages, [message]))[0]
+        taken = await self._together(message)
+        if isinstance(taken, UserError):
+            raise taken
+        return taken
+
+    def _fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+        try:
+            return list(self._ingest.take(messages))
+        except UserError as error:  # one of them spoils it for the others
+            return [error] if len(messages) == 1 else [self._fold([one])[0] for one in messages]
+
+
+class RayBehind:
+    """What the door sees of the two."""
+
+    def __init__(self, identify: Any, fold: Any, digest: str) -> None:
+        self._identify = identify
+        self._fold = fold
+        self._digest = digest
+
+    async def fold(self, body: bytes) -> Taken:
+        """Fold a message."""
+        taken: Taken = await _asked(self._fold.fold.remote(body))
+        return taken
+
+    async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
+        """Identify a window and fold it."""
+        estimate = await _asked(self._identify.identify.remote(start, values))
+        window = WindowEstimate(start, "used", None, 0, False, estimate)
+        taken: Taken = await _asked(self._fold.fold.remote(Message(vehicle, self._digest, (window,))))
+        return taken
+
+
+async def _asked(pending: Any) -> Any:
+    from ray.exceptions import RayTaskError
+    from ray.serve.exceptions import BackPressureError
+
+    try:
+        return await pending
+    except BackPressureError:
+        raise Busy("too many requests wait; try again in a second") from None
+    except RayTaskError as error:
+        raise error.as_instanceof_cause() from None
+
+
+def application(settings: Settings, sizes: ServingSizes) -> Any:
+    """The Serve application: `serve.run(application(...))`."""
+    from ray import serve
+
+    from sprung.service.api.live_ingest import ingest_app
+
+    scaling = {"min_replicas": 1, "max_replicas": sizes.replicas, "target_ongoing_requests": sizes.batch_windows}
+    shared: dict[str, Any] = {
+        "autoscaling_config": scaling,
+        "max_ongoing_requests": 4 * sizes.batch_windows,
+        "max_queued_requests": sizes.queued,
+        "health_check_period_s": 5,
+        "graceful_shutdown_timeout_s": settings.shutdown_seconds,
+    }
+    cores = {"num_cpus": sizes.cores}
+    identify = serve.deployment(IdentifyReplica, name="identify", ray_actor_options=cores, **shared)
+    fold = serve.deployment(FoldReplica, name="fold", ray_actor_options={"num_cpus": sizes.cores / 2}, **shared)
+
+    def build() -> Any:
+        """The door's ASGI application; runs in its replica."""
+        engine = load_engine(settings)
+        behind = RayBehind(
+            serve.get_deployment_handle("identify", APPLICATION),
+            serve.get_deployment_handle("fold", APPLICATION),
+            engine.digest,
+        )
+        return ingest_app(settings, engine, open_store(settings.store_url), behind)
+
+    class Door:
+        """Asks who it is, reads what was sent, hands it on."""
+
+        def __init__(self, *after: Any) -> None:
+            """after: deployments that are started before it."""
+
+    door = serve.deployment(
+        serve.ingress(build)(Door),
+        name="door",
+        num_replicas=1,
+        ray_actor_options={"num_cpus": sizes.cores / 4},
+        max_ongoing_requests=8 * sizes.queued,
+    )
+    return door.bind(identify.bind(settings, sizes), fold.bind(settings, sizes))
+
+
+def start(
+    settings: Settings, sizes: ServingSizes, host: str, port: int, address: str | None, cores: int | None
+) -> None:
+    """Serve on the cluster at `address`, or on a Ray that is started here; returns when requests are taken."""
+    try:
+        import ray
+        from ray import serve
+    except ModuleNotFoundError as error:
+        raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
+    if address:
+        ray.init(address=address)
+    else:
+        ray.init(
+            num_cpus=cores,
+            object_store_memory=OBJECT_STORE_BYTES,
+            include_dashboard=False,
+            log_to_driver=False,
+            configure_logging=False,
+        )
+    serve.start(http_options={"host": host, "port": port})
+    serve.run(application(settings, sizes), name=APPLICATION, route_prefix="/")
+
+
+def stop() -> None:
+    """Leave the cluster, or end the one that was started here."""
+    import ray
+    from ray import serve
+
+    serve.shutdown()
+    ray.shutdown()

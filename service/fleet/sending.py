@@ -1,0 +1,172 @@
+"""From the spool to the server, over a link that comes and goes: as often as it takes, longer and longer pauses."""
+
+from __future__ import annotations
+
+import http.client
+import logging
+import random
+import ssl
+import threading
+import uuid
+from dataclasses import dataclass
+from typing import Protocol
+from urllib.parse import urlsplit
+
+from sprung.service.errors import UserError
+from sprung.service.fleet.message import MEDIA_TYPE
+from sprung.service.fleet.spool import Spool, SpoolEntry
+
+log = logging.getLogger("sprung.edge")
+FIRST_PAUSE, LAST_PAUSE = 1.0, 300.0  # s, doubled from try to try
+ANSWER_SECONDS = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came of one attempt."""
+
+    stored: bool
+    refused: str = ""  # why it will never be taken
+    trouble: str = ""  # why it was not taken now
+    wait: float = 0.0  # s that the server asks for
+
+
+class Link(Protocol):
+    """A way to the server."""
+
+    def send(self, entry: SpoolEntry) -> Answer:
+        """One attempt; never raises for what a network does."""
+
+
+class HttpLink:
+    """`POST /ingest/estimates` and `POST /recordings` with a bearer token, the connection kept open."""
+
+    def __init__(self, url: str, token: str | None, vehicle: str) -> None:
+        """Raises UserError for an address that is none."""
+        parts = urlsplit(url)
+        if parts.scheme not in ("http", "https") or not parts.hostname:
+            raise UserError(f"--server {url}: give an address as in https://sprung.example.org")
+        self._parts = parts
+        self._vehicle = vehicle
+        self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
+        self._open: http.client.HTTPConnection | None = None
+        self.sent_bytes = 0  # bodies and what stands around them
+
+    def send(self, entry: SpoolEntry) -> Answer:
+        """One attempt."""
+        try:
+            status, wait, text = self._post(entry)
+        except (OSError, http.client.HTTPException) as error:
+            self.close()
+            return Answer(False, trouble=str(error) or type(error).__name__)
+        if status < 300:
+            return Answer(True)
+        said = f"{status} {text}"
+        if status in (401, 403, 408, 425, 429) or status >= 500:  # the token may be renewed, the server started anew
+            return Answer(False, trouble=said, wait=wait)
+        return Answer(False, refused=said)
+
+    def _post(self, entry: SpoolEntry) -> tuple[int, float, str]:
+        if entry.kind == "estimates":
+            path, kind, body = "/ingest/estimates", MEDIA_TYPE, entry.body
+        else:
+            path, (kind, body) = "/recordings", _form(entry, self._vehicle)
+        headers = self._headers | {"Content-Type": kind, "Idempotency-Key": f"{self._vehicle}-{entry.name}"}
+        if entry.kind == "estimates":
+            del headers["Idempotency-Key"]  # windows are known by themselves
+        connection = self._connection()
+        connection.request("POST", self._parts.path.rstrip("/") + path, body, headers)
+        response = connection.getresponse()
+        text = response.read().decode(errors="replace")
+        self.sent_bytes += len(body) + sum(len(n) + len(v) + 4 for n, v in headers.items()) + len(path) + 80
+        wait = response.headers.get("Retry-After", "0")
+        return response.status, float(wait) if wait.isdigit() else 0.0, " ".join(text.split())[:300]
+
+    def _connection(self) -> http.client.HTTPConnection:
+        if self._open is None:
+            host, port = self._parts.hostname or "", self._parts.port
+            if self._parts.scheme == "https":
+                context = ssl.create_default_context()
+                self._open = http.client.HTTPSConnection(host, port, timeout=ANSWER_SECONDS, context=context)
+            else:
+                self._open = http.client.HTTPConnection(host, port, timeout=ANSWER_SECONDS)
+        return self._open
+
+    def close(self) -> None:
+        """Close the connection; the next attempt opens another one."""
+        if self._open is not None:
+            self._open.close()
+            self._open = None
+
+
+class Sending:
+    """A thread that empties a spool.  Pauses double while nothing is taken, with a random part: a fleet that lost its
+    server does not come back all at once."""
+
+    def __init__(self, spool: Spool, link: Link, first_pause: float = FIRST_PAUSE) -> None:
+        self._spool = spool
+        self._link = link
+        self._first_pause = first_pause
+        self._wake = threading.Event()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="sprung-sending", daemon=True)
+        self.sent = 0
+        self.refused = 0
+        self.trouble = ""  # why nothing is taken now
+
+    def start(self) -> None:
+        """Begin."""
+        self._thread.start()
+
+    def wake(self) -> None:
+        """Something was added."""
+        self._wake.set()
+
+    def close(self, seconds: float) -> bool:
+        """Send what can be sent within `seconds`, then stop; whether the spool is empty."""
+        deadline = threading.Event()
+        timer = threading.Timer(seconds, deadline.set)
+        timer.start()
+        self.wake()
+        while self._spool.waiting[0] and not deadline.is_set():
+            deadline.wait(0.05)
+        timer.cancel()
+        self._stopping.set()
+        self.wake()
+        self._thread.join()
+        return self._spool.waiting[0] == 0
+
+    def _run(self) -> None:
+        pause = self._first_pause
+        while not self._stopping.is_set():
+            entry = self._spool.first()
+            if entry is None:
+                self._wake.wait(1.0)
+                self._wake.clear()
+                continue
+            answer = self._link.send(entry)
+            if answer.stored or answer.refused:
+                if answer.refused:
+                    log.error("the server will not take %s: %s", entry.name or entry.kind, answer.refused)
+                self.sent += answer.stored
+                self.refused += not answer.stored
+                self.trouble, pause = "", self._first_pause
+                self._spool.done(entry)
+                continue
+            if not self.trouble:
+                log.warning("the server takes nothing (%s); what is made waits", answer.trouble)
+            self.trouble = answer.trouble
+            self._stopping.wait(max(answer.wait, pause * random.uniform(0.5, 1.0)))
+            pause = min(2.0 * pause, LAST_PAUSE)
+
+
+def _form(entry: SpoolEntry, vehicle: str) -> tuple[str, bytes]:
+    """multipart/form-data of a recording."""
+    border = uuid.uuid4().hex
+    head = (
+        f'--{border}\r\nContent-Disposition: form-data; name="vehicle"\r\n\r\n{vehicle}\r\n'
+        f'--{border}\r\nContent-Disposition: form-data; name="file"; filename="{entry.name}"\r\n'
+        "Content-Type: application/octet-stream\r\n\r\n"
+    )
+    body = head.encode() + entry.body + f"\r\n--{border}--\r\n".encode()
+    return f"multipart/form-data; boundary={border}", body

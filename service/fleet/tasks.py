@@ -1,0 +1,106 @@
+"""Work done here, one piece after the other, or by Ray, wherever there is room: the same calls.
+
+Ray is given functions and what they depend on, and does the rest: which runs when and where, what is tried again when
+a worker dies, what is moved to disk when memory is short.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any, Protocol
+
+from sprung.service.errors import UserError
+
+OBJECT_STORE_BYTES = 200_000_000  # of a Ray that is started here; more goes to disk
+RETRIES = 10  # of a piece of work whose worker died
+
+
+class Tasks(Protocol):
+    """Somebody who does work."""
+
+    name: str
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """Have work done; arguments that `submit` returned stand for their results.  What stands for the result."""
+
+    def result(self, pending: Any) -> Any:
+        """Wait for a result; raises what the work raised."""
+
+    def close(self) -> None:
+        """Let go of what was started for it."""
+
+
+class HereTasks:
+    """Does everything at once, in this process."""
+
+    name = "this process"
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """The result itself."""
+        return work(*arguments)
+
+    def result(self, pending: Any) -> Any:
+        """The result."""
+        return pending
+
+    def close(self) -> None:
+        """Nothing."""
+
+
+class RayTasks:
+    """Ray: the cluster that RAY_ADDRESS names, else one on this machine with `workers` cores."""
+
+    def __init__(self, workers: int | None = None) -> None:
+        """Raises UserError where Ray is not installed or cannot be reached."""
+        try:
+            import ray
+        except ModuleNotFoundError as error:
+            raise UserError("Ray is not installed: pip install 'sprung[fleet]'") from error
+        self._ray = ray
+        self._started = not ray.is_initialized()
+        address = os.environ.get("RAY_ADDRESS")
+        try:
+            if self._started and address:
+                ray.init(address=address, log_to_driver=False)
+            elif self._started:
+                ray.init(
+                    num_cpus=workers or os.cpu_count(),
+                    object_store_memory=OBJECT_STORE_BYTES,
+                    include_dashboard=False,
+                    log_to_driver=False,
+                    configure_logging=False,
+                )
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            raise UserError(f"Ray: {str(error).splitlines()[0]}") from error
+        self.name = f"Ray, {ray.cluster_resources().get('CPU', 0):.0f} cores"
+        self._remote: dict[Callable[..., Any], Any] = {}
+
+    def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
+        """A reference to the result."""
+        if work not in self._remote:
+            self._remote[work] = self._ray.remote(num_cpus=1, max_retries=RETRIES)(work)
+        return self._remote[work].remote(*arguments)
+
+    def result(self, pending: Any) -> Any:
+        """The result."""
+        try:
+            return self._ray.get(pending)
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.as_instanceof_cause() from None
+
+    def close(self) -> None:
+        """Stop a Ray that was started here."""
+        if self._started:
+            self._ray.shutdown()
+
+
+def tasks_for(wanted: str, workers: int | None) -> Tasks:
+    """`here`, `ray`, or `auto`: Ray where it is installed and there is more than one core to use."""
+    if wanted == "here":
+        return HereTasks()
+    if wanted == "ray":
+        return RayTasks(workers)
+    several = (workers or os.cpu_count() or 1) > 1 or "RAY_ADDRESS" in os.environ
+    return RayTasks(workers) if several and find_spec("ray") is not None else HereTasks()
