@@ -16,6 +16,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "simulate": ("sprung.benchmarks.simulate", "windows simulated per second, against torchdiffeq and scipy"),
     "decode": ("sprung.benchmarks.decode", "frames and messages per second, against cantools and mcap"),
     "replay": ("sprung.benchmarks.replay", "recording to stored drift: times real time, and memory over length"),
+    "fleet": (
+        "sprung.benchmarks.fleet",
+        "one process and many: identity, scaling, load, kills, edge, a plan on paper",
+    ),
     "serve": ("sprung.benchmarks.serve", "latency of POST /identify, against a bare echo"),
     "trust": ("sprung.benchmarks.trust", "windows acknowledged, lost and doubled while the service is killed"),
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from sprung.benchmarks import postgres as postgres_tests
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
-from tests import postgres as postgres_tests
 from tests.service_fakes import FakeIdentifier
 
 # a process for every file that a test reads would cost a second each; tests/service/test_apart.py has them

@@ -19,6 +19,7 @@ from sprung.service.cli.replay import readable
 from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import vehicle_of
+from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.sending import HttpLink, Sending
 from sprung.service.fleet.spool import Spool
@@ -57,7 +58,9 @@ def run(
     with ExitStack() as stack:
         spool = Spool(spool_file or settings.data_dir / "edge.db", spool_bytes)
         stack.callback(spool.close)
-        link = HttpLink(server, token, name)
+        link: HttpLink | NatsLink = (
+            NatsLink(server, name) if server.startswith("nats://") else HttpLink(server, token, name)
+        )
         stack.callback(link.close)
         sending = Sending(spool, link)
         onboard = Onboard(engine, name, spool, rates)

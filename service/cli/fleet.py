@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
+import signal
 import sys
+import threading
 import time
+from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sprung.service.compute import Compute
+from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
+from sprung.service.fleet import ray_serving
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
+from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
+from sprung.service.fleet.ingest import Ingest
+from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
+from sprung.service.fleet.nats_broker import NatsBroker
+from sprung.service.fleet.ray_serving import ServingSizes
 from sprung.service.fleet.tasks import tasks_for
+from sprung.service.logs import set_up
+from sprung.service.main import access_notice, announce_access
+from sprung.service.pipeline import Pipeline
 from sprung.service.settings import settings_with
-from sprung.service.times import from_iso
+from sprung.service.store import open_store
+from sprung.service.store.partitions import prepare
+from sprung.service.times import NANOSECONDS, from_iso, now_ns
+from sprung.service.tokens import Tokens
 
 FOREVER = 2**62
 
@@ -77,6 +95,75 @@ def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, worker
     finally:
         tasks.close()
     return 1 if bad else 0
+
+
+def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None, workers: int | None) -> int:
+    """Serve until told to stop."""
+    settings = settings_with(options)
+    with closing(open_store(settings.store_url)) as store:  # migrated once, before replicas start
+        notice = access_notice(settings, Tokens(store).any)
+    ray_serving.start(settings, sizes, settings.host, settings.port, address, workers)
+    if notice:
+        announce_access(notice)
+    print(f"Sprung takes windows and estimates on http://{settings.host}:{settings.port}; Ctrl-C stops", flush=True)
+    stopping = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopping.set())
+    stopping.wait()
+    ray_serving.stop()
+    return 0
+
+
+def run_consume(options: dict[str, Any], address: str) -> int:
+    """Take messages until told to stop."""
+    settings = settings_with(options)
+    set_up(settings.log_format, settings.log_level)
+    engine = load_engine(settings)
+    counts = ConsumerCounts()
+    with ExitStack() as stack:
+        store = open_store(settings.store_url)
+        stack.callback(store.close)
+        compute = Compute(1)
+        stack.callback(compute.close)
+        pipeline = Pipeline(engine, store, compute, vehicles_in_memory=settings.vehicles_in_memory)
+        ingest = Ingest(pipeline, settings.late_seconds)
+        ingest.start()
+        stack.callback(ingest.close)
+        asyncio.run(_consume(address, ingest, counts))
+    print(f"{counts.messages} messages with {counts.windows} windows stored, {counts.refused} refused", flush=True)
+    return 0
+
+
+async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts) -> None:
+    stopping = asyncio.Event()
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, stopping.set)
+    broker = await _broker(address)
+    print(f"sprung fleet: folding what {address} holds; Ctrl-C stops", flush=True)
+    try:
+        await consume(broker, ingest, stopping, counts)
+    finally:
+        await broker.close()
+
+
+async def _broker(address: str) -> Broker:
+    if address.startswith("nats://"):
+        return await NatsBroker.open(address)
+    if address.startswith("kafka://"):
+        return await open_kafka(address)
+    raise UserError(f"{address}: give nats://HOST:PORT or kafka://HOST:PORT/TOPIC")
+
+
+def run_migrate(store: str | None) -> int:
+    """Migrate and make partitions ahead."""
+    settings = settings_with({"store": store})
+    with closing(open_store(settings.store_url)) as opened:
+        now = now_ns()
+        prepare(opened, (now, now + 31 * 86_400 * NANOSECONDS))
+        shown = opened.engine.url.render_as_string(hide_password=True)
+    print(f"{shown}: tables are those of this version")
+    return 0
 
 
 def _place(text: str) -> str:

@@ -122,3 +122,48 @@ def diagnose(
     from sprung.service.cli.fleet import run_diagnose
 
     return run_diagnose({"system": system, "dbc": dbc}, place, out, on, workers, json_lines)
+
+
+@fleet.command("serve")
+def serve(
+    store: StoreUrl = None,
+    host: Annotated[str, typer.Option("--host", metavar="ADDRESS")] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", metavar="NUMBER", min=1, max=65535)] = 8100,
+    ray_address: Annotated[
+        str | None, typer.Option("--ray", envvar="RAY_ADDRESS", help="A running cluster; default: a Ray started here.")
+    ] = None,
+    workers: Workers = None,
+    replicas: Annotated[int, typer.Option("--replicas", min=1, help="Of each deployment, at most.")] = 8,
+    cores: Annotated[float, typer.Option("--cores", min=0.1, help="Of a replica that identifies.")] = 1.0,
+    system: System = None,
+    weights: Weights = None,
+) -> int:
+    """Ingest on Ray Serve: POST /ingest/estimates and /ingest/windows, identified in batches, folded into one store."""
+    one_thread_each()
+    from sprung.service.cli.fleet import run_serve
+    from sprung.service.fleet.ray_serving import ServingSizes
+
+    options = {"system": system, "weights": weights, "store": store, "host": host, "port": port}
+    return run_serve(options, ServingSizes(replicas=replicas, cores=cores), ray_address, workers)
+
+
+@fleet.command("consume")
+def consume(
+    broker: Annotated[str, typer.Argument(help="nats://HOST:PORT or kafka://HOST:PORT/TOPIC.")],
+    store: StoreUrl = None,
+    system: System = None,
+    weights: Weights = None,
+) -> int:
+    """Fold what a broker holds, acknowledged once it is stored; several may do so on one PostgreSQL store."""
+    one_thread_each()
+    from sprung.service.cli.fleet import run_consume
+
+    return run_consume({"system": system, "weights": weights, "store": store}, broker)
+
+
+@fleet.command("migrate")
+def migrate(store: StoreUrl = None) -> int:
+    """Bring the store's tables to this version and make the partitions of this month and the next, then end."""
+    from sprung.service.cli.fleet import run_migrate
+
+    return run_migrate(store)

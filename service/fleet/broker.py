@@ -25,7 +25,7 @@ WAIT_SECONDS = 1.0
 AGAIN_SECONDS = 2.0  # before a message is delivered again that could not be stored
 
 
-class Delivery(Protocol):
+class BrokerMessage(Protocol):
     """A message that was delivered and not yet acknowledged."""
 
     @property
@@ -42,7 +42,7 @@ class Delivery(Protocol):
 class Broker(Protocol):
     """Where messages come from."""
 
-    async def fetch(self, most: int, seconds: float) -> Sequence[Delivery]:
+    async def fetch(self, most: int, seconds: float) -> Sequence[BrokerMessage]:
         """What is there, at most `most`; none when nothing comes for so long."""
 
     async def close(self) -> None:
@@ -65,7 +65,7 @@ async def consume(broker: Broker, ingest: Ingest, stopping: asyncio.Event, count
         deliveries = await broker.fetch(TOGETHER, WAIT_SECONDS)
         if not deliveries:
             continue
-        readable: list[tuple[Delivery, Message]] = []
+        readable: list[tuple[BrokerMessage, Message]] = []
         for one in deliveries:
             try:
                 readable.append((one, read_messages([one.body])[0]))
@@ -74,7 +74,7 @@ async def consume(broker: Broker, ingest: Ingest, stopping: asyncio.Event, count
         await _store(readable, ingest, counts)
 
 
-async def _store(found: Sequence[tuple[Delivery, Message]], ingest: Ingest, counts: ConsumerCounts) -> None:
+async def _store(found: Sequence[tuple[BrokerMessage, Message]], ingest: Ingest, counts: ConsumerCounts) -> None:
     """One transaction; when one of them cannot be folded, each by itself."""
     if not found:
         return
@@ -99,7 +99,7 @@ async def _store(found: Sequence[tuple[Delivery, Message]], ingest: Ingest, coun
             counts.windows += len(message.windows)
 
 
-async def _refuse(delivery: Delivery, error: Exception, counts: ConsumerCounts) -> None:
+async def _refuse(delivery: BrokerMessage, error: Exception, counts: ConsumerCounts) -> None:
     log.error("a message is left out: %s", error)
     counts.refused += 1
     await delivery.done()

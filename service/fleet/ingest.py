@@ -22,7 +22,7 @@ from sprung.service.pipeline import Folded, Pipeline
 from sprung.service.store import fleet, pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
-from sprung.service.store.windows import known_windows
+from sprung.service.store.windows import known_windows, newest_start
 from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
 
 log = logging.getLogger("sprung.ingest")
@@ -138,6 +138,7 @@ class Ingest:
         held = {row.start: row for row in waited}
         came = {w.start: w for w in fresh if w.start not in held}
         last = self._pipeline.last_window(connection, vehicle)
+        last = newest_start(connection, vehicle, model, last)  # a window that was dropped is no gap
         stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
         if stepped_back is not None:  # the clock was set: what waits is from before, then the rest as it came
             due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))

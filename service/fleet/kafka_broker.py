@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
+from urllib.parse import urlsplit
 
-from sprung.service.fleet.broker import Delivery
+from sprung.service.errors import UserError
+from sprung.service.fleet.broker import BrokerMessage
 
 
 class KafkaBroker:
@@ -17,7 +19,7 @@ class KafkaBroker:
         self.consumer = consumer
         self.again: dict[Any, int] = {}  # by partition: the first record that is to come again
 
-    async def fetch(self, most: int, seconds: float) -> Sequence[Delivery]:
+    async def fetch(self, most: int, seconds: float) -> Sequence[BrokerMessage]:
         """What is there, records that are to come again first."""
         for place, offset in self.again.items():
             self.consumer.seek(place, offset)
@@ -52,3 +54,25 @@ class KafkaDelivery:
         """Read on from it."""
         known = self._broker.again.get(self._place, self._record.offset)
         self._broker.again[self._place] = min(known, self._record.offset)
+
+
+async def open_kafka(address: str) -> KafkaBroker:
+    """The consumer group `sprung-fold` of a topic, kafka://HOST:PORT/TOPIC.  Raises UserError."""
+    try:
+        from aiokafka import AIOKafkaConsumer
+        from aiokafka.errors import KafkaError
+    except ModuleNotFoundError as error:
+        raise UserError("Kafka needs aiokafka: pip install aiokafka") from error
+    parts = urlsplit(address)
+    consumer = AIOKafkaConsumer(
+        parts.path.strip("/") or "sprung.estimates",
+        bootstrap_servers=parts.netloc,
+        group_id="sprung-fold",
+        enable_auto_commit=False,
+        auto_offset_reset="earliest",
+    )
+    try:
+        await consumer.start()
+    except (KafkaError, OSError) as error:
+        raise UserError(f"{address}: no Kafka broker answers ({type(error).__name__})") from error
+    return KafkaBroker(consumer)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from sprung.service.errors import UserError
-from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, Delivery
+from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, BrokerMessage
 from sprung.service.fleet.sending import Answer
 from sprung.service.fleet.spool import SpoolEntry
 
@@ -58,7 +58,7 @@ class NatsBroker:
         subscription = await stream.pull_subscribe(f"{SUBJECT}.>", durable=DURABLE, stream=STREAM, config=config)
         return cls(connection, subscription)
 
-    async def fetch(self, most: int, seconds: float) -> Sequence[Delivery]:
+    async def fetch(self, most: int, seconds: float) -> Sequence[BrokerMessage]:
         """What is there; none while the server is away: the client connects again by itself."""
         from nats.errors import Error
 

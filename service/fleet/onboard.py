@@ -20,8 +20,9 @@ from sprung.service.compute import Priority
 from sprung.service.engine import Engine
 from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.spool import Spool
+from sprung.service.following import Followed
 from sprung.service.ring import Rings
-from sprung.service.times import NANOSECONDS, to_iso
+from sprung.service.times import NANOSECONDS, now_ns, to_iso
 
 log = logging.getLogger("sprung.edge")
 RAW_AFTER_SECONDS = 20.0  # of samples after the window that raised an alarm
@@ -69,7 +70,8 @@ class Onboard:
         self._ring = Rings(1, raw, len(engine.system.channels), engine.system.sample_rate) if raw else None
         self._raw_due: int | None = None  # ns: when enough samples after an alarm will be there
         self._raw_next = 0  # ns: before it, none are sent again
-        self._state = self._restored()
+        state = self._restored()
+        self._followed = Followed(state, -1 if state.time is None else state.time)
 
     def process(
         self,
@@ -96,7 +98,7 @@ class Onboard:
     @property
     def state(self) -> TrackerState:
         """The vehicle's tracker as of the windows that were identified."""
-        return self._state
+        return self._followed.state
 
     def _identify(self) -> None:
         windows, self._waiting = self._waiting, []
@@ -116,15 +118,12 @@ class Onboard:
         self.counts.windows += len(windows)
 
     def _follow(self, window: Window, estimate: Estimate | None) -> None:
-        tracker, before = self.engine.tracker, self._state
-        if before.time is not None and window.start <= before.time and window.new_segment:
-            self._state = tracker.rebase(before, window.start)
+        before = self._followed.state
+        self._followed = self._followed.after(self.engine.tracker, window, estimate, now_ns())
         if estimate is None:
-            self._state = tracker.missed(self._state)
             return
-        self._state = tracker.update(self._state, estimate, window.start)
         known = {(alarm.parameter, alarm.opened) for alarm in before.alarms}
-        opened = [a for a in self._state.active if (a.parameter, a.opened) not in known]
+        opened = [a for a in self._followed.state.active if (a.parameter, a.opened) not in known]
         self.counts.alarms += len(opened)
         if self._ring is None:
             return
@@ -139,7 +138,7 @@ class Onboard:
             return
         made, self._made = self._made, []
         body = encode(Message(self._vehicle, self.engine.digest, tuple(made)), "small")
-        state = {"vehicle": self._vehicle, "model": self.engine.digest, "state": self._state.to_dict()}
+        state = {"vehicle": self._vehicle, "model": self.engine.digest, "state": self._followed.state.to_dict()}
         self._kept(self._spool.add("estimates", body, tracker=state))
         self.counts.messages += 1
         self.counts.message_bytes += len(body)

@@ -49,11 +49,11 @@ class IdentifyReplica:
         one_thread_each()
         self._engine = load_engine(settings)
 
-        @serve.batch(max_batch_size=sizes.batch_windows, batch_wait_timeout_s=sizes.batch_wait_seconds)
         async def together(asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
             return await asyncio.to_thread(self._identify, asked)
 
-        self._together = together
+        batched = serve.batch(max_batch_size=sizes.batch_windows, batch_wait_timeout_s=sizes.batch_wait_seconds)
+        self._together = batched(together)
 
     async def identify(self, start: int, values: FloatArray) -> Estimate:
         """The estimate of one window, values (T, C)."""
@@ -77,11 +77,11 @@ class FoldReplica:
         self._ingest = Ingest(pipeline, settings.late_seconds)
         self._ingest.start()
 
-        @serve.batch(max_batch_size=sizes.batch_messages, batch_wait_timeout_s=sizes.batch_wait_seconds)
         async def together(messages: list[Message]) -> list[Taken | UserError]:
             return await asyncio.to_thread(self._fold, messages)
 
-        self._together = together
+        batched = serve.batch(max_batch_size=sizes.batch_messages, batch_wait_timeout_s=sizes.batch_wait_seconds)
+        self._together = batched(together)
 
     async def fold(self, message: Message | bytes) -> Taken:
         """What became of a message; it is stored."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Connection, Row, select
+from sqlalchemy import Connection, Row, func, select
 
 from sprung.model.signals import BoolArray, Estimate, FloatArray
 from sprung.service.store.partitions import ensure_months, insert_new
@@ -113,6 +113,13 @@ def windows_between(
     while records := [_record(row) for row in connection.execute(query.where(windows.c.start_ns >= since))]:
         yield records
         since = records[-1].start + 1
+
+
+def newest_start(connection: Connection, vehicle: str, model_id: int, last: int) -> int:
+    """Start of the newest window that is stored after `last`, ns; `last` where there is none."""
+    query = select(func.max(windows.c.start_ns)).where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    found = connection.execute(query.where(windows.c.start_ns > last)).scalar()
+    return last if found is None else int(found)
 
 
 def latest_window(connection: Connection, vehicle: str, model_id: int) -> WindowRecord | None:

@@ -119,7 +119,7 @@ def test_a_backfill_that_was_interrupted_goes_on(
     """Stopped after three files, and in the middle of what was fed to the fourth; until the end nothing is shown."""
     calls = 0
 
-    class Interrupted(Exception):
+    class StoppedHere(Exception):
         pass
 
     class Dying(HereTasks):
@@ -127,10 +127,10 @@ def test_a_backfill_that_was_interrupted_goes_on(
             nonlocal calls
             calls += work is module.fold_file
             if calls > 3:
-                raise Interrupted
+                raise StoppedHere
             return super().submit(work, *arguments)  # type: ignore[arg-type]
 
-    with pytest.raises(Interrupted):
+    with pytest.raises(StoppedHere):
         backfill(plan, Dying(), 2, shown)
     with any_store.read() as connection:
         assert status.fleet_page(connection, status.Wanted(), "id", 10) == []

@@ -1,4 +1,4 @@
-"""A temporary PostgreSQL server of the tests' own, where the binaries are there."""
+"""A temporary PostgreSQL server for tests and benchmarks, where the binaries are there."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-SETTINGS = (  # tests may lose their data: a disk that is waited for makes them slow
+SETTINGS = (  # it may lose its data: a disk that is waited for makes them slow
     "fsync=off",
     "synchronous_commit=off",
     "full_page_writes=off",
@@ -45,7 +45,7 @@ def missing() -> str:
 
 @dataclass
 class PostgresServer:
-    """A cluster in a folder; `start` and `kill` as often as a test likes."""
+    """A cluster in a folder; `start` and `kill` as often as one likes."""
 
     folder: Path
     port: int
