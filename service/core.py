@@ -22,6 +22,7 @@ from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
 from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
 from sprung.service.fleet.ingest import Ingest
+from sprung.service.fleet.telling import FleetTelling
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
@@ -66,6 +67,7 @@ class Core:
     tokens: Tokens
     stopping: threading.Event
     ingest: Ingest
+    telling: FleetTelling
     archive: Archive | None = None
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
     requests: Histogram | None = None  # durations of requests
@@ -149,6 +151,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
         stopping,
         Ingest(pipeline, settings.late_seconds),
+        FleetTelling(engine, store, pipeline.model_id),
         archive,
         feeds,
     )

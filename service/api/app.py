@@ -75,6 +75,7 @@ def create_app(
         ingest,
         admin,
         fleet,
+        fleet_knowledge,
         history,
         signals,
         actions,

@@ -62,6 +62,56 @@ class IdentifyAnswer(BaseModel):
     posterior: list[WindowParameter] | None = None
 
 
+class UsualAnswer(BaseModel):
+    """What is usual for one type of element in one class of vehicles."""
+
+    kind: str
+    vehicle_class: str = Field(description="what stands before the last separator of the vehicles' ids")
+    vehicles: int
+    ratio: float = Field(description="to nominal")
+    mean_std: float = Field(description="of its logarithm")
+    own_std: float = Field(description="by which elements of the class differ, of the logarithm")
+    class_std: float = Field(description="by which classes differ, of the logarithm")
+
+
+class StandingAnswer(BaseModel):
+    """One parameter of one vehicle."""
+
+    vehicle: str
+    parameter: str
+    ratio: float
+    std: float
+    usual_ratio: float
+    departure: float = Field(description="from what is usual, in its standard deviations")
+    per_day: float | None = Field(description="change of the logarithm a day, less what the class did together")
+    per_day_std: float | None
+    per_day_sure: float | None = Field(description="exceeded with 95 %; negative where not even the sign is sure")
+    crossing_days: list[float | None] = Field(
+        description="until an alarm's change from its own first level: 5, 50 and 95 %; null: not within 1000 days"
+    )
+
+
+class CommonAnswer(BaseModel):
+    """What the vehicles of a class did together."""
+
+    vehicle_class: str
+    kind: str
+    time: str
+    change: float
+    std: float
+
+
+class KnowledgeAnswer(BaseModel):
+    """Answer to `GET /fleet/knowledge`."""
+
+    parameters: int
+    usual: list[UsualAnswer]
+    worst: list[StandingAnswer]
+    fastest: list[StandingAnswer]
+    common: list[CommonAnswer]
+    expected_crossings: dict[str, float] = Field(description="parameters by days ahead")
+
+
 class IngestAnswer(BaseModel):
     """Answer to `POST /ingest/estimates`: what became of the windows."""
 

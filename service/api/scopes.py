@@ -39,6 +39,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/reports/{id}"): Need("read", by_fleet=True),
     ("GET", "/reports/{id}/page"): Need("read", by_fleet=True),
     ("GET", "/"): Need("read", by_fleet=True),
+    ("GET", "/fleet/knowledge"): Need("read", by_fleet=True),
     ("GET", "/vehicles"): Need("read", by_fleet=True),
     ("GET", "/vehicles/{id}"): Need("read", by_fleet=True),
     ("GET", "/vehicles/{id}/{part}"): Need("read", by_fleet=True),

@@ -8,11 +8,13 @@ from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import APIRouter, Query
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse
 from sqlalchemy import Connection
 
 from sprung.service.api.access import ActorOf, CoreOf, read
 from sprung.service.api.fleet import silent_before
+from sprung.service.fleet.telling import knowledge_dict
 from sprung.service.pages.drawing import columns, small_view
 from sprung.service.pages.render import render
 from sprung.service.store import status
@@ -21,6 +23,7 @@ from sprung.service.store.status import Sort, Wanted
 router = APIRouter(include_in_schema=False)
 
 PAGE_ROWS = 50
+SHOWN_STANDINGS = 8
 HEALTH = {  # NAMUR NE 107
     "ok": "good",
     "maintenance_required": "maintenance required",
@@ -64,6 +67,7 @@ async def fleet_page(
         return rows, status.health_counts(connection, wanted)
 
     rows, counts = await read(core, query)
+    told = await run_in_threadpool(core.telling.told, actor.fleet) if page == 1 else None
     total = sum(counts.values()) if wanted.health is None else counts[wanted.health]
     asked = {"q": q, "sort": sort, "health": health, "page": page}
     asked |= {name: "true" for name, on in (("silent", silent), ("open", open), ("retired", retired)) if on}
@@ -71,6 +75,7 @@ async def fleet_page(
         render(
             "fleet.html",
             rows=rows,
+            told=None if told is None else knowledge_dict(told, SHOWN_STANDINGS),
             counts=counts,
             wanted=wanted,
             searching=wanted != Wanted(fleet=actor.fleet),
