@@ -11,10 +11,11 @@ DEMO := tests/data/drift-600s.blf
 PORT ?= 8000
 PYTEST ?=
 
-.PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit
+.PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
 
 help:
 	@echo "make demo       install, replay the bundled recording, leave the service running"
+	@echo "make fleet-demo the same as a fleet: PostgreSQL, Ray Serve, vehicles that send estimates"
 	@echo "make test       install, run the tests"
 	@echo "make test-slow  the tests that take minutes"
 	@echo "make matrix     the fast tests on Python 3.11, 3.12 and 3.13, those that are installed"
@@ -26,6 +27,12 @@ help:
 install: $(VENV)/.installed
 
 install-dev: $(VENV)/.installed-dev
+
+install-fleet: $(VENV)/.installed-fleet
+
+$(VENV)/.installed-fleet: $(VENV)/.installed
+	$(PIP) --constraint requirements.lock --editable ".[fleet]"
+	@touch $@
 
 # torch comes first and by itself: with the exact CPU build there, nothing pulls the CUDA packages
 $(VENV)/.installed: requirements.lock requirements.hashes.lock pyproject.toml
@@ -39,6 +46,9 @@ $(VENV)/.installed: requirements.lock requirements.hashes.lock pyproject.toml
 $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock
 	$(PIP) -r requirements-dev.lock
 	@touch $@
+
+fleet-demo: install-fleet
+	$(BIN)/sprung fleet demo --port $(PORT)
 
 demo: install
 	$(BIN)/sprung serve --replay $(DEMO) --port $(PORT) --data-dir .demo

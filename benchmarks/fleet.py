@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from sprung.benchmarks import postgres
 from sprung.benchmarks.fleet_chaos import chaos
 from sprung.benchmarks.fleet_compare import differences
 from sprung.benchmarks.fleet_load import ingest
@@ -26,6 +25,7 @@ from sprung.replay.writing import write_recording
 from sprung.service.compute import Compute
 from sprung.service.errors import UserError
 from sprung.service.feed import feed_file
+from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, list_files, opened_store
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.spool import Spool

@@ -27,11 +27,11 @@ import numpy as np
 from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.benchmarks import postgres
 from sprung.benchmarks.fleet_compare import differences
 from sprung.model.identification.excitation import simulate_runs
 from sprung.service.compute import Compute
 from sprung.service.errors import UserError
+from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.message import Message, WindowEstimate, encode

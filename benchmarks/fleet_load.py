@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from sprung.benchmarks import postgres
 from sprung.benchmarks.serve import window_body
 from sprung.model.system import load_system
 from sprung.service.errors import UserError
+from sprung.service.fleet import local_postgres as postgres
 from sprung.service.times import to_iso
 
 Figures = Iterator[dict[str, Any]]

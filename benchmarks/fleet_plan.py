@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from sqlalchemy import text
 
-from sprung.benchmarks import postgres
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.signals import Window
 from sprung.service.compute import Compute
+from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings

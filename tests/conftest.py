@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sprung.benchmarks import postgres as postgres_tests
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine, make_tracker
+from sprung.service.fleet import local_postgres as postgres_tests
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
 from tests.service_fakes import FakeIdentifier

@@ -16,6 +16,7 @@ from sprung.service.api import (
     docs,
     events,
     fleet,
+    fleet_knowledge,
     health,
     history,
     identify,

@@ -167,3 +167,14 @@ def migrate(store: StoreUrl = None) -> int:
     from sprung.service.cli.fleet import run_migrate
 
     return run_migrate(store)
+
+
+@fleet.command("demo")
+def demo(
+    vehicles: Annotated[int, typer.Option("--vehicles", min=1, max=50)] = 3,
+    port: Annotated[int, typer.Option("--port", metavar="NUMBER", min=1, max=65000, help="Of the pages.")] = 8000,
+) -> int:
+    """The fleet variant on this machine: PostgreSQL, Ray Serve, pages, and vehicles that replay a recording."""
+    from sprung.service.cli.fleet_demo import run
+
+    return run(vehicles, port)

@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cache
-from math import inf
 from pathlib import Path
 from typing import Any
 
@@ -29,14 +28,13 @@ from sprung.service.feed import vehicle_of
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.fleet.tasks import Tasks
 from sprung.service.pipeline import Pipeline
-from sprung.service.reading import Apart, ReadRequest
+from sprung.service.reading import Here, ReadRequest
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status, work
 from sprung.service.store.partitions import prepare
 from sprung.service.store.staging import staging_digest, swap
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
-from sprung.service.worker import ProcessLimits
 
 TOGETHER = 64  # windows that are identified, and folded, together
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
@@ -232,7 +230,7 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
     try:
         with local_copy(file) as path, ExitStack() as stack:
             request = ReadRequest(path, engine.system, engine.dbc, TOGETHER, start=file.modified_ns or None)
-            reading = Apart(request, ProcessLimits(inf, inf, plan.settings.worker_memory_bytes))
+            reading = Here(request)
             stack.callback(reading.close)
             for piece in reading.pieces(lambda: None):
                 add(piece.windows)

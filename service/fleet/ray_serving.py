@@ -21,7 +21,7 @@ from sprung.service.fleet.ingest import Ingest, Taken, read_messages
 from sprung.service.fleet.message import Message, WindowEstimate
 from sprung.service.fleet.tasks import OBJECT_STORE_BYTES
 from sprung.service.pipeline import Pipeline
-from sprung.service.settings import Settings
+from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 from sprung.service.threads import one_thread_each
 
@@ -206,3 +206,9 @@ def stop() -> None:
 
     serve.shutdown()
     ray.shutdown()
+
+
+def from_environment(arguments: dict[str, str]) -> Any:
+    """The application as `import_path` of a Serve configuration: settings from SPRUNG_..., sizes from its `args`."""
+    sizes = ServingSizes(replicas=int(arguments.get("replicas", 8)), cores=float(arguments.get("cores", 1.0)))
+    return application(settings_with({}), sizes)

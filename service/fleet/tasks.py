@@ -96,6 +96,11 @@ class RayTasks:
             self._ray.shutdown()
 
 
+def ray_installed() -> bool:
+    """Whether Ray can be imported."""
+    return find_spec("ray") is not None
+
+
 def tasks_for(wanted: str, workers: int | None) -> Tasks:
     """`here`, `ray`, or `auto`: Ray where it is installed and there is more than one core to use."""
     if wanted == "here":
@@ -103,4 +108,4 @@ def tasks_for(wanted: str, workers: int | None) -> Tasks:
     if wanted == "ray":
         return RayTasks(workers)
     several = (workers or os.cpu_count() or 1) > 1 or "RAY_ADDRESS" in os.environ
-    return RayTasks(workers) if several and find_spec("ray") is not None else HereTasks()
+    return RayTasks(workers) if several and ray_installed() else HereTasks()

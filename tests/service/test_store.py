@@ -14,8 +14,8 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import func, select, text
 
-from sprung.benchmarks.postgres import PostgresServer
 from sprung.service.errors import UserError
+from sprung.service.fleet.local_postgres import PostgresServer
 from sprung.service.store import Store, fleet, history, open_store, partitions, retention, work
 from sprung.service.store.schema import metadata, windows
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows

@@ -1,4 +1,4 @@
-"""A temporary PostgreSQL server for tests and benchmarks, where the binaries are there."""
+"""A temporary PostgreSQL server of this process: for the demo, benchmarks and tests, where the binaries are there."""
 
 from __future__ import annotations
 

@@ -1,0 +1,66 @@
+"""`sprung fleet demo`: the fleet variant on one machine, with vehicles that replay the bundled recording."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+from sprung.service.errors import UserError
+from sprung.service.fleet import local_postgres as postgres
+from sprung.service.fleet.tasks import ray_installed
+
+RECORDING = Path(__file__).resolve().parents[2] / "tests" / "data" / "drift-600s.blf"
+SPEED = "10"  # times real time
+
+
+def run(vehicles: int, port: int) -> int:
+    """Start a database, the pages, the ingest and some vehicles; end them all when told to stop."""
+    if not RECORDING.exists():
+        raise UserError(f"{RECORDING}: is not here; the demo needs a clone of the repository")
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sprung-fleet-"))
+        environment = os.environ | {"SPRUNG_DATA_DIR": folder}
+        reason = postgres.missing()
+        if reason:
+            print(f"sprung fleet demo: {reason}; the store is SQLite, and one process takes all")
+        else:
+            environment["SPRUNG_STORE"] = stack.enter_context(postgres.server(durable=True)).database()
+        started: list[subprocess.Popen[bytes]] = []
+        stack.callback(_end, started)
+
+        def start(*arguments: str) -> None:
+            started.append(subprocess.Popen([sys.executable, "-m", "sprung", *arguments], env=environment))
+
+        start("serve", "--port", str(port))
+        server = f"http://127.0.0.1:{port}"
+        if not reason and ray_installed():
+            start("fleet", "serve", "--port", str(port + 100), "--workers", "2", "--cores", "0.5")
+            server = f"http://127.0.0.1:{port + 100}"
+        for number in range(vehicles):
+            name = f"demo-{number + 1:04d}"
+            where = f"{folder}/{name}.db"
+            start("edge", str(RECORDING), "--vehicle", name, "--server", server, "--speed", SPEED, "--spool", where)
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+        try:
+            while started[0].poll() is None:
+                time.sleep(0.5)
+        except KeyboardInterrupt:
+            pass
+    return 0
+
+
+def _end(started: list[subprocess.Popen[bytes]]) -> None:
+    for process in reversed(started):
+        process.send_signal(signal.SIGINT)
+    for process in started:
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

@@ -1,0 +1,68 @@
+"""The examples of the fleet variant: they parse, and name commands, routes and settings that exist."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from typer.main import get_command
+
+from sprung.service.api.scopes import need_of
+from sprung.service.cli.app import app
+from sprung.service.settings import Settings
+
+FOLDER = Path(__file__).resolve().parents[2] / "deploy" / "fleet"
+
+
+def commands(node: Any) -> list[list[str]]:
+    """Every list below a key `command` that begins with sprung."""
+    if isinstance(node, dict):
+        own = node.get("command")
+        found = [own] if isinstance(own, list) and own[:1] == ["sprung"] else []
+        return found + [one for value in node.values() for one in commands(value)]
+    if isinstance(node, list):
+        return [one for value in node for one in commands(value)]
+    return []
+
+
+def names(node: Any) -> set[str]:
+    """Every key and name that begins with SPRUNG_."""
+    if isinstance(node, dict):
+        own = {key for key in node if str(key).startswith("SPRUNG_")}
+        own |= {node["name"]} if str(node.get("name", "")).startswith("SPRUNG_") else set()
+        return own.union(*(names(value) for value in node.values()))
+    return set().union(*(names(value) for value in node)) if isinstance(node, list) else set()
+
+
+@pytest.mark.parametrize("name", ["compose.yaml", "kubernetes.yaml"])
+def test_examples_name_what_there_is(name: str) -> None:
+    documents = list(yaml.safe_load_all((FOLDER / name).read_text()))
+    found = [one for document in documents for one in commands(document)]
+    assert len(found) >= 3
+    for _, *words in found:
+        command: Any = get_command(app)
+        while words and hasattr(command, "commands"):
+            command = command.commands[words.pop(0)]
+        options = {text for parameter in command.params for text in parameter.opts}
+        assert [word for word in words if word.startswith("--") and word not in options] == []
+    known = {f"SPRUNG_{field.upper()}" for field in Settings.model_fields}
+    assert set().union(*(names(document) for document in documents)) <= known
+
+
+def test_probes_ask_routes_that_need_no_token() -> None:
+    text = (FOLDER / "kubernetes.yaml").read_text()
+    for path in ("/health/live", "/health/ready"):
+        assert path in text
+        assert need_of("GET", path).scope == ""
+
+
+def test_the_application_that_ray_imports_is_there() -> None:
+    document = next(
+        d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"
+    )
+    served = yaml.safe_load(document["spec"]["serveConfigV2"])["applications"][0]
+    module, _, name = served["import_path"].partition(":")
+    imported = __import__(module, fromlist=[name])
+    assert callable(getattr(imported, name))
