@@ -11,7 +11,7 @@ import asyncio
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -22,6 +22,7 @@ from sprung.service.fleet.message import Message
 log = logging.getLogger("sprung.broker")
 TOGETHER = 64  # messages of one transaction
 WAIT_SECONDS = 1.0
+Verdict = Literal["stored", "refused", "again"]
 AGAIN_SECONDS = 2.0  # before a message is delivered again that could not be stored
 
 
@@ -65,41 +66,42 @@ async def consume(broker: Broker, ingest: Ingest, stopping: asyncio.Event, count
         deliveries = await broker.fetch(TOGETHER, WAIT_SECONDS)
         if not deliveries:
             continue
-        readable: list[tuple[BrokerMessage, Message]] = []
-        for one in deliveries:
-            try:
-                readable.append((one, read_messages([one.body])[0]))
-            except UserError as error:
-                await _refuse(one, error, counts)
-        await _store(readable, ingest, counts)
+        messages: list[Message | None] = [_readable(one) for one in deliveries]
+        verdicts = iter(await _store([one for one in messages if one is not None], ingest))
+        for delivery, message in zip(deliveries, messages, strict=True):  # in order: Kafka's offsets only go on
+            verdict = "refused" if message is None else next(verdicts)
+            if verdict == "again":
+                counts.again += 1
+                await delivery.again()
+                continue
+            await delivery.done()
+            counts.refused += verdict == "refused"
+            if message is not None and verdict == "stored":
+                counts.messages += 1
+                counts.windows += len(message.windows)
 
 
-async def _store(found: Sequence[tuple[BrokerMessage, Message]], ingest: Ingest, counts: ConsumerCounts) -> None:
-    """One transaction; when one of them cannot be folded, each by itself."""
-    if not found:
-        return
+def _readable(delivery: BrokerMessage) -> Message | None:
     try:
-        await asyncio.to_thread(ingest.take, [message for _, message in found])
+        return read_messages([delivery.body])[0]
     except UserError as error:
-        if len(found) > 1:
-            for one in found:
-                await _store([one], ingest, counts)
-            return
-        await _refuse(found[0][0], error, counts)
+        log.error("a message is left out: %s", error)
+        return None
+
+
+async def _store(messages: Sequence[Message], ingest: Ingest) -> list[Verdict]:
+    """One transaction; when one of them cannot be folded, each by itself."""
+    if not messages:
+        return []
+    try:
+        await asyncio.to_thread(ingest.take, messages)
+    except UserError as error:
+        if len(messages) > 1:
+            return [verdict for one in messages for verdict in await _store([one], ingest)]
+        log.error("a message is left out: %s", error)
+        return ["refused"]
     except (SQLAlchemyError, OSError, Busy) as error:
         log.warning("the store does not take anything (%s); the messages come again", type(error).__name__)
-        for delivery, _ in found:
-            await delivery.again()
-        counts.again += len(found)
         await asyncio.sleep(AGAIN_SECONDS)
-    else:
-        for delivery, message in found:
-            await delivery.done()
-            counts.messages += 1
-            counts.windows += len(message.windows)
-
-
-async def _refuse(delivery: BrokerMessage, error: Exception, counts: ConsumerCounts) -> None:
-    log.error("a message is left out: %s", error)
-    counts.refused += 1
-    await delivery.done()
+        return ["again"] * len(messages)
+    return ["stored"] * len(messages)

@@ -80,6 +80,7 @@ class NatsLink:
         self._servers = servers
         self._subject = f"{SUBJECT}.{vehicle.replace('.', '_')}"
         self._loop = asyncio.new_event_loop()
+        self._connection: Any = None
         self._stream: Any = None
 
     def send(self, entry: SpoolEntry) -> Answer:
@@ -89,15 +90,25 @@ class NatsLink:
         try:
             self._loop.run_until_complete(self._publish(entry.body))
         except Exception as error:
-            self._stream = None
+            self._leave()
             return Answer(False, trouble=f"{type(error).__name__}: {error}")
         return Answer(True)
 
     def close(self) -> None:
         """Leave."""
-        if self._stream is not None:
-            self._loop.run_until_complete(self._connection.close())
+        self._leave()
         self._loop.close()
+
+    def _leave(self) -> None:
+        """Close the connection, whatever state it is in; the next message opens another one."""
+        connection, self._stream, self._connection = self._connection, None, None
+        if connection is not None:
+            self._loop.run_until_complete(connection.close())
+        left = asyncio.all_tasks(self._loop)
+        for task in left:
+            task.cancel()
+        if left:
+            self._loop.run_until_complete(asyncio.gather(*left, return_exceptions=True))
 
     async def _publish(self, body: bytes) -> None:
         if self._stream is None:

@@ -80,7 +80,7 @@ def test_exact_messages_come_back_bit_by_bit() -> None:
                 )
 
 
-@pytest.mark.parametrize(("condition", "factor"), [(1.0, 1.5), (1e2, 2.0), (1e4, 4.0)])
+@pytest.mark.parametrize(("condition", "factor"), [(1.0, 1.5), (1e2, 2.0), (1e4, 5.0)])
 def test_small_messages_keep_every_direction_of_the_covariance(condition: float, factor: float) -> None:
     """However correlated the parameters are, no direction becomes much surer or less sure than it was.
 
@@ -95,7 +95,7 @@ def test_small_messages_keep_every_direction_of_the_covariance(condition: float,
         assert np.abs((one.estimate.log_ratio - other.estimate.log_ratio) / std).max() < 0.033
         np.testing.assert_allclose(np.sqrt(np.diag(other.estimate.covariance)), std, rtol=0.016)
         ratio = np.linalg.eigvals(np.linalg.solve(one.estimate.covariance, other.estimate.covariance)).real
-        assert ratio.min() > 0.5 and ratio.max() < 2.0
+        assert ratio.min() > 1 / factor and ratio.max() < factor
         np.testing.assert_allclose(one.estimate.per_sensor, other.estimate.per_sensor, rtol=0.01)
         np.testing.assert_array_equal(one.estimate.identifiable, other.estimate.identifiable)
         if one.estimate.deviating is not None and other.estimate.deviating is not None:
