@@ -59,8 +59,6 @@ async def history(
     start, end = time_of("since", since, 0), time_of("until", until, FOREVER)
     width = resolution_of(resolution)
 
-    older = store_history.older_windows(core.archive, id_, core.engine.digest)
-
     def query(connection: Connection) -> tuple[float, Series, VehicleView]:
         known_vehicle(fleet.vehicle_exists(connection, id_), id_)
         key = (id_, core.pipeline.model_id)
@@ -68,6 +66,7 @@ async def history(
         if fit is None:
             fit = store_history.fitting_resolution(connection, *key, start, end, AUTO_POINTS)
         view = load_view(core, connection, id_)
+        older = store_history.older_windows(core.archive, id_, fleet.digest_of(connection, core.pipeline.model_id))
         return fit, store_history.series(connection, *key, start, end, fit, MAX_POINTS, older), view
 
     step, found, view = await read(core, query)

@@ -59,7 +59,7 @@ def run(
                 end,
                 _seconds(resolution),
                 FOREVER,
-                history.older_windows(open_archive(settings.archive), vehicle, engine.digest),
+                history.older_windows(open_archive(settings.archive), vehicle, fleet.digest_of(connection, model)),
             )
     body = history_file(engine, vehicle, parameters or known, found, kind)
     if out is None:

@@ -93,12 +93,20 @@ def known_model(connection: Connection, digest: str, description: dict[str, Any]
     baselines go on.
     """
     there = connection.execute(select(models.c.id).where(models.c.digest == digest)).scalar()
-    return _of_same_values(connection, digest, description) if there is None else int(there)
+    if there is None and not digest.startswith(STAGING):
+        return _of_same_values(connection, digest, description)
+    return None if there is None else int(there)
+
+
+def digest_of(connection: Connection, model_id: int) -> str:
+    """Under which digest a model is stored; that of the weights in use may be a later one."""
+    return str(connection.execute(select(models.c.digest).where(models.c.id == model_id)).scalar_one())
 
 
 def _of_same_values(connection: Connection, digest: str, description: dict[str, Any]) -> int | None:
     """The newest stored model whose windows read alike and whose values mean the same."""
-    stored = select(models.c.id, models.c.digest, models.c.description).order_by(models.c.id.desc())
+    shown = models.c.id.not_in(staging_models())
+    stored = select(models.c.id, models.c.digest, models.c.description).where(shown).order_by(models.c.id.desc())
     for number, old_digest, old in connection.execute(stored):
         if "structure" not in old:  # of an earlier version: other weights of the same file at the most
             if old_digest.partition("-")[0] == digest.partition("-")[0] and old | description == description and old:

@@ -90,7 +90,7 @@ def test_the_sender_tries_until_it_is_taken_and_gives_up_what_never_will_be(spoo
     assert (sending.sent, sending.refused, sending.trouble) == (2, 1, "")
 
 
-class Receiver(ThreadingHTTPServer):
+class EdgeReceiver(ThreadingHTTPServer):
     """Answers with the statuses it was given, then 200; keeps what came."""
 
     def __init__(self, statuses: list[int]) -> None:
@@ -103,7 +103,7 @@ class ReceiverHandler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
 
     def do_POST(self) -> None:
-        assert isinstance(self.server, Receiver)
+        assert isinstance(self.server, EdgeReceiver)
         body = self.rfile.read(int(self.headers["Content-Length"]))
         self.server.requests.append((self.path, dict(self.headers), body))
         status = self.server.statuses.pop(0) if self.server.statuses else 200
@@ -117,7 +117,7 @@ class ReceiverHandler(BaseHTTPRequestHandler):
 
 
 def test_statuses_say_whether_to_try_again() -> None:
-    receiver = Receiver([200, 429, 503, 401, 422, 409])
+    receiver = EdgeReceiver([200, 429, 503, 401, 422, 409])
     thread = threading.Thread(target=receiver.serve_forever, daemon=True)
     thread.start()
     link = HttpLink(f"http://127.0.0.1:{receiver.server_port}/base", "sprung_x_y", "north-1")
