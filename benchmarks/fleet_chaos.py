@@ -93,7 +93,7 @@ def chaos(minutes: float, every: float) -> Figures:
         ]
         for part in parts[:3]:
             part.process = part.start()
-            stack.callback(lambda part=part: _kill(part.process))
+            stack.callback(_end_part, part)
         rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
         messages = _messages(engine, rounds)
         told = ChaosTold()
@@ -228,6 +228,10 @@ def _worker(address: str, url: str, folder: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "sprung", "fleet", "consume", address, "--store", url]
     environment = os.environ | {"SPRUNG_DATA_DIR": str(folder)}
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+
+
+def _end_part(part: KilledPart) -> None:
+    _kill(part.process)
 
 
 def _kill(process: subprocess.Popen[bytes] | None) -> None:

@@ -107,7 +107,7 @@ def knowledge(
     newest, newest_std = newest_of(level), newest_of(np.where(np.isnan(level), np.nan, found.std))
     slope, slope_std, first = trends(found.time, rest, found.std)
     for kind in dict.fromkeys(kinds.tolist()):
-        columns = np.flatnonzero(kinds == kind)
+        columns = np.flatnonzero(kinds == kind).tolist()
         levels = usual_levels(kind, newest[:, columns], newest_std[:, columns], classes)
         usual += levels
         by_class = {one.vehicle_class: one for one in levels}
