@@ -213,17 +213,7 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
         if whole:
             estimates, _ = engine.identify(np.stack([w.values for w in whole]), starts=[w.start for w in whole])
             found = iter(estimates)
-        sent = [
-            WindowEstimate(
-                w.start,
-                w.outcome,
-                w.reason,
-                w.repaired_samples,
-                w.new_segment,
-                None if w.outcome == "dropped" else next(found),
-            )
-            for w in chosen
-        ]
+        sent = [WindowEstimate.of(w, None if w.outcome == "dropped" else next(found)) for w in chosen]
         if sent:
             messages.append(encode(Message(file.vehicle, engine.digest, tuple(sent)), "exact"))
 
@@ -259,9 +249,10 @@ def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | No
         with pipeline.store.write() as connection:
             if work.get_recording(connection, row.id) is None:
                 work.add_recording(connection, row)
+        system = pipeline.engine.system
         for body in found.messages:
             message = decode(body)
-            windows = [_bare(w, pipeline.engine) for w in message.windows]
+            windows = [w.window(system.sample_rate, len(system.channels)) for w in message.windows]
             prepare(pipeline.store, (w.start for w in windows))
             with pipeline.store.write() as connection:
                 folded = pipeline.fold(
@@ -346,18 +337,6 @@ def _row_id(plan: BackfillPlan, file: FoundFile) -> str:
     """One row a file, back-fill and model."""
     key = f"{file.id} {plan.name} {engine_of(plan.settings).digest}"
     return hashlib.sha256(key.encode()).hexdigest()[:36]
-
-
-def _bare(window: WindowEstimate, engine: Engine) -> Window:
-    return Window(
-        window.start,
-        engine.system.sample_rate,
-        np.empty((0, len(engine.system.channels))),
-        window.outcome,
-        window.reason,
-        window.repaired_samples,
-        window.new_segment,
-    )
 
 
 def _line(error: Exception) -> str:

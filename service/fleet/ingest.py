@@ -15,7 +15,6 @@ import numpy as np
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.model.signals import Window
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.pipeline import Folded, Pipeline
@@ -149,7 +148,7 @@ class Ingest:
         order = [came[start] if start in came else _restored(held[start]) for start in due]
         if order:
             width = len(self._pipeline.engine.system.channels)
-            windows = [_window(w, self._pipeline.engine.system.sample_rate, width) for w in order]
+            windows = [w.window(self._pipeline.engine.system.sample_rate, width) for w in order]
             one = self._pipeline.fold(connection, vehicle, windows, [w.estimate for w in order])
             folded.append(one)
         pending.release(connection, vehicle, model, [start for start in due if start in held])
@@ -170,6 +169,9 @@ class Ingest:
         for window in message.windows:
             if not FIRST_TIME <= window.start <= now + AHEAD:
                 raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
+            beside = len(self._pipeline.engine.system.auxiliary)
+            if window.auxiliary is not None and window.auxiliary.shape != (beside,):
+                raise UserError(f"{window.auxiliary.size} measurements beside a window came; the system has {beside}")
             e = window.estimate
             if e is None:
                 continue
@@ -210,16 +212,3 @@ def read_messages(bodies: Sequence[bytes]) -> list[Message]:
 
 def _restored(row: Waiting) -> WindowEstimate:
     return decode(row.message).windows[0]
-
-
-def _window(window: WindowEstimate, sample_rate: float, channels: int) -> Window:
-    """A window whose samples stayed where they were measured."""
-    return Window(
-        window.start,
-        sample_rate,
-        np.empty((0, channels)),
-        window.outcome,
-        window.reason,
-        window.repaired_samples,
-        window.new_segment,
-    )

@@ -20,7 +20,7 @@ from typing import Any, Literal
 import msgpack
 import numpy as np
 
-from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault, Outcome
+from sprung.model.signals import Deviating, Estimate, FloatArray, MeasurementFault, Outcome, Window
 from sprung.service.fleet.coding import (
     from_log_steps,
     log_steps,
@@ -55,6 +55,33 @@ class WindowEstimate:
     repaired_samples: int
     new_segment: bool  # the first after the clock jumped
     estimate: Estimate | None  # None where dropped
+    auxiliary: FloatArray | None = None  # temperature, pressure and so on, as in `Window.auxiliary`
+
+    @classmethod
+    def of(cls, window: Window, estimate: Estimate | None) -> WindowEstimate:
+        """What is sent of a window."""
+        return cls(
+            window.start,
+            window.outcome,
+            window.reason,
+            window.repaired_samples,
+            window.new_segment,
+            estimate,
+            window.auxiliary,
+        )
+
+    def window(self, sample_rate: float, channels: int) -> Window:
+        """The window without its samples: they stayed where they were measured."""
+        return Window(
+            self.start,
+            sample_rate,
+            np.empty((0, channels)),
+            self.outcome,
+            self.reason,
+            self.repaired_samples,
+            self.new_segment,
+            auxiliary=self.auxiliary,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +106,7 @@ def encode(message: Message, coding: Coding) -> bytes:
             [w.outcome, w.reason, w.repaired_samples, w.new_segment, w.estimate is not None] for w in message.windows
         ],
         "estimates": _estimates(estimates, coding) if estimates else None,
+        "auxiliary": [None if w.auxiliary is None else _beside(w.auxiliary, coding) for w in message.windows],
     }
     return zlib.compress(msgpack.packb(body), 9)
 
@@ -104,16 +132,22 @@ def _read(body: dict[str, Any]) -> Message:
         raise UnreadableMessage(f"{len(body['windows'])} windows in one message; at most {MOST_WINDOWS} are taken")
     found = iter(_read_estimates(body["estimates"], body["coding"]) if body["estimates"] is not None else ())
     starts = unpack_ints(body["start"]).tolist()
+    beside = [None if one is None else np.array(one, dtype=np.float64) for one in body["auxiliary"]]
     windows = []
-    for start, (outcome, reason, repaired, new_segment, known) in zip(starts, body["windows"], strict=True):
+    rows = zip(starts, beside, body["windows"], strict=True)
+    for start, auxiliary, (outcome, reason, repaired, new_segment, known) in rows:
         if outcome not in ("used", "repaired", "dropped"):
             raise UnreadableMessage(f"unknown outcome {outcome!r}"[:100])
         estimate = next(found, None) if known else None
         if bool(known) is (estimate is None) or bool(known) is (outcome == "dropped"):
             raise UnreadableMessage("windows and estimates do not belong together")
         said = None if reason is None else str(reason)[:200].replace("\x00", "")
-        windows.append(WindowEstimate(start, outcome, said, int(repaired), bool(new_segment), estimate))
+        windows.append(WindowEstimate(start, outcome, said, int(repaired), bool(new_segment), estimate, auxiliary))
     return Message(str(body["vehicle"]), str(body["model"]), tuple(windows))
+
+
+def _beside(values: FloatArray, coding: Coding) -> list[float]:
+    return values.tolist() if coding == "exact" else [float(f"{value:.5g}") for value in values.tolist()]
 
 
 def _estimates(found: Sequence[Estimate], coding: Coding) -> dict[str, Any]:

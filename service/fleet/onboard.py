@@ -110,16 +110,14 @@ class Onboard:
         for window in windows:
             estimate = None if window.outcome == "dropped" else _spoken(next(estimates))
             self._follow(window, estimate)
-            self._made.append(
-                WindowEstimate(
-                    window.start, window.outcome, window.reason, window.repaired_samples, window.new_segment, estimate
-                )
-            )
+            self._made.append(WindowEstimate.of(window, estimate))
         self.counts.windows += len(windows)
 
     def _follow(self, window: Window, estimate: Estimate | None) -> None:
         before = self._followed.state
-        self._followed = self._followed.after(self.engine.tracker, window, estimate, now_ns())
+        self._followed = self._followed.after(
+            self.engine.tracker, window, estimate, now_ns(), self.engine.system.conditions(window.auxiliary)
+        )
         if estimate is None:
             return
         known = {(alarm.parameter, alarm.opened) for alarm in before.alarms}
