@@ -78,8 +78,8 @@ class WindowEstimate:
             np.empty((0, channels)),
             self.outcome,
             self.reason,
-            self.repaired_samples,
-            self.new_segment,
+            repaired_samples=self.repaired_samples,
+            new_segment=self.new_segment,
             auxiliary=self.auxiliary,
         )
 
