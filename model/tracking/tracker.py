@@ -198,6 +198,9 @@ class Tracker:
         shift = time_ns - _ns(self.settings.hop) - state.time
         changes, fit, calibration = state.changes, state.fit, state.calibration
         weighed = calibration.recent != 0
+        weather = state.weather
+        if weather is not None:
+            weather = replace(weather, began=np.where(weather.began != 0, weather.began + shift, 0))
         return replace(
             state,
             time=state.time + shift,
@@ -215,6 +218,7 @@ class Tracker:
                 recent=np.where(weighed, calibration.recent + shift, 0),
             ),
             stuck=tuple(replace(s, since=s.since + shift) for s in state.stuck),
+            weather=weather,
         )
 
     def update_many(self, state: TrackerState, windows: Iterable[tuple[Estimate, int]]) -> TrackerState:
