@@ -30,6 +30,9 @@ _EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
 _BETTER = 0.8  # a correction that leaves more of chi-square than this is none
 _REVERSED = 0.3  # share of the squares at nominal values that a reversed or exchanged channel leaves, at most
 _MARGIN = 2  # samples that a delay costs at either end beyond itself
+_LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
+_LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
+_TRIALS = 3  # of those, by their squares at the nominal values
 _FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
 _CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
 
@@ -111,9 +114,12 @@ class Explainer:
         stuck = [self._stuck(window) for window in windows]
         plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
         found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
+        late = 0
         for i, window in enumerate(windows):
             if i not in found:
                 strong = self._without(window, stuck[i]) if stuck[i] else self._turned(window)
+                if strong is None and late < _LATE_TRIED:
+                    strong, late = self._late(window), late + 1
                 if strong is not None:
                     found[i] = strong
         return {int(names[i]): explained for i, explained in found.items()}
@@ -236,6 +242,23 @@ class Explainer:
                 return explained[0]
         return None
 
+    def _late(self, window: FloatArray) -> Explained | None:
+        """One window with a channel, or all of a clock, that is late or early by many samples put right."""
+        C = self.channels
+        rows = [row for row in self.directions if row[C : 2 * C].any()]
+        points = np.array([np.zeros(len(self.deviations)), *(row * late for row in rows for late in _LATE)])
+        edge = int(np.ceil(max(_LATE) * self.system.sample_rate)) + _MARGIN
+        if self.samples <= 4 * edge:
+            return None
+        mended = self.corrected(np.repeat(window[None], len(points), axis=0), points)
+        costs = self._nominal_cost(mended[:, edge : self.samples - edge])
+        for at in np.argsort(costs[1:])[:_TRIALS] + 1:
+            if costs[at] < _BETTER * costs[0]:
+                explained = self._by_steps(window[None], [()], points[at])
+                if 0 in explained:
+                    return explained[0]
+        return None
+
     def _stuck(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
         """Channels whose samples themselves show that they are frozen or saturated."""
         found = []
@@ -273,7 +296,7 @@ class Explainer:
 
     def _nominal_cost(self, windows: FloatArray) -> FloatArray:
         """Weighted squares at the nominal values with the best initial state, (B,)."""
-        refiner = self.refiner(self.samples)
+        refiner = self.refiner(windows.shape[1])
         model = refiner.model
         present: BoolArray = np.asarray(~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0))
         with torch.no_grad():

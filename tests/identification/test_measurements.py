@@ -113,6 +113,7 @@ def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_clai
         (lambda x: x * np.where(np.arange(28) == 0, 1.2, 1), "wheel_11l.displacement", "gain"),
         (lambda x: late(x, BOGIE, 0.003), "bogie1_1l|bogie1_1r|bogie1_2l|bogie1_2r", "delay"),
         (lambda x: late(x, [20], 0.01), "bogie1_1l", "delay"),
+        (lambda x: late(x, [3], 0.027), "wheel_11r.velocity", "delay"),
         (lambda x: x * np.where(np.arange(28) == 17, -1, 1), "car_1r", "inverted"),
         (lambda x: x[:, [*range(20), 21, 20, *range(22, 28)]], "bogie1_1l|bogie1_1r", "swapped"),
     ],
@@ -149,6 +150,23 @@ def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(system, identifie
     assert fault.value == pytest.approx(1 + gain, abs=4 * fault.std)
     mean, std = tracker.posterior(state)
     assert np.abs(mean / std).max() < 3.5
+
+
+def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system, identifier):
+    healthy = record(75, 7)
+    tracker, state = tracked(system, identifier, after(healthy, late(healthy, [20], -0.003), 35))
+    assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "bogie1_1l.delay")]
+    assert state.alarms[0].change == pytest.approx(-0.003, abs=5e-4)  # against all others, wherever they wander
+    drift = np.array([p.drift for p in tracker.report(state)])
+    assert np.abs(drift).max() < 0.025
+
+
+def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system, identifier):
+    tracker, state = tracked(system, identifier, late(record(20, 8), [8], 0.03))
+    assert state.rejected <= 6 and not state.alarms
+    assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {("wheel_21l.displacement", "delay")}
+    mean, std = tracker.posterior(state)
+    assert np.abs(mean / std).max() < 4.0
 
 
 @pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
