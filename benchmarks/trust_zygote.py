@@ -13,11 +13,17 @@ import subprocess
 import sys
 import time
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
+from runpy import run_module
 from typing import Any
 
 PR_SET_PDEATHSIG = 1
 CODE = "from sprung.benchmarks.trust_zygote import main"
+WARM = (  # what commands need: loaded before anything is forked
+    *(f"sprung.service.{name}" for name in ("backup", "housekeeping", "main", "store")),
+    *(f"sprung.service.cli.{name}" for name in ("app", "replay", "serve")),
+)
 GO, DONE = "step-begun", "step-done"  # files that a step makes in its folder
 
 
@@ -96,8 +102,8 @@ def alive(pid: int) -> bool:
 def main(warm: bool) -> None:
     """The zygote: a line of JSON in, a process number out."""
     if warm:
-        from sprung.service import backup, housekeeping, main, store  # noqa: F401 (imported for the children)
-        from sprung.service.cli import app, replay, serve  # noqa: F401
+        for name in WARM:
+            import_module(name)
 
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children that have ended are gone at once
     for line in sys.stdin:
@@ -123,8 +129,9 @@ def _child(wanted: dict[str, Any]) -> None:
             Path(DONE).touch()
             status = 0
         else:
-            from sprung.service.cli import main as run
-
-            status = run(wanted["arguments"])
+            sys.argv = ["sprung", *wanted["arguments"]]
+            run_module("sprung", run_name="__main__")  # the command, as a process of its own would run it
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
     finally:
         os._exit(status)

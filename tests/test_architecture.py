@@ -7,6 +7,7 @@ import re
 from collections import defaultdict
 from functools import cache
 from pathlib import Path
+from runpy import run_path
 
 import pytest
 
@@ -134,6 +135,18 @@ def circle(graph: dict[str, set[str]]) -> list[str]:
 
 def test_no_file_imports_itself_by_a_detour() -> None:
     assert circle(edges()) == []
+
+
+def test_folders_stand_above_those_that_they_import() -> None:
+    """As drawn in docs/architecture.md: `make drawing` refuses a circle of folders, too."""
+    folder_of = run_path(str(ROOT / "docs" / "imports.py"))["folder_of"]
+    graph: dict[str, set[str]] = defaultdict(set)
+    for name, targets in edges().items():
+        graph[folder_of(name)] |= {folder_of(target) for target in targets}
+    whole = {name: {target for target in targets if target != name} for name, targets in graph.items()}
+    for package in ("model", "model.diagnosis"):  # their own files hold nothing
+        whole.pop(package, None)
+    assert circle({name: targets & set(whole) for name, targets in whole.items()}) == []
 
 
 def test_a_circle_would_be_seen() -> None:
