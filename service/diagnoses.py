@@ -11,6 +11,7 @@ from typing import Any
 
 from sqlalchemy import Connection
 
+from sprung.model.system import MANCHESTER
 from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
 from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.engine import Engine
@@ -133,7 +134,8 @@ class DiagnosisJobs:
         final = self._settings.reports / report_id
         part = final.with_name(f"{report_id}.{os.getpid()}.part")
         shutil.rmtree(part, ignore_errors=True)
-        request = DiagnosisRequest(path, row.name, self._engine.system, self._engine.dbc, part)
+        source = self._settings.system or MANCHESTER
+        request = DiagnosisRequest(path, row.name, self._engine.system, self._engine.dbc, part, source)
         seconds = self._settings.diagnosis_seconds
         worker = Worker(
             self.task, request, ProcessLimits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"

@@ -6,6 +6,7 @@ stop can interrupt it.
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 import time
@@ -24,7 +25,10 @@ from sprung.service.ring import Excerpt
 from sprung.service.threads import hand_over_often, one_thread_each
 from sprung.service.worker import Emit
 
+log = logging.getLogger("sprung.diagnosis")
+
 SIGN_OF_LIFE_SECONDS = 2.0  # a stage may take longer
+IMPROVED = "system.yaml"  # in the report's folder: the system file with what was found
 STAGE_SHARE, STAGE_SECONDS = 0.1, 20.0  # a stage's usual part of the whole, and how soon most of it is done
 
 
@@ -37,6 +41,7 @@ class DiagnosisRequest:
     system: System
     dbc: Path | None
     out: Path  # folder for page, pictures and report; made when absent
+    system_file: Path | None = None  # where the system was read from: what was found is written into a copy of it
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +65,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
     from sprung.model.diagnosis.api import Options, diagnose
+    from sprung.service.improved import write_improved
     from sprung.service.report import write_report
 
     latest, begun = Stage(0.0, "reading"), time.monotonic()
@@ -82,6 +88,11 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
         report = diagnose(request.system, _load(request), Options(file=request.name), show)
         show(1.0, "writing the report")
         write_report(report, request.system, request.out)
+        if request.system_file is not None:
+            try:
+                write_improved(request.out / IMPROVED, request.system_file, request.system, report)
+            except (OSError, ValueError) as error:  # changed or gone since the service began: the report stays good
+                log.warning("%s: not written with what was found: %s", request.system_file, error)
         return DiagnosisResult(report.verdict, report.to_dict())
     except ValueError as error:
         raise ValueError(str(error).replace(str(request.path), request.name)) from error

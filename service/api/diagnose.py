@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
@@ -19,6 +19,7 @@ from sprung.service.api.recordings import job_dict
 from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import discard, receive
 from sprung.service.core import Core
+from sprung.service.diagnosing import IMPROVED
 from sprung.service.errors import NotFound
 from sprung.service.links import with_links
 from sprung.service.notify.events import vehicle_page
@@ -83,7 +84,22 @@ async def report_page(core: CoreOf, actor: ActorOf, id: str) -> Response:
     page = await run_in_threadpool(path.read_text, "utf-8")
     links = {"/": "Fleet"} | ({vehicle_page("", row.vehicle_id): row.vehicle_id} if row.vehicle_id else {})
     links |= {"/pages/work": "Reports", f"/reports/{row.id}": "JSON"}
+    if path.with_name(IMPROVED).is_file():
+        links |= {f"/reports/{row.id}/system": "System file with what was found"}
     return HTMLResponse(with_links(page, links))
+
+
+@router.get("/reports/{id}/system", summary="The system file with what was found", response_class=PlainTextResponse)
+async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
+    """Nominal values, laws and noise as the diagnosis found them, in a copy of the system file: for `serve --system`,
+    `replay --system` and the other commands."""
+    row = await _report(core, actor, id)
+    path = core.settings.reports / row.id / IMPROVED
+    if not path.is_file():
+        raise NotFound(f"the system file of report {row.id} is not kept")
+    text = await run_in_threadpool(path.read_text, "utf-8")
+    named = {"Content-Disposition": f'attachment; filename="{row.id}.yaml"'}
+    return Response(text, media_type="application/yaml", headers=named)
 
 
 async def _of_upload(request: Request, core: Core, actor: Actor) -> JobRow:

@@ -25,7 +25,7 @@ from sprung.service.pages.render import STATIC
 from sprung.service.settings import Settings
 from tests.service_fakes import make_window
 
-NO_JSON = {"/metrics", "/events", "/vehicles/{id}/bundle", "/reports/{id}/page"}
+NO_JSON = {"/metrics", "/events", "/vehicles/{id}/bundle", "/reports/{id}/page", "/reports/{id}/system"}
 EMPTY = {("/vehicles/{id}", "delete")}
 
 

@@ -331,6 +331,17 @@ def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recordin
     assert page.text == "<p>the page</p>"
 
 
+def test_the_system_file_with_what_was_found_is_handed_out(client: TestClient, core: Core, recording: Path) -> None:
+    with open(recording, "rb") as stream:
+        job = client.post("/diagnose", files={"file": ("ride.csv", stream)}).json()
+    report = finished(client, job)["result"]["report"]
+    assert client.get(f"/reports/{report}/system").status_code == 404
+    (core.settings.reports / report / "system.yaml").write_text("name: found\n")
+    answer = client.get(f"/reports/{report}/system")
+    assert answer.text == "name: found\n" and answer.headers["content-type"].startswith("application/yaml")
+    assert client.get("/reports/none/system").status_code == 404
+
+
 def test_a_stored_recording_is_diagnosed_by_id(client: TestClient, recording: Path) -> None:
     job = finished(client, upload(client, recording).json())
     response = client.post("/diagnose", json={"recording": job["recording"]})
