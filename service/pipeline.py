@@ -22,6 +22,7 @@ from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_wi
 from sprung.service.times import now_ns
 from sprung.service.views import vehicle_view
 
+LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 
 OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
@@ -274,8 +275,13 @@ class Pipeline:
             return held
         row = fleet.load_tracker(connection, vehicle, self.model_id)
         if row is None:
-            return _Vehicle(0, -1, self.engine.tracker.initial_state())
+            return _Vehicle(0, -1, self._newcomer(connection))
         return _Vehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
+
+    def _newcomer(self, connection: Connection) -> TrackerState:
+        """State of a vehicle never seen: what weather does to springs, others of its fleet have learned."""
+        rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
+        return self.engine.tracker.newcomer([self.engine.load_state(row.state) for row in rows])
 
     def relearn(self, vehicle: str, names: Sequence[str] | None, connection: Connection) -> Batch:
         """Forget baselines (all, or those of `names`) inside a transaction of the caller's, e.g. after a repair.

@@ -128,6 +128,12 @@ class Tracker:
             cargo=cargos.start(np.diag(self.model.prior)[self.model.loads]),
         )
 
+    def newcomer(self, others: Iterable[TrackerState]) -> TrackerState:
+        """Nothing seen yet, but what other vehicles of the system have learned of weather, load and speed."""
+        known = [s.weather for s in others if s.weather is not None and s.names == self.names]
+        whole = [w for w in known if len(w.common) == self.weather.groups]
+        return replace(self.initial_state(), weather=weathers.start(weathers.pooled(self.weather, whole)))
+
     def update(
         self, state: TrackerState, estimate: Estimate, time_ns: int, conditions: Conditions | None = None
     ) -> TrackerState:

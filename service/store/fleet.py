@@ -131,6 +131,14 @@ def load_tracker(connection: Connection, vehicle: str, model_id: int) -> Tracker
     return None if row is None else TrackerRow(*row)
 
 
+def latest_trackers(connection: Connection, model_id: int, most: int) -> list[TrackerRow]:
+    """Stored trackers of the vehicles that ran last."""
+    table = tracker_states
+    query = select(table.c.last_window_ns, table.c.revision, table.c.state).where(table.c.model_id == model_id)
+    rows = connection.execute(query.order_by(table.c.last_window_ns.desc()).limit(most))
+    return [TrackerRow(*row) for row in rows]
+
+
 def tracker_revision(connection: Connection, vehicle: str, model_id: int) -> int | None:
     """The revision of the stored tracker, without reading its state."""
     query = select(tracker_states.c.revision).where(

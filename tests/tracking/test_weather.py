@@ -123,12 +123,13 @@ def test_a_state_without_weather_goes_on_and_begins_to_learn_it():
 
 def test_the_fleet_teaches_a_new_vehicle_its_slopes():
     rng = np.random.default_rng(9)
-    slope, found = -0.003, []
+    slope, others = -0.003, []
     for _ in range(3):
         state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k, slope)[1],
                     lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
-        found.append(state.weather)
-    prior = weather.pooled(tracker().weather, found)
+        others.append(state)
+    prior = weather.pooled(tracker().weather, [s.weather for s in others])
+    assert np.array_equal(tracker().newcomer(others).weather.kind_mean, prior.kind_mean)
     dampers = prior.kind_mean[:, 1] < -0.01
     assert np.allclose(prior.kind_mean[dampers, 1] / weather.KELVIN, slope, atol=3e-4)
     assert np.all(prior.kind_std[dampers, 1] < tracker().weather.kind_std[dampers, 1])
