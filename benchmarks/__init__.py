@@ -30,6 +30,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "vehicles with laws in their file: coverage, errors, windows per second, drift of a law",
     ),
     "exchange": ("sprung.benchmarks.exchange", "exports read by other programs, against our own free run"),
+    "day": (
+        "sprung.benchmarks.day",
+        "months of service: weather, loads, clocks, drifting gains; false alarms, hidden faults",
+    ),
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
