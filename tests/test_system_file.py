@@ -250,3 +250,27 @@ def test_the_schema_for_editors_knows_short_forms_and_every_kind(capfd):
     assert {"type": "number"} in mass["anyOf"]
     (entry,) = schema["properties"]["inputs"]["patternProperties"].values()
     assert set(entry["discriminator"]["mapping"]) == {"displacement", "support", "track", "force"}
+
+
+FOLLOWED = """
+name: damper
+sample_rate: 100
+window: 64
+inputs: {rod: {kind: displacement, displacement: {csv: d}}}
+signals: {valve: {csv: U, unit: V, scale: 2.0}}
+elements: {damper: {upper: rod, lower: ground, stiffness: 1e3, damping: 1e3, depends_on: [%s]}}
+sensors: {cell: {kind: force, element: damper, csv: F}}
+"""
+
+
+def test_signals_that_parameters_follow_are_channels_of_their_own() -> None:
+    system = parse_system(FOLLOWED % "valve")
+    (valve,) = system.signals
+    assert (valve.name, valve.unit, valve.csv, valve.gain) == ("valve", "V", "U", 2.0)
+    assert "valve" not in [channel.name for channel in system.channels]
+    assert system.digest == parse_system(FOLLOWED % "").digest  # no window sees it
+
+
+def test_a_signal_that_nobody_measures_is_an_error_with_the_likely_one() -> None:
+    with pytest.raises(SystemFileError, match="did you mean 'valve'"):
+        parse_system(FOLLOWED % "vavle")

@@ -66,6 +66,21 @@ def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest
     assert reversal_step(np.ones(10)) == 0.0
 
 
+@pytest.mark.parametrize("p", [(9e4, 300.0, 1.0), (9e4, 300.0**2, 2.0, 0.2)])
+def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p):
+    law = find_law("bouc_wen") if len(p) == 3 else find_law("bouc_wen").wider
+    way = np.linspace(0, 1.0, 200)  # far beyond yielding
+
+    def yields(values):
+        return force_along(law, values, way, np.ones(200), np.arange(200) / 200, SpringDamper(4e5, 2e4))[-1]
+
+    others = law.alike(p)
+    assert len(others) == 2
+    for other in others:
+        assert yields(other) == pytest.approx(yields(p), rel=1e-3)
+        assert law.admits(other)
+
+
 def test_laws_that_contain_commoner_ones_must_beat_them():
     rare = {law.name for law in CATALOGUE if law.prior_cost == RARE}
     assert rare == {
