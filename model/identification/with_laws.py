@@ -33,8 +33,8 @@ _FITS = 1.5  # chi-square of a window that stands where it belongs, generously
 _ENOUGH = 3  # such windows tell where those of a batch that went astray should begin
 _OPENING = 1  # rounds of forces and first state before the first iteration
 _CONVERGED = 0.3  # a second step this small, in standard deviations, leaves an error far below it
-_STILL = 0.1  # a first step this small: the window stands at its minimum, whatever the second one says
-_SLACK = 1.0  # of chi-square, by which a step may be worse: neither forces nor smoothed inputs settle closer
+_STILL = 0.3  # a first step this small: the window stands at its minimum, whatever the second one says
+_SLACK = 2.0  # of chi-square, by which a step may be worse: neither forces nor smoothed inputs settle closer
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 
 
