@@ -63,8 +63,10 @@ class RestlessClient(threading.Thread):
         self, method: str, path: str, body: bytes = b"", kind: str = "application/json", identity: str = ""
     ) -> tuple[int, Any]:
         """Status and JSON of an answer."""
-        assert self.port is not None
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=TIMEOUT)
+        port = self.port
+        if port is None:
+            raise ConnectionError("the service is gone")
+        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT)
         try:
             connection.request(
                 method, path, body, {"content-type": kind} | ({"x-request-id": identity} if identity else {})

@@ -184,6 +184,15 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
     )
 
 
+def spoken(parameter: str) -> str:
+    """A parameter as a sentence has it: of `*.damping` and `primary_*.damping` what they mean."""
+    element, _, quantity = parameter.rpartition(".")
+    if "*" not in element:
+        return parameter
+    group = element.replace("*", "").strip("_").replace("_", " ")
+    return f"{quantity} of all {f'{group} ' if group else ''}elements"
+
+
 def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
     """Severity of an alarm of all elements of a kind, `*.damping` or `primary_*.damping`, to which one belongs."""
     return next(

@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.views import finite
+from sprung.service.views import finite, spoken
 
 ALARM_TYPES = {"opened": "sprung.alarm.opened", "changed": "sprung.alarm.changed", "closed": "sprung.alarm.closed"}
 REPORT_READY = "sprung.report.ready"
@@ -83,7 +83,8 @@ def sentence(event: dict[str, Any]) -> str:
     data = event["data"]
     if event["type"].startswith("sprung.alarm."):
         alarm = data["alarm"]
-        what = alarm["parameter"] or {"misfit": "windows no longer fit the model"}.get(alarm["kind"], alarm["kind"])
+        kind = {"misfit": "windows no longer fit the model"}.get(alarm["kind"], alarm["kind"])
+        what = spoken(alarm["parameter"] or "") or kind
         size = "" if alarm["change"] is None else f" {100 * alarm['change']:+.1f} %"
         return f"{data['vehicle']}: {alarm['severity']} {event['type'].rsplit('.', 1)[1]}: {what}{size}"
     if event["type"] == REPORT_READY:

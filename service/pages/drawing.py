@@ -211,7 +211,7 @@ def _element(name: str, short: str, across: float, head: float, base: float, par
         f"V{cup:.1f}H{x + 8:.1f}V{top + 12:.1f}M{x - 6:.1f},{top + 20:.1f}H{x + 6:.1f}M{x:.1f},{top + 20:.1f}"
         f'V{head:.1f}"/></g>'
         f'<text class="name" x="{across:.1f}" y="{head + 13:.1f}">{escape(short)}</text>'
-        + _said(spring, across - 16, base - 5)
+        + _said(spring, across - 16, base - (17 if damper.text else 5))
         + _said(damper, across + 16, base - 5)
         + "</a>"
     )

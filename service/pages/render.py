@@ -13,6 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
 from sprung.service.times import to_iso
+from sprung.service.views import spoken
 
 STATIC = Path(__file__).parent / "static"
 LITERAL = re.compile(r"`([^`]*)`")
@@ -28,7 +29,7 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment}
+    environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment, "spoken": spoken}
     environment.globals["asset"] = asset
     return environment
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
-from sprung.service.views import VehicleView
+from sprung.service.views import VehicleView, spoken
 
 MOSTLY = 0.5  # share of the windows from which something is worth a hint
 
@@ -63,11 +63,15 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
         many = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         level = "alarm" if any(a.severity == "alarm" for a in changed) else "warning"
         size = "" if worst.change is None else f" by {100 * worst.change:+.1f} %"
+        together = "*" in (worst.parameter or "")
         text = (
-            "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew. "
+            "All of them together: weather, load, speed or a scale more often than wear. Compare with other vehicles. "
+            "Acknowledge the alarm so that others see that somebody looks into it."
+            if together
+            else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew. "
             "Acknowledge the alarm so that others see that it is being worked on."
         )
-        found.append(Hint(level, f"{worst.parameter} has changed{size}{many}", text))
+        found.append(Hint(level, f"{spoken(worst.parameter or '')} has changed{size}{many}", text))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
         found.append(Hint("warning", "Windows no longer fit the model", text))

@@ -135,7 +135,7 @@ def test_every_control_of_the_vehicle_page_is_reached_by_keys_and_seen(address: 
 def test_an_alarm_is_acknowledged_by_keys(address: str, browser: Any) -> None:
     page = browser.new_page()
     page.goto(address + PAGES["vehicle"])
-    button = page.get_by_role("button", name="Acknowledge")
+    button = page.get_by_role("button", name="Acknowledge").first
     button.focus()
     page.keyboard.press("Enter")
     page.wait_for_timeout(1500)

@@ -28,6 +28,7 @@ from sprung.service.settings import Settings
 from sprung.service.store import Store
 from sprung.service.store.lists import list_deliveries
 from sprung.service.times import NANOSECONDS, now_ns
+from sprung.service.views import spoken
 from tests.service_fakes import make_window
 
 SECRET = "whsec_" + base64.b64encode(b"a secret of many letters").decode()
@@ -210,3 +211,9 @@ def test_wrong_receivers_are_refused_at_the_start(tmp_path: Path, store: Store, 
 
 def test_without_a_secret_nothing_is_signed() -> None:
     assert "webhook-signature" not in signature("i", 1, b"{}", None)
+
+
+def test_alarms_of_all_elements_are_told_in_words() -> None:
+    assert spoken("*.damping") == "damping of all elements"
+    assert spoken("primary_*.stiffness") == "stiffness of all primary elements"
+    assert spoken("secondary_2l.damping") == "secondary_2l.damping"
