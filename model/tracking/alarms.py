@@ -115,7 +115,8 @@ class Attribution:
         if "*" in name:
             members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
             still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
-            if not (still or state.changes.active[members].any()):
+            learning = np.isnan(drift.whole[members]).all()  # all baselines begin anew: nothing is left to compare with
+            if learning or not (still or state.changes.active[members].any()):
                 return _closed(alarm, now)
             return self._followed(alarm, *_common(replace(drift, change=drift.whole), members))
         i = self.names.index(name)
