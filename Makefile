@@ -7,14 +7,15 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 SOURCES := sprung noxfile.py docs/imports.py model replay service benchmarks tests
-DEMO := tests/data/drift-600s.blf
+DEMO := .demo/day.blf
 PORT ?= 8000
 PYTEST ?=
 
+.DELETE_ON_ERROR:
 .PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
 
 help:
-	@echo "make demo       install, replay the bundled recording, leave the service running"
+	@echo "make demo       install, replay a piece of a working day, leave the service running"
 	@echo "make fleet-demo the same as a fleet: PostgreSQL, Ray Serve, vehicles that send estimates"
 	@echo "make test       install, run the tests"
 	@echo "make test-slow  the tests that take minutes"
@@ -50,7 +51,12 @@ $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock
 fleet-demo: install-fleet
 	$(BIN)/sprung fleet demo --port $(PORT)
 
-demo: install
+# twenty minutes of a working day, always the same
+$(DEMO): | install
+	$(BIN)/python -m sprung.benchmarks.generator --day 1200 --seed 11 --clock 0.0002 --formats blf --out $(@D) \
+		--fault secondary_2r.damping,420,0.7,240 --fault bogie1_1l.gain,780,1.06,180
+
+demo: install $(DEMO)
 	$(BIN)/sprung serve --replay $(DEMO) --port $(PORT) --data-dir .demo
 
 test: install-dev
