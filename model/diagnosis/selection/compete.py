@@ -276,7 +276,8 @@ def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
     """
     if problem.memory is None:
         return _joint_start(problem, base, hit)
-    key = "start", id(base), hit.term, problem.rules.selection.hint
+    term = hit.term
+    key = "start", id(base), term.key, term.parameters, term.scales, problem.rules.selection.hint
     return problem.memory.recall(key, lambda: _joint_start(problem, base, hit))
 
 

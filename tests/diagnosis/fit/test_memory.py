@@ -10,6 +10,9 @@ from sprung.model.diagnosis.fit.memory import FitMemory, key_of
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.compete import joint_start
+from sprung.model.laws import CATALOGUE
 from tests.diagnosis_cases import problem_of, simulate
 
 
@@ -42,3 +45,15 @@ def test_what_goes_into_a_fit_is_in_its_key() -> None:
         key_of(problem.system, problem.part, problem.noise, start, 3, np.ones(2)),
     }
     assert len(keys) == 5
+
+
+def test_starts_of_sensors_faults_are_remembered_too() -> None:
+    record = simulate(seconds=8.0)
+    record.values[:, 4] *= 0.9
+    problem = replace(problem_of(record), memory=FitMemory())
+    base = optimise(problem, start_of(problem), iterations=3)
+    found = screen(problem, base, CATALOGUE)
+    assert screen(problem, base, CATALOGUE) is found
+    gain = next(hit for hit in found.candidates if hit.effect == "sensor_gain")
+    first = joint_start(problem, base, gain)
+    assert joint_start(problem, base, gain) is first
