@@ -74,7 +74,7 @@ class PostgresServer:
         self._made += 1
         name = f"sprung_{self._made}"
         with psycopg.connect(self.url("postgres").replace("+psycopg", ""), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}")  # type: ignore[arg-type]
+            connection.execute(f"CREATE DATABASE {name}")
         return self.url(name)
 
     def url(self, name: str) -> str:
@@ -106,8 +106,9 @@ def server(durable: bool = False) -> Iterator[PostgresServer]:
     """A running server; it is gone afterwards."""
     with tempfile.TemporaryDirectory(prefix="sprung-pg-", dir="/tmp") as name:
         folder = Path(name)
-        if os.geteuid() == 0:
-            shutil.chown(folder, user=_user())
+        user = _user()
+        if os.geteuid() == 0 and user is not None:
+            shutil.chown(folder, user=user)
         found = PostgresServer(folder, _free_port(), durable)
         found.initdb()
         found.start()
