@@ -140,6 +140,24 @@ class RideQuality:
             self.minutes.append(minute(self._held[:whole], self.rate, began))
             self._held = self._held[whole - lead :]
 
+    def by_minute(self) -> list[tuple[int, dict[str, dict[str, float | None]]]]:
+        """Start, ns, and quantities by sensor, m/s^2, of every minute."""
+        return [
+            (
+                m.start,
+                {
+                    name: {
+                        "wb_rms": _number(np.sqrt(np.mean(m.blocks[:, i] ** 2))),
+                        "wk_rms": _number(m.wk[i]),
+                        "en14363_peak": _number(m.peak[i]),
+                        "en14363_rms": _number(m.rms[i]),
+                    }
+                    for i, name in enumerate(self.names)
+                },
+            )
+            for m in self.minutes
+        ]
+
     def summary(self) -> dict[str, object]:
         """What a ride was like, sensor by sensor; None where there is too little of it, or no sensor."""
         if not self.minutes:

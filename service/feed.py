@@ -18,9 +18,10 @@ from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Priority
 from sprung.service.pipeline import Batch, Identified, Pipeline
 from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
-from sprung.service.times import NANOSECONDS
+from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.worker import ProcessLimits
 
+MOST_MINUTES = 1440  # of comfort that a summary keeps
 MOST_LOST = 0.1  # of the samples; with more, too few windows can be used
 NOT_IN_IDS = re.compile(r"[^A-Za-z0-9._:-]")
 
@@ -78,7 +79,7 @@ class Fed:
             "monitored": self.monitored,
             "late_windows": self.late,
             "stored_before": self.stored_before,  # windows of a recording that was sent before
-            "comfort": None if self.ride is None else self.ride.summary(),
+            "comfort": None if self.ride is None else ride_dict(self.ride),
         }
 
 
@@ -156,9 +157,15 @@ def feed_file(
     return fed
 
 
+def ride_dict(ride: comfort.RideQuality) -> dict[str, Any]:
+    """The comfort of a ride, and of each of its latest minutes."""
+    minutes = ride.by_minute()[-MOST_MINUTES:]
+    return ride.summary() | {"by_minute": [{"start": to_iso(start), "sensors": told} for start, told in minutes]}
+
+
 def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
     """The ride's comfort, and what the changes from the vehicle's own baseline cost of it on an average track."""
-    told = fed.ride.summary() if fed.ride is not None else {"minutes": 0, "sensors": {}}
+    told = ride_dict(fed.ride) if fed.ride is not None else {"minutes": 0, "sensors": {}}
     if fed.state is None:
         return told | {"cost": None}
     reports = pipeline.engine.tracker.report(fed.state)

@@ -67,6 +67,10 @@ def test_minutes_are_the_same_however_windows_overlap(vehicle: System) -> None:
         assert one.start == other.start
         assert np.allclose(one.blocks, other.blocks)
     assert straight.minutes[1].start - straight.minutes[0].start == 60_000_000_000
+    start, sensors = straight.by_minute()[1]
+    assert start == straight.minutes[1].start
+    assert sensors["car_1l"]["wk_rms"] == straight.minutes[1].wk[0]
+    assert sensors["car_1l"]["wb_rms"] == pytest.approx(np.sqrt(np.mean(straight.minutes[1].blocks[:, 0] ** 2)))
 
 
 def test_a_gap_begins_a_new_minute_and_too_little_says_nothing(vehicle: System) -> None:
