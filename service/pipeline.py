@@ -275,7 +275,9 @@ class Pipeline:
             return held
         row = fleet.load_tracker(connection, vehicle, self.model_id)
         if row is None:
-            return _Vehicle(0, -1, self._newcomer(connection))
+            # a back-fill must not depend on which vehicle is done first
+            new = self._newcomer(connection) if self._shown else self.engine.tracker.initial_state()
+            return _Vehicle(0, -1, new)
         return _Vehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
 
     def _newcomer(self, connection: Connection) -> TrackerState:
