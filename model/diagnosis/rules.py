@@ -27,9 +27,6 @@ class RecordRules:
     moves: float = rule(2.0, "noise deviations by which one sensor has to move; chosen: 1 is noise alone", 1.5, 3.0)
     longest: int = rule(18_000, "samples; chosen: three minutes of a vehicle, 2 to 3 GB of memory", 12_000, 60_000)
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
-    wanders: float = rule(0.3, "of the supports' relative motion, noise of an integral; chosen", 0.15, 0.5)
-    held_at_most: float = rule(1.0, "Hz; derived: a car body's slowest mode must still be driven", 0.5, 1.5)
-    may_move: float = rule(10.0, "times the deviation that an integral is held with; chosen: long waves", 5.0, 20.0)
 
 
 @dataclass(frozen=True)

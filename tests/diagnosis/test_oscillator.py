@@ -86,7 +86,6 @@ def signals_of(record: MadeRecord) -> Signals:
         force_names=("shaker",),
         integrated=np.zeros(0, dtype=bool),
         accelerated=np.zeros(0, dtype=bool),
-        held=np.zeros(0),
     )
 
 

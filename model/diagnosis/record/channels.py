@@ -10,12 +10,11 @@ from scipy.interpolate import CubicSpline
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
-from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS
 from sprung.model.simulate.fusion import motion
-from sprung.model.system import USUAL_NOISE, System
+from sprung.model.system import System
 
 MINIMUM_SAMPLES = RULES.record.minimum_samples
 
@@ -70,9 +69,7 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     first, last, used = _affordable(system, values, sample_rate, (first, last), rules.longest)
     values = _close_gaps(values[first:last])
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
-    prepared = replace(prepared, signals=_held(system, values, prepared.signals, rules))
     _require_motion(system, prepared.signals, rules)
-    _require_accelerometers(system, prepared.signals)
     return replace(prepared, used=used)
 
 
@@ -104,20 +101,6 @@ def _require_motion(system: System, signals: Signals, rules: RecordRules) -> Non
             f"too still to decide anything: no sensor moves by {rules.moves:g} times its noise "
             f"({signals.sensor_names[best]}: {moves[best]:.2g}, noise {noise[best]:.2g}); "
             "record faster or on rougher track"
-        )
-
-
-def _require_accelerometers(system: System, signals: Signals) -> None:
-    """Over a whole recording a twofold integral wanders further than any sensor of positions may be off."""
-    kinds = system.mechanics.sensor_kind[signals.sensor_index]
-    wandering = [
-        n for n, a, i in zip(signals.support_names, signals.accelerated, signals.integrated, strict=True) if a & i
-    ]
-    other = [n for n, kind in zip(signals.sensor_names, kinds, strict=True) if kind != ACCELERATION]
-    if wandering and other:
-        raise DiagnosisError(
-            f"{wandering[0]} is measured by its acceleration alone: a recording can be diagnosed with accelerometers "
-            f"only; leave {other[0]} out, or measure the displacement or velocity of {wandering[0]} as well"
         )
 
 
@@ -192,6 +175,11 @@ def _by_role(
         column += len(quantities)
         if not there:
             raise DiagnosisError(_missing(name, frozen))
+        if set(there) == {"acceleration"}:  # over a whole recording the noise of its integral goes by metres
+            raise DiagnosisError(
+                f"input {name} is measured by its acceleration alone: windows are identified with it, but a whole "
+                "recording cannot be diagnosed; measure its displacement or velocity as well"
+            )
         if "displacement" not in there and "displacement" in quantities:
             notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
         d, v = _moved(source, there, 1 / sample_rate)
@@ -220,7 +208,6 @@ def _by_role(
         force_names=tuple(force_names),
         integrated=np.array(integrated, dtype=bool),
         accelerated=np.array(accelerated, dtype=bool),
-        held=np.zeros(len(support_names)),
         start=first / sample_rate,
     )
     return Prepared(signals, stuck, tuple(notes))
@@ -235,37 +222,6 @@ def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> 
     noise = {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured}
     d, _ = motion(by_order, dt, noise)
     return d, measured.get("velocity", apart) if set(measured) == {"velocity"} else apart
-
-
-def _held(system: System, values: FloatArray, signals: Signals, rules: RecordRules) -> Signals:
-    """Signals in which displacements that are integrals of accelerations alone do not wander.
-
-    Over a whole recording their noise goes by metres, which laws that depend on the deflection must not see: they are
-    held to zero with the standard deviation at which, from some frequency on, the noise is `wanders` of the motion.
-    """
-    names = [channel.name for channel in system.channels]
-    there = {name for name, column in zip(names, values.T, strict=True) if np.isfinite(column[0])}
-    held = zip(signals.support_names, signals.accelerated & signals.integrated, strict=True)
-    at = [i for i, (name, wanders) in enumerate(held) if wanders and f"{name}.velocity" not in there]
-    if not at:
-        return signals
-    columns = [names.index(f"{signals.support_names[i]}.acceleration") for i in at]
-    measured, dt = values[:, columns], 1 / signals.sample_rate
-    noise = np.array([system.channels[c].noise or USUAL_NOISE["m/s^2"] for c in columns])
-    relative = measured - measured.mean(axis=1, keepdims=True) if len(at) > 1 else measured
-    taper = np.hanning(len(values))[:, None]
-    omega = 2 * np.pi * np.fft.rfftfreq(len(values), dt)[1:, None]
-    power = np.abs(np.fft.rfft(relative * taper, axis=0)[1:]) ** 2 / np.sum(taper**2) / omega**4
-    above = [np.sqrt(part[::-1].mean(axis=1).cumsum()[::-1]) for part in (noise**2 / omega**4, power)]
-    loud = np.flatnonzero(above[0] > rules.wanders * above[1])
-    first = min(int(loud[-1]) + 1 if len(loud) else 0, len(omega) - 1)
-    level = noise / min(float(omega[first, 0]), 2 * np.pi * rules.held_at_most) ** 2
-    displacement, open_ = signals.displacement.copy(), np.zeros(signals.displacement.shape[1])
-    for i, series, std, own in zip(at, measured.T, noise, level, strict=True):
-        both = {0: np.zeros(len(series)), 2: series - series.mean()}
-        displacement[:, i], _ = motion(both, dt, {0: float(own), 2: float(std)})
-        open_[i] = rules.may_move * own
-    return replace(signals, displacement=displacement, held=open_)
 
 
 def _missing(name: str, frozen: set[str]) -> str:

@@ -26,7 +26,6 @@ _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _LEAST = 0.2  # of a sensor's declared noise, or of what its fastest changes leave room for
 _ORDER = 8  # of the differences that tell those
 _SEEN = 1e-9  # of a loose motion
-_OPEN = 1e8  # times its noise power: nothing is known of a mean
 _END = 9  # samples that tell the slope at an end of a record
 
 
@@ -45,7 +44,6 @@ class Signals:
     force_names: tuple[str, ...]
     integrated: np.ndarray  # supports whose displacement is only an integral, (supports,)
     accelerated: np.ndarray  # supports in whose displacement a measured acceleration is fused already, (supports,)
-    held: FloatArray  # m, how far off displacements may be that are integrals of accelerations alone, (supports,)
     start: float = 0.0  # s, time of the first sample since the start of the recording
 
     @property
@@ -91,10 +89,7 @@ class Noise:
         The noise of the record's two ends, where the rate's line is anchored, spreads over all bins alike.
         """
         ends = 2 / (grid.samples * grid.step**2)
-        variance = self.sensors**2 * np.where(differentiated, grid.omega[:, None] ** 2 + ends, 1.0)
-        if np.any(np.isinf(self.velocity) & np.isfinite(self.acceleration)):
-            variance[0] *= _OPEN  # the mean of an acceleration, whose offset is unknown, moves everything alike
-        return variance
+        return self.sensors**2 * np.where(differentiated, grid.omega[:, None] ** 2 + ends, 1.0)
 
 
 @dataclass(frozen=True)
@@ -125,7 +120,7 @@ def declared_noise(system: System, signals: Signals) -> Noise:
             stated = {quantity: address.noise for quantity, address in source.measured.items()}
             level = stated.get("displacement", 0.0) or 1e-3 * size
             if signals.integrated[at_support]:
-                level = signals.held[at_support] or _INTEGRATED * max(level, size)
+                level = _INTEGRATED * max(level, size)
             displacement.append(level)
             level = stated.get("velocity", 0.0) or 1e-3 * _size(signals.velocity[:, at_support])
             measured = np.isfinite(signals.velocity[0, at_support]) or (fused and "velocity" in stated)
