@@ -5,9 +5,9 @@
 >>> len(system.parameters)
 24
 
-`load_system`, `open_recording`, `load_record`, `identify`, `track`, `diagnose`, `write_report` and `simulate` are what
-most programs need; `docs/python.md` shows them at work.  Names load when they are first used, so that `import sprung`
-and `sprung --help` are quick.
+`load_system`, `open_recording`, `load_record`, `identify`, `track`, `diagnose`, `write_report`, `simulate` and `Client`
+are what most programs need; their docstrings show them at work.  Names load when they are first used, so that
+`import sprung` and `sprung --help` are quick.
 """
 
 import lazy_loader

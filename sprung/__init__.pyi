@@ -11,5 +11,6 @@ from .api import parse_system as parse_system
 from .api import simulate as simulate
 from .api import track as track
 from .api import write_report as write_report
+from .client import Client as Client
 
 __version__: str
