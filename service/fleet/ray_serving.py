@@ -129,7 +129,7 @@ async def _asked(pending: Any) -> Any:
     except BackPressureError:
         raise Busy("too many requests wait; try again in a second") from None
     except RayTaskError as error:
-        raise error.as_instanceof_cause() from None
+        raise error.cause from None
 
 
 def application(settings: Settings, sizes: ServingSizes) -> Any:

@@ -88,7 +88,7 @@ class RayTasks:
         try:
             return self._ray.get(pending)
         except self._ray.exceptions.RayTaskError as error:
-            raise error.as_instanceof_cause() from None
+            raise error.cause from None  # as it was raised, without the worker's traceback in its text
 
     def close(self) -> None:
         """Stop a Ray that was started here."""
