@@ -234,7 +234,8 @@ def test_the_steps_of_the_image_make_a_service_that_answers(tmp_path: Path) -> N
 def test_the_lock_with_hashes_is_the_lock() -> None:
     def pinned(name: str) -> list[str]:
         lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
-        return sorted(line.split()[0].lower() for line in lines if "==" in line and not line.startswith("#"))
+        found = [line.split()[0].lower().partition("==") for line in lines if "==" in line and not line.startswith("#")]
+        return sorted(f"{re.sub('[-_.]+', '-', package)}=={version}" for package, _, version in found)
 
     plain = [line for line in pinned("requirements.lock") if not line.startswith("torch==")]
     assert pinned("requirements.hashes.lock") == plain, "run `make lock`"
