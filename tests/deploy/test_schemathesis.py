@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
@@ -52,7 +53,8 @@ def schemathesis(address: str, folder: Path, *options: str) -> str:
 
 
 def test_the_examples_of_the_description_are_answered_as_described(address: str, tmp_path: Path) -> None:
-    assert "33/33" in schemathesis(address, tmp_path, "--phases", "examples")
+    said = schemathesis(address, tmp_path, "--phases", "examples")
+    assert re.search(r"Selected: (\d+)/\1\b", said), said
 
 
 @pytest.mark.slow
