@@ -121,12 +121,17 @@ def start(model: WeatherModel) -> Weather:
 
 
 def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather:
-    """After a repair of the parameters `rows` (P,): their baseline is learned anew, with what was known of slopes."""
+    """After a repair of the parameters `rows` (P,): their baseline is learned anew, with what was known of slopes.
+
+    A kind of which nothing old is left has nothing in common with its past either.
+    """
     mean, covariance = weather.mean.copy(), weather.covariance.copy()
     mean[rows, 0] = 0.0
     covariance[rows, 0, :] = covariance[rows, :, 0] = 0.0
     covariance[rows, 0, 0] = model.std[rows, 0] ** 2
-    return replace(weather, mean=mean, covariance=covariance)
+    whole = np.array([bool(rows[model.group == g].all()) for g in range(model.groups)], dtype=bool)
+    fresh = {n: np.where(whole, 0.0, getattr(weather, n)) for n in ("common", "variance", "settled", "slack")}
+    return replace(weather, mean=mean, covariance=covariance, **fresh)
 
 
 def features(conditions: Conditions | None, load: float | None) -> FloatArray:

@@ -55,9 +55,9 @@ def test_the_documented_law_runs_in_the_simulation_and_takes_out_energy(law):
 def test_the_table_names_every_law_and_parameter():
     text = DOCUMENT.read_text(encoding="utf-8")
     for law in CATALOGUE:
-        (row,) = [line for line in text.splitlines() if line.startswith(f"| `{law.name}`")]
-        for parameter in law.parameters:
-            assert re.search(rf"\b{parameter.name} \(", row), (law.name, parameter.name)
+        rows = [line for line in text.splitlines() if line.startswith(f"| `{law.name}`")]
+        missing = [[p.name for p in law.parameters if not re.search(rf"\b{p.name}( [A-Za-z]+)? \(", r)] for r in rows]
+        assert [] in missing, (law.name, missing)  # a law in two forms has two rows
 
 
 def test_a_file_without_laws_is_refused_in_one_line(tmp_path):

@@ -174,7 +174,7 @@ def test_histories_as_parquet(client: TestClient, broken: str, system: System) -
 
 def test_pages_show_states_and_what_to_do(client: TestClient, core: Core, system: System, broken: str) -> None:
     page = client.get("/pages/vehicles/a").text
-    assert "Inspect the element" in page and 'class="spring alarm"' in page
+    assert "All of them together" in page and 'class="spring alarm"' in page
     assert page.count('class="element"') == len(system.elements)
     assert page.count('data-sensor="') >= len(system.sensors)
     core.pipeline.process("young", [make_window(system, i) for i in range(5)])

@@ -75,7 +75,8 @@ def test_a_back_up_that_was_cut_short_is_refused_and_leaves_nothing(
     whole = tmp_path / "b.tar"
     back_up(lived_in, whole)
     cut = tmp_path / "cut.tar"
-    cut.write_bytes(whole.read_bytes()[: round(share * whole.stat().st_size)])
+    content = whole.read_bytes().rstrip(b"\0")  # without the blocks of zeros that fill an archive up
+    cut.write_bytes(content[: round(share * len(content))])
     new = Settings(data_dir=tmp_path / "new")
     with pytest.raises(UserError, match="back-up"):
         restore(new, cut)
