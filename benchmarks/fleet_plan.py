@@ -34,7 +34,7 @@ HEADROOM = 0.7  # of the cores, busy
 WINDOWS_PER_SECOND = 2.0  # of a vehicle that runs
 RUNNING_SHARE = 0.5  # of the day
 KEPT_DAYS = 30.0
-CORE_YEAR = 250.0  # EUR: a rented core, a year; change with --core-eur in docs/fleet.md's table
+CORE_YEAR = 250.0  # EUR: a rented core, a year: assumed, as the two below
 GIGABYTE_YEAR = 1.2  # EUR: replicated network disk
 OBJECT_GIGABYTE_YEAR = 0.25  # EUR: object storage
 
