@@ -107,8 +107,12 @@ def _line(name: str, file: str, truth: dict[str, Any], report: dict[str, Any], s
 def _recordings(
     folder: Path, count: int, seed: int, kinds: list[str] | None, weak: float, seconds: float, batch: int = 36
 ) -> Path:
-    """Makes what is not there yet, a batch at a time; the n-th recording does not depend on the count."""
+    """Makes what is not there yet, a batch at a time; the n-th recording does not depend on the count.
+
+    Seeds and lengths have folders of their own: reports kept beside recordings would be taken for those of others.
+    """
     vehicle = read_vehicle(MANCHESTER)
+    folder = folder / f"seed-{seed}-{seconds:g}s"
     for first in range(0, count, batch):
         part = folder / f"part-{first // batch:02d}"
         wanted = min(batch, count - first)
