@@ -11,6 +11,7 @@ import json
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -70,6 +71,7 @@ def run(
                 return
 
 
+@cache
 def commit() -> str:
     """The commit that a row was made at, "+" after it where files differ; "unknown" outside a checkout."""
     root = Path(__file__).resolve().parent.parent

@@ -138,18 +138,20 @@ def _untrained(method: str, data: _Data) -> tuple[dict[str, float | None], dict[
         reading = output_error.opened(task, data.splits["train"])
     elif method == "output_error":
         reading = output_error.calibrated(task, data.splits["train"])
-    found = _answered(task, method, reading, test, rows, starts)
-    move = metrics.aligned(task, found.encoded, found.true) if method != "zero" else _same
-    found = replace(found, encoded=move(found.encoded), simulated=move(found.simulated))
-    figures = evaluate.state_figures(task, found)
-    figures["SE_affine"] = figures["SE"]
-    if method != "zero":
-        like = data.splits["train"]
-        few = torch.arange(min(400, len(like.embeddings)))
-        fitted = _answered(task, method, reading, like, few, few % len(_STARTS) * 5)
-        affine = metrics.affine_gauge(task, fitted.simulated, fitted.true)
-        found = replace(found, simulated=affine(_answered(task, method, reading, test, rows, starts).simulated))
-        figures |= _gauge_free(task, found)
+    answered = _answered(task, method, reading, test, rows, starts)
+    if method == "zero":
+        figures = evaluate.state_figures(task, answered)
+        figures["SE_affine"] = figures["SE"]
+        return figures, evaluate.by_trajectory(task, answered, rows)
+    move = metrics.aligned(task, answered.encoded, answered.true)
+    moved = replace(answered, encoded=move(answered.encoded), simulated=move(answered.simulated))
+    figures = evaluate.state_figures(task, moved)
+    like = data.splits["train"]
+    few = torch.arange(min(400, len(like.embeddings)))
+    fitted = _answered(task, method, reading, like, few, few % len(_STARTS) * 5)
+    affine = metrics.affine_gauge(task, fitted.simulated, fitted.true)
+    found = replace(moved, simulated=affine(answered.simulated))
+    figures |= _gauge_free(task, found)
     if method == "output_error":
         for name in ("unseen", "below", "noisy"):
             other = data.splits[name]
@@ -157,10 +159,6 @@ def _untrained(method: str, data: _Data) -> tuple[dict[str, float | None], dict[
             beyond = evaluate.state_figures(task, _answered(task, method, reading, other, few, few % 26))
             figures[f"PE_{name}"], figures[f"PE_{name}_relative"] = beyond["PE"], beyond["PE_relative"]
     return figures, evaluate.by_trajectory(task, found, rows)
-
-
-def _same(states: Tensor) -> Tensor:
-    return states
 
 
 def _answered(

@@ -21,7 +21,7 @@ from sprung.model.alps.posterior import (
     von_mises_divergence,
     von_mises_sample,
 )
-from sprung.model.alps.task import WINDOW, Task
+from sprung.model.alps.task import WINDOW, Opening, Task
 
 
 @dataclass(frozen=True)
@@ -73,15 +73,13 @@ class PosteriorHead(nn.Module):
         """
         if self.opening is None:
             return
-        directions, mean = principal_components(embeddings)
-        weights, bias = self.opening((embeddings.double() - mean) @ directions.mT)
-        rows, offsets = (weights @ directions).float(), (bias - weights @ directions @ mean).float()
+        weights, offsets = (value.float() for value in opened_positions(self.opening, embeddings))
         at = 0
         for columns in self._mean_columns().values():
             here = slice(at, at + columns.stop - columns.start)
-            if here.stop > len(rows):
+            if here.stop > len(weights):
                 break
-            self.direct.weight[columns], self.direct.bias[columns] = rows[here], offsets[here]
+            self.direct.weight[columns], self.direct.bias[columns] = weights[here], offsets[here]
             at = here.stop
 
     def _mean_columns(self) -> dict[int, slice]:
@@ -137,18 +135,20 @@ class _Block(nn.Module):
         return z + self.forward_net(self.between(z))
 
 
-def principal_components(embeddings: Tensor) -> tuple[Tensor, Tensor]:
-    """Two rows (2, E) that whiten the first two components of embeddings (M, E), and the mean (E,); float64.
+def opened_positions(opening: Opening, embeddings: Tensor) -> tuple[Tensor, Tensor]:
+    """Affine map from embeddings (M, E) to the positions that a task's opening makes of their two principal components.
 
-    By the covariance in double precision: single precision leaves digits that depend on where a tensor lies in memory.
-    The sign, which is free, is that of the largest entry.
+    Weights (P, E) and offsets (P,), float64.  By the covariance in double precision: single precision leaves digits
+    that depend on where a tensor lies in memory.  The sign of a component, which is free, is that of its largest entry.
     """
     x = embeddings.double()
     mean = x.mean(0)
     variance, vectors = torch.linalg.eigh((x - mean).mT @ (x - mean) / len(x))
     directions = vectors[:, [-1, -2]].mT / variance[[-1, -2], None].sqrt()
     largest = directions.gather(1, directions.abs().argmax(1, keepdim=True))
-    return directions * largest.sign(), mean
+    directions = directions * largest.sign()
+    weights, offsets = opening((x - mean) @ directions.mT)
+    return weights @ directions, offsets - weights @ directions @ mean
 
 
 class AttentionEncoder(nn.Module):

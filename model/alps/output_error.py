@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from sprung.model.alps.encoder import principal_components
+from sprung.model.alps.encoder import opened_positions
 from sprung.model.alps.fit import Split
 from sprung.model.alps.task import ROLLOUT, WINDOW, Task, windows
 
@@ -84,12 +84,9 @@ def regressed(task: Task, embeddings: Tensor, states: Tensor) -> PositionReading
 
 def opened(task: Task, data: Split) -> PositionReading:
     """The untrained reading.  Errors: `ValueError` for a task with neither opening nor inputs."""
-    embeddings = data.embeddings.double().flatten(0, 1)[::7]
     if task.opening is not None:
-        directions, mean = principal_components(embeddings)
-        weights, bias = task.opening((embeddings - mean) @ directions.mT)
-        rows = weights @ directions
-        return PositionReading(task, rows.mT, bias - rows @ mean)
+        weights, offsets = opened_positions(task.opening, data.embeddings.flatten(0, 1)[::7])
+        return PositionReading(task, weights.mT, offsets)
     if not task.inputs:
         raise ValueError(f"{task.name}: nothing says where positions start: no opening, no inputs")
     count = len(data.embeddings)
