@@ -9,6 +9,7 @@ import typer
 
 from sprung import __version__
 from sprung.service.cli import fleet_commands
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.threads import hand_over_often, one_thread_each
 
@@ -28,19 +29,6 @@ Files = Annotated[
 File = Annotated[
     Path, typer.Argument(help="MCAP, BLF, ASC, candump .log, MF4, CSV and other tables; - is stdin.", metavar="FILE")
 ]
-System = Annotated[
-    Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
-]
-Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE", help="CAN database; default: the bundled system's.")]
-Weights = Annotated[
-    Path | None,
-    typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),
-]
-StoreUrl = Annotated[
-    str | None,
-    typer.Option("--store", metavar="URL", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
-]
-Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
 Start = Annotated[
     str | None,
     typer.Option(

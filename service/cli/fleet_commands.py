@@ -7,21 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
 from sprung.service.threads import one_thread_each
 
-System = Annotated[
-    Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
-]
-Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE", help="CAN database; default: the bundled system's.")]
-Weights = Annotated[
-    Path | None,
-    typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),
-]
-StoreUrl = Annotated[
-    str | None,
-    typer.Option("--store", metavar="URL", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
-]
-Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
 On = Annotated[str, typer.Option("--on", help="here, ray, or auto: Ray where it is installed.")]
 Workers = Annotated[
