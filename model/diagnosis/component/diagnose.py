@@ -8,7 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, ComponentTask, covariance, fitted, spread
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
-from sprung.model.diagnosis.component.pieces import SURFACE
+from sprung.model.diagnosis.component.piece import SURFACE
 from sprung.model.diagnosis.component.search import (
     Progress as Told,
 )

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.pieces import Part, Seen, Values
+from sprung.model.diagnosis.component.piece import Part, Seen, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.following import Covariate

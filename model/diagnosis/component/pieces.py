@@ -1,226 +1,23 @@
-"""What a component's force may be made of: laws of the catalogue, linear in their strengths once few shapes are fixed.
+"""The laws of the catalogue as pieces of a component's force: their strengths, shapes, and where shapes are sought.
 
-    F(t) = preload + k d + c v + sum over pieces of  strengths @ columns(motion; shapes)
-
-The strengths and k, c, preload follow by linear least squares for any shapes (variable projection, Golub and Pereyra
-1973), so that only one to three shapes per law are searched, on a grid first: no start can be far away.  What a law
-is stands in `model.laws`; a piece says which of its numbers are strengths and where its shapes are sought.
+What a law is stands in `model.laws`; here it is said which of its numbers are strengths and which are shapes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, find_law, grid, reversal_step
-from sprung.model.laws.along import force_along
+from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece, Seen, Shape, Values, rates_at
+from sprung.model.laws import ElementLaw, SpringDamper, find_law, grid
 from sprung.model.laws.following import Covariate, following_law
-from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA
 from sprung.model.signals import FloatArray
 
-Values = dict[str, tuple[float, str]]  # value and unit by name
-Shape = Sequence[float]
 _LOWEST_KNEE = 0.3  # of the median rate: a valve that opens far below usual rates acts as friction, and is called so
-_UNIT = SpringDamper(1.0, 1.0)
 _SHARPEST = 1e-6  # an exponent this close to 1 is 1
 _POLYTROPIC = 1.3  # of a gas: no test of usual rates tells it from the column's length
-
-
-@dataclass(frozen=True)
-class Seen:
-    """Sizes of a motion: where knees, gaps and yield displacements can be sought."""
-
-    travel: float  # m, half of the range
-    rate: FloatArray  # m/s, quantiles 0 .. 100 % of the magnitude, (101,)
-    seconds: float
-    step: float  # s
-
-    @classmethod
-    def of(cls, motion: ElementMotion) -> Seen:
-        quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
-        travel = 0.5 * float(np.ptp(motion.deflection))
-        return cls(max(travel, 1e-12), np.maximum(quantiles, 1e-12), len(motion.time) * motion.step, motion.step)
-
-    @property
-    def rate_rms(self) -> float:
-        return float(np.sqrt(np.mean(self.rate**2)))
-
-    def slowest_corner(self, motion: ElementMotion) -> float:
-        """The rate that one sample passes at a reversal, m/s: a knee below it is not resolved."""
-        return reversal_step(motion.rate)
-
-
-Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
-Named = Callable[[FloatArray, Shape, SpringDamper], Values]
-
-
-@dataclass(frozen=True)
-class Piece:
-    """One law as a part of a component's force."""
-
-    law: ElementLaw
-    shapes: tuple[str, ...]  # names of what the columns depend on
-    grid: Callable[[Seen], FloatArray]  # trial shapes, (trials, shapes)
-    limits: Callable[[Seen], list[tuple[float, float]]]  # of every shape
-    signs: tuple[int, ...]  # of the strengths: 1, -1, 0 for either
-    parameters: Parameters  # the law's, of strengths, shapes and the element; its force is linear in the strengths
-    shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # shapes of the law's parameters
-    quoted: Named = lambda a, s, e: {}
-    kind: str = (
-        "static"  # "static", "friction", "hysteresis" or "linear": look-alikes within a kind are told apart last
-    )
-    plain: int = 0  # prior cost: how many commoner laws it contains
-    acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
-    acting_parameters: Parameters | None = None
-
-    @property
-    def effect(self) -> str:
-        return self.law.name
-
-    @property
-    def title(self) -> str:
-        return self.law.title
-
-    @property
-    def key(self) -> str:
-        """Apart from other pieces of the same law."""
-        return f"{self.law.name} {len(self.law.parameters)}"
-
-    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        """Force per strength along a motion, (T, m); deflections count from the middle of the travel."""
-        d = motion.deflection - motion.middle
-        law, of = self.acting or self.law, self.acting_parameters or self.parameters
-        total, found = np.zeros(len(d)), []
-        for count in range(1, len(self.signs) + 1):
-            strengths = (np.arange(len(self.signs)) < count).astype(float)
-            force = force_along(law, of(strengths, shape, _UNIT), d, motion.rate, motion.time, _UNIT)
-            found.append(force - total)
-            total = force
-        return np.column_stack(found)
-
-    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
-        """The law's parameters."""
-        numbers = self.parameters(strengths, shape, element)
-        return {spec.name: (float(x), spec.unit) for spec, x in zip(self.law.parameters, numbers, strict=True)}
-
-
-@dataclass(frozen=True)
-class Following:
-    """A law whose strengths follow a measured signal linearly, about its mean."""
-
-    piece: Piece
-    signal: Covariate
-
-    @property
-    def law(self) -> ElementLaw:
-        return self.piece.law
-
-    @property
-    def effect(self) -> str:
-        return self.piece.effect
-
-    @property
-    def title(self) -> str:
-        return f"{self.piece.title} that follows {self.signal.name}"
-
-    @property
-    def key(self) -> str:
-        return f"{self.piece.key} {self.signal.name}"
-
-    @property
-    def kind(self) -> str:
-        return self.piece.kind
-
-    @property
-    def plain(self) -> int:
-        return self.piece.plain + 1
-
-    @property
-    def shapes(self) -> tuple[str, ...]:
-        return self.piece.shapes
-
-    @property
-    def signs(self) -> tuple[int, ...]:
-        return (*self.piece.signs, *(0 for _ in self.piece.signs))
-
-    def grid(self, seen: Seen) -> FloatArray:
-        return self.piece.grid(seen)
-
-    def limits(self, seen: Seen) -> list[tuple[float, float]]:
-        return self.piece.limits(seen)
-
-    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        steady = self.piece.columns(motion, shape)
-        above = self.signal.above(motion.time + CLOCK_LEAD) / self.signal.size
-        return np.column_stack([steady, steady * above[:, None]])
-
-    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
-        """The law's parameters at the signal's mean, and the relative change of its first strength per unit."""
-        count = len(self.piece.signs)
-        first = strengths[0] if strengths[0] != 0 else 1e-300
-        slope = float(strengths[count] / (first * self.signal.size))
-        found = self.piece.values(strengths[:count], shape, element)
-        return found | {f"{self.signal.name}_slope": (slope, self.signal.per_unit)}
-
-    def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
-        """What is quoted of the law, at the signal's mean and per unit of it."""
-        count = len(self.piece.signs)
-        steady = self.piece.quoted(strengths[:count], shape, element)
-        moved = self.piece.quoted(strengths[:count] + strengths[count:] / self.signal.size, shape, element)
-        per = {
-            f"{name}_per_{self.signal.name}": (moved[name][0] - value, f"{unit}/{self.signal.unit}")
-            for name, (value, unit) in steady.items()
-            if moved[name][0] != value
-        }
-        return steady | per
-
-
-@dataclass(frozen=True)
-class SliderSurface:
-    """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
-
-    effect: str = "unknown"
-    title: str = "a force that no law explains"
-    key: str = "unknown"
-    kind: str = "static"
-    plain: int = 0
-    shapes: tuple[str, ...] = ()
-
-    @property
-    def signs(self) -> tuple[int, ...]:
-        return (0,) * (len(_REACHES) + len(_RATES) + 6)
-
-    def limits(self, seen: Seen) -> list[tuple[float, float]]:
-        return []
-
-    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
-        seen = Seen.of(motion)
-        x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
-        columns = [stop_path(motion.deflection, reach * seen.travel) / (reach * seen.travel) for reach in _REACHES]
-        columns += [np.clip(motion.rate, -knee, knee) / knee for knee in _rates(seen, _RATES.tolist())]
-        columns += [np.maximum(v, 0.0), x**2, x**3, x * v, x**2 * v, v * np.abs(v)]
-        return np.column_stack(columns)
-
-    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
-        return {}
-
-    def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
-        return {}
-
-
-_REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
-_RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
-SURFACE = SliderSurface()
-LawPiece = Piece | Following  # what is searched among
-Part = LawPiece | SliderSurface
-
-
-def _rates(seen: Seen, shares: Sequence[float]) -> FloatArray:
-    return np.interp(shares, np.linspace(0, 1, 101), seen.rate)
 
 
 def _yields(seen: Seen) -> FloatArray:
@@ -379,7 +176,7 @@ _QUADRATIC = Piece(_law("quadratic_damping"), (), _none, lambda seen: [], (1,), 
 _BLOWOFF = Piece(
     _law("damper_blowoff"),
     ("knee",),
-    lambda seen: grid(_rates(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
+    lambda seen: grid(rates_at(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
     lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))],
     (-1,),
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e)),
@@ -389,7 +186,7 @@ _BLOWOFF = Piece(
 _TWO_KNEES = Piece(
     _wider("damper_blowoff"),
     ("knee", "knee_compression"),
-    lambda seen: grid(_rates(seen, [0.2, 0.4, 0.7]), _rates(seen, [0.2, 0.4, 0.7])),
+    lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7]), rates_at(seen, [0.2, 0.4, 0.7])),
     lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))] * 2,
     (-1, -1),
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),

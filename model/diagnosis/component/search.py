@@ -22,7 +22,8 @@ from sprung.model.diagnosis.component.fit import (
     refined,
     spread,
 )
-from sprung.model.diagnosis.component.pieces import PIECES, LawPiece, Part, pieces_following
+from sprung.model.diagnosis.component.piece import LawPiece, Part
+from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
 from sprung.model.laws.paths import stop_path

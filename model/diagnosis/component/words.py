@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
-from sprung.model.diagnosis.component.pieces import Values
+from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic

@@ -1,0 +1,61 @@
+"""What a user can do: likely reasons where nothing fits, what a recording is too short to tell."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.investigation.course import Investigation, Outcome
+from sprung.model.diagnosis.report.values import deviations
+
+
+def nothing_fits(outcome: Outcome, strange: float) -> str:
+    """That the system file does not describe the recording, and the likeliest reasons."""
+    return (
+        f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; the system file does not "
+        f"seem to belong to this recording. Likeliest: {'; '.join(likely_reasons(outcome))}"
+    )
+
+
+def likely_reasons(outcome: Outcome) -> list[str]:
+    """Two or three reasons for which nothing fits, by what the record shows."""
+    course, before = outcome.investigation, outcome.before
+    names, rules = course.signals.sensor_names, course.options.rules.report
+    turned, scales = [], []
+    for i, name in enumerate(names):
+        measured, simulated = before.measured[:, i], before.simulated[:, i]
+        power = float(np.sum(measured**2) * np.sum(simulated**2))
+        alike = float(measured @ simulated) / np.sqrt(power) if power > 0 else 0.0
+        if alike < -rules.alike:
+            turned.append(name)
+        elif alike > rules.alike:
+            scale = float(np.sqrt(np.sum(measured**2) / np.sum(simulated**2)))
+            if not 1 / rules.scale < scale < rules.scale:
+                scales.append(f"{name} is {scale:.3g} times what it should show (a unit or a scale?)")
+    reasons = [f"the sign of {', '.join(turned)}"] if turned else []
+    reasons += scales[:1]
+    sigma = np.sqrt(np.maximum(np.diag(course.base.covariance), 0))[: len(course.base.point.theta)]
+    far = [
+        i
+        for i in np.argsort(-np.abs(course.base.point.theta))
+        if abs(course.base.point.theta[i]) > rules.far * (1 + sigma[i])
+    ]
+    if far:
+        parameter = course.system.parameters[int(far[0])]
+        factor = float(np.exp(course.base.point.theta[int(far[0])]))
+        reasons.append(f"{parameter.name} came out {factor:.2g} times nominal, which is not plausible: units, masses")
+    reasons.append("an excitation that nobody measured")
+    reasons.append("channels swapped, sensors elsewhere than stated, or bodies that the file does not have")
+    return reasons[:3]
+
+
+def undecided(course: Investigation) -> list[str]:
+    """What the recording is too short or too still to tell."""
+    sigma = deviations(course.system, course.base)
+    loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > course.options.rules.report.loose]
+    if not loose:
+        return []
+    shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")
+    return [
+        f"undecided: {shown}: the motion is too small or the recording too short to tell them from their nominal "
+        "values; record longer, faster or on rougher track"
+    ]

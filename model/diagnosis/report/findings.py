@@ -1,0 +1,183 @@
+"""Every finding of an investigation: laws, unnamed forces, inputs, wrong set-ups, noise, channels that are stuck."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
+from sprung.model.diagnosis.investigation.setup import SetupFault
+from sprung.model.diagnosis.report.report import Finding, LawParameter
+from sprung.model.diagnosis.report.sentences import sentence_of, with_deviation
+from sprung.model.diagnosis.report.values import law_parameters
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import ReportRules
+from sprung.model.laws import ElementLaw, SensorLaw
+from sprung.model.laws.basis import UNKNOWN
+
+
+def findings_of(outcome: Outcome) -> list[Finding]:
+    """Findings, the strongest first: a channel that is dead, then by what each explains of chi-square."""
+    course, said = outcome.investigation, outcome.judgement
+    if said.strange is not None:
+        return []
+    ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
+    ranked += [(np.inf, _setup_finding(f)) for f in course.setup_faults]
+    ranked += [(f.score, _input_finding(f)) for f in course.input_faults]
+    ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
+    if said.carried:
+        ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
+    ranked.sort(key=lambda pair: -pair[0])
+    findings = [finding for _, finding in ranked]
+    if said.verdict == "unknown_physics" and not any(f.effect == UNKNOWN for f in findings):
+        findings.insert(len(course.setup_faults), _unknown_finding(outcome))
+    return findings
+
+
+def _unknown_finding(outcome: Outcome) -> Finding:
+    """What is left above the noise, at the place where it is seen best, without a name."""
+    course, said = outcome.investigation, outcome.judgement
+    here = [hit for hit in course.last.candidates if hit.location == said.place]
+    best = max(here, key=lambda hit: hit.score, default=None)
+    tried = ""
+    if course.found:
+        names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in course.found)
+        tried = f"; {names} would explain too little of it"
+    return Finding(
+        location=said.place,
+        effect=UNKNOWN,
+        parameters=(),
+        p_value=None if best is None else course.last.p_value(best),
+        delta_bic=None,
+        sentence=f"a misfit that no law explains: {said.where}{tried}",
+    )
+
+
+def _physics(outcome: Outcome) -> list[Finding]:
+    """Findings of the fitted terms, in the order in which they were found: by evidence."""
+    course, findings = outcome.investigation, []
+    for index, found in enumerate(course.found):
+        term = course.fit.point.terms[course.given + index]
+        parameters, block = law_parameters(outcome.final, course.given + index)
+        rival = found.runner_up
+        family, advice = _look_alikes(found, course.options.rules.report)
+        finding = Finding(
+            location=term.location,
+            effect=term.law.name,
+            parameters=parameters,
+            p_value=found.p_value,
+            delta_bic=found.trial.delta_bic(),
+            runner_up=None if rival is None else (rival.term.law.name, rival.delta_bic()),
+            runner_up_location=None if rival is None else rival.term.location,
+            family=family,
+            advice=advice,
+            parameter_covariance=block,
+            look_alikes=_beaten(found),
+        )
+        findings.append(replace(finding, sentence=sentence_of(outcome, term, finding)))
+    return findings
+
+
+def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:
+    """The laws at the same place that the recording cannot tell from the chosen one, and what would."""
+    best = found.trial
+    near = [
+        t
+        for t in found.trials
+        if t.evidence > best.evidence - rules.naming_margin
+        and t.named
+        and t.term.location == best.term.location
+        and t.term.law.name != best.term.law.name
+    ]
+    if not near:
+        return None, None
+    names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
+    return names, f"{names} fit this recording almost equally well; {_experiment(best.term)} would tell them apart"
+
+
+def _beaten(found: Found) -> dict[str, float]:
+    """Laws that similar data may suggest, as far as they were fitted, with the evidence by which they lost."""
+    best, beaten = found.trial, dict[str, float]()
+    for rival in found.trials:
+        name, margin = rival.term.law.name, best.evidence - rival.evidence
+        if rival.finished and name in best.term.law.confused_with:
+            beaten[name] = min(margin, beaten.get(name, margin))
+    return beaten
+
+
+def _experiment(term: Term) -> str:
+    if isinstance(term.law, ElementLaw) and term.law.memory:
+        return "a recording at another speed, so that the same deflections come at other rates,"
+    if isinstance(term.law, SensorLaw):
+        return "a calibration of the sensor"
+    return "a longer recording, or one at a higher level (worse track, more speed or load),"
+
+
+def _input_finding(fault: InputFault) -> Finding:
+    spec = fault.term.law.parameters[0]
+    parameter = LawParameter(spec.name, fault.term.parameters[0], fault.std, spec.unit)
+    words = fault.term.law.sentence.format(**{spec.name: with_deviation(parameter)})
+    return Finding(
+        location=fault.term.location,
+        effect=fault.term.law.name,
+        parameters=(parameter,),
+        p_value=fault.p_value,
+        delta_bic=None,
+        runner_up=fault.runner_up,
+        sentence=f"{fault.term.location}: {words}",
+    )
+
+
+_SETUP_WORDS = {
+    "sign_reversed": "{place}: the sign is reversed",
+    "channels_swapped": "{place}: the two channels are exchanged",
+    "node_delay": "{place}: all of them are late by {value}, as a whole node is",
+    "wrong_scale": "{place}: {value} times what it should show, a wrong scale or unit",
+    "wrong_position": "{place}: sits {value} along {axis} from where the system file says",
+    "wrong_body": "{place}: is not fixed to what the system file says; its {detail} fits",
+}
+_SETUP_VALUES = {"node_delay": ("time", "s"), "wrong_scale": ("ratio", "1"), "wrong_position": ("offset", "m")}
+
+
+def _setup_finding(fault: SetupFault) -> Finding:
+    parameters: tuple[LawParameter, ...] = ()
+    words = ""
+    if fault.value is not None:
+        name, unit = _SETUP_VALUES[fault.effect]
+        parameters = (LawParameter(name, fault.value, fault.std, unit),)
+        words = with_deviation(parameters[0])
+    sentence = _SETUP_WORDS[fault.effect].format(
+        place=fault.location.replace("|", " and "), value=words, axis="xy"[fault.axis], detail=fault.detail
+    )
+    share = 100 * (1 - fault.after / fault.before)
+    return Finding(
+        location=fault.location,
+        effect=fault.effect,
+        parameters=parameters,
+        p_value=None,
+        delta_bic=None,
+        sentence=f"{sentence}; put right, {share:.0f} % of the misfit goes",
+    )
+
+
+def _noise_finding(fault: NoiseFault) -> Finding:
+    return Finding(
+        location=fault.location,
+        effect="sensor_noise",
+        parameters=(LawParameter("ratio", fault.ratio, fault.std, "1"),),
+        p_value=fault.p_value,
+        delta_bic=None,
+        sentence=f"{fault.location}: {fault.ratio:.3g} times the noise declared, its peers {fault.usual:.3g} times",
+    )
+
+
+def _stuck_finding(name: str, at: float) -> Finding:
+    return Finding(
+        location=name,
+        effect="sensor_stuck",
+        parameters=(),
+        p_value=None,
+        delta_bic=None,
+        sentence=f"{name}: repeats one value from {at:.2f} s on; it was left out of the diagnosis",
+    )

@@ -1,0 +1,54 @@
+"""A finding in words, with what the missing physics had done to the parameters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.investigation.course import Outcome
+from sprung.model.diagnosis.report.report import Finding, LawParameter
+from sprung.model.diagnosis.report.values import deviations
+from sprung.model.diagnosis.response.terms import Term
+
+_NO_LONGER = 900.0  # %, of a value that stood for something else
+
+
+def with_deviation(parameter: LawParameter) -> str:
+    """395 +- 6 N, to the digits that the deviation supports."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    if not np.isfinite(parameter.std) or parameter.std <= 0:
+        return f"{parameter.value:.4g}{unit}"
+    digits = max(2, int(np.ceil(np.log10(max(abs(parameter.value), parameter.std) / parameter.std))) + 1)
+    return f"{parameter.value:.{min(digits, 6)}g} +- {parameter.std:.2g}{unit}"
+
+
+def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
+    values = {p.name: with_deviation(p) for p in finding.parameters}
+    try:
+        words = term.law.sentence.format(**values)
+    except (KeyError, IndexError):
+        words = term.law.title
+    if finding.family is not None:
+        words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
+    sentence = f"{term.location.replace('|', ' and ')}: {words}"
+    bias = _worst_bias(outcome)
+    if bias is not None:
+        sentence += f"; {bias}"
+    return sentence
+
+
+def _worst_bias(outcome: Outcome) -> str | None:
+    """What the missing physics had done to the parameter that it shifted most."""
+    course, final = outcome.investigation, outcome.final
+    sigma = deviations(course.system, final)
+    shift = course.base.point.theta - final.point.theta
+    if not len(shift):
+        return None
+    shift = np.where(np.abs(shift) > 5 * sigma, shift, 0.0)
+    worst = int(np.argmax(np.abs(shift)))
+    if abs(shift[worst]) < 0.01:
+        return None
+    change = 100 * (np.exp(shift[worst]) - 1)
+    side = "high" if change > 0 else "low"
+    if change > _NO_LONGER:
+        return f"{course.system.parameters[worst].name} is then no longer needed"
+    return f"without it {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"

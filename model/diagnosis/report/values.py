@@ -1,0 +1,84 @@
+"""Numbers of a fit as they are reported: values with deviations, of parameters and of laws."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import ElementLaw, reversal_step
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
+
+
+def figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
+    return FitFigures(
+        nrmse=float(np.sqrt(np.mean(np.asarray(per_sensor) ** 2))),
+        per_sensor={name: float(value) for name, value in zip(names, per_sensor, strict=True)},
+    )
+
+
+def deviations(system: System, fit: Fit) -> FloatArray:
+    """Standard deviations of the log-ratios, (P,).
+
+    What of an unnamed force belongs to the spring and damper that it works beside is a matter of convention: their
+    own values are uncertain by as much as the whole of it would change them.
+    """
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance), 0))[: len(system.parameters)]
+    for i, term in enumerate(fit.forces.terms if fit.forces is not None else ()):
+        if term.law.named or fit.forces is None:
+            continue
+        d, v = fit.forces.deflection[:, i], fit.forces.rate[:, i]
+        force = np.std(fit.forces.force[:, i] + term.equivalent[0] * d + term.equivalent[1] * v)
+        for j, parameter in enumerate(system.parameters):
+            if parameter.element == term.location and parameter.quantity != "mass":
+                along = np.std(d if parameter.quantity == "stiffness" else v)
+                value = parameter.nominal * np.exp(fit.point.theta[j])
+                sigma[j] = np.hypot(sigma[j], force / max(along * value, 1e-300))
+    return sigma
+
+
+def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ...]:
+    sigma = deviations(system, fit)
+    values = []
+    for i, parameter in enumerate(system.parameters):
+        value = parameter.nominal * float(np.exp(fit.point.theta[i]))
+        values.append(
+            ReportedParameter(parameter.name, value, value * float(sigma[i]), parameter.nominal, parameter.unit)
+        )
+    return tuple(values)
+
+
+def law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
+    term, place = fit.point.terms[index], fit.place(index)
+    block = _with_corner(fit, term, fit.covariance[place, place])
+    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
+    hidden = not term.law.named
+    parameters = tuple(
+        LawParameter(spec.name, float(value), float(s), spec.unit)
+        for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
+        if not hidden
+    )
+    return parameters, block
+
+
+def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
+    """Covariance of a law's parameters with what sampling leaves open of a corner over the rate.
+
+    A corner of width s is passed in steps of the rate, h each.  The slope there, sech^2(v / s), summed over samples
+    instead of integrated is off by 2 x / sinh x cos(phase) of itself, x = pi^2 s / h (Poisson's sum formula).
+    """
+    corner = term.law.corner if isinstance(term.law, ElementLaw) else None
+    if corner is None or covariance[corner, corner] <= 0:
+        return covariance
+    rate = fit.element_motion[1] @ term.port(fit.forward.system)
+    passing = reversal_step(rate)
+    if passing == 0.0:
+        return covariance
+    width = term.parameters[corner]
+    x = min(np.pi**2 * width / passing, 300.0)
+    along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
+    return covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
