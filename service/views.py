@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from sprung.model.signals import FloatArray, MeasurementFault
-from sprung.model.tracking.tracker import KNOWN, Alarm, TrackerState
+from sprung.model.tracking.fusion import KNOWN
+from sprung.model.tracking.tracker import Alarm, TrackerState
 from sprung.service.engine import Engine
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import Status

@@ -1,0 +1,291 @@
+"""What one window does to what is known of a vehicle: filter, scatter, change tests, weather and deviations in turn.
+
+The tracker decides whether a window may speak; this is what it then says.  docs/tracking.md derives the steps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.linalg.lapack import dpotrf
+
+from sprung.model.signals import BoolArray, Conditions, Deviating, Estimate, FloatArray
+from sprung.model.tracking import cargo as cargos
+from sprung.model.tracking import changes as change_test
+from sprung.model.tracking import deviations as dev
+from sprung.model.tracking import filter as kalman
+from sprung.model.tracking import scatter, surprise
+from sprung.model.tracking import weather as weathers
+from sprung.model.tracking.alarms import Drift
+from sprung.model.tracking.cargo import Cargo
+from sprung.model.tracking.deviations import DeviationModel, Jump
+from sprung.model.tracking.settings import TrackerSettings
+from sprung.model.tracking.state import TrackerState
+from sprung.model.tracking.weather import WeatherModel
+
+OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
+BENT = 4.0  # standard deviations of a window that deviations may move it by without being weighed itself
+STILL = 5.0  # log-likelihood ratio of a change above which a parameter teaches no slopes
+KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """Constants of one tracker that the fusion of its windows needs."""
+
+    settings: TrackerSettings
+    model: DeviationModel
+    weather: WeatherModel
+
+    @cached_property
+    def limit(self) -> FloatArray:
+        """Standard deviations (H,) of deviations before any window."""
+        return np.sqrt(np.diag(self.model.prior))
+
+    def fuse(
+        self,
+        state: TrackerState,
+        estimate: Estimate,
+        mask: BoolArray,
+        time_ns: int,
+        centre: int,
+        conditions: Conditions | None,
+    ) -> tuple[TrackerState, Jump | None]:
+        """Filter, scatter and change tests after a usable window; a deviation that is found to have jumped."""
+        settings, model, H = self.settings, self.model, self.model.size
+        elapsed = np.inf if state.last is None else (time_ns - state.last) * 1e-9
+        share = min(1.0, elapsed / settings.window)
+        belief, calibration, jump = state.belief, state.calibration, None
+        if state.last is not None:
+            belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self.limit)
+        found = estimate.deviating if H else None
+        belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
+        if found is not None and not found.whole:
+            belief = dev.loaded(belief, model, found, share)
+            gains = np.where(model.loads, found.cross, calibration.cross)
+            found = replace(found, cross=gains, point=np.where(model.loads, found.point, 0.0))
+        elif found is not None:
+            apart = (time_ns - int(calibration.recent[-1])) * 1e-9
+            calibration, belief, jump, agrees = dev.weigh(
+                calibration, model, belief, found, min(1.0, apart / settings.window), time_ns
+            )
+            if estimate.faults and not agrees:  # mended by what is not believed yet: its values are of neither
+                undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
+                return replace(undecided, belief=belief, calibration=calibration), None
+            if jump is not None and self.armed(state):
+                calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
+                state = replace(state, changes=change_test.restarted(state.changes))
+        value, covariance, cross = self._at_belief(estimate, found, calibration, belief, mask)
+        variance = np.where(mask, covariance.diagonal(), 1.0)
+        open_ = self._open(calibration, belief, cross)
+
+        measured = scatter.update(
+            state.scatter, value, variance + open_, mask, time=time_ns, window=nanoseconds(settings.window)
+        )
+        wide = np.sqrt(measured.inflation)
+        covariance = covariance * np.outer(wide, wide)
+        fresh = (variance + open_) * measured.inflation / share
+
+        known = belief.level_variance < (KNOWN * settings.prior) ** 2
+        reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.inflation)
+        plausible = np.clip(value, belief.level - reach, belief.level + reach)
+        watch, jumped = surprise.update(
+            state.surprise, value - belief.level, belief.level_variance + fresh, mask & known
+        )
+        if jumped.any():
+            belief = kalman.reopen(belief, jumped, settings.process)
+            if H:
+                belief = dev.unsure(belief, model)
+        belief, innovation = kalman.correct(
+            belief, value, covariance, mask, share=share, bound=settings.outlier, cross=cross if H else None
+        )
+        off = self._of_baseline(state, calibration, cross, belief)
+        at = weathers.features(conditions, self.load(belief))
+        usable = mask & (state.changes.learned >= settings.learning)
+        assert state.weather is not None
+        weather = weathers.foreseen(state.weather, self.weather, at, learning=not self.armed(state))
+        left = np.where(usable, value - off - np.where(usable, state.changes.baseline, 0.0), 0.0)
+        weather = weathers.together(weather, self.weather, left, fresh, usable, centre)
+        effect = np.where(usable, weather.effect + weathers.shared(weather, self.weather), 0.0)
+        doubt = np.where(usable, weather.doubt, 0.0)
+        tested = change_test.update(
+            state.changes,
+            value - off - effect,
+            fresh,
+            mask,
+            seconds=share * settings.window,
+            time=centre,
+            settings=settings,
+            plausible=plausible - off - effect,
+            doubt=doubt,
+        )
+        still = usable & (tested.active == 0) & (np.maximum(tested.up, tested.down) < STILL)
+        weather = weathers.learned(weather, self.weather, left, fresh, still, at, centre, share * settings.window)
+        new = replace(
+            state,
+            last=time_ns,
+            used=state.used + 1,
+            outliers=state.outliers + int(innovation.bounded),
+            belief=belief,
+            scatter=measured,
+            surprise=watch,
+            changes=tested,
+            calibration=self._learned(state, tested, calibration, cross, belief),
+            weather=weather,
+            cargo=cargo,
+        )
+        return new, jump
+
+    def _loaded(
+        self,
+        state: TrackerState,
+        belief: kalman.Belief,
+        elapsed: float,
+        found: Deviating | None,
+        conditions: Conditions | None,
+    ) -> tuple[kalman.Belief, Cargo | None]:
+        """Loads are open again after a stop, and where a window shows another one; pressures say what they are."""
+        model, cargo = self.model, state.cargo
+        if not self.model.size or cargo is None or not model.loads.any():
+            return belief, cargo
+        rows = np.flatnonzero(model.loads) + len(belief.mean) - model.size
+        pressure = np.full(len(rows), np.nan)
+        if conditions is not None and len(conditions.pressure) == len(rows):
+            pressure = np.array(conditions.pressure)
+        departs = elapsed - self.settings.window > dev.STOPPED
+        changed = found is not None and state.last is not None and not departs and dev.moved(belief, model, found)
+        if not (departs or changed):
+            return belief, cargos.felt(cargo, pressure)
+        if state.last is not None and departs:
+            cargo = cargos.arrived(cargo, belief.mean[rows], np.diag(belief.covariance)[rows])
+        cargo = cargos.departed(cargo, pressure, np.diag(model.prior)[model.loads])
+        return dev.boarded(belief, model, cargo.prior, cargo.prior_variance), cargo
+
+    def load(self, belief: kalman.Belief) -> float | None:
+        """Logarithm of the loaded mass over the empty one, of the first load; None where it is not known."""
+        at = np.flatnonzero(self.model.loads)
+        if not len(at):
+            return None
+        row = len(belief.mean) - self.model.size + int(at[0])
+        known = belief.covariance[row, row] < (KNOWN * self.limit[at[0]]) ** 2
+        return float(belief.mean[row]) if known else None
+
+    def bent(self, state: TrackerState, estimate: Estimate) -> bool:
+        """Whether known deviations move this window so far that mean sensitivities are not good enough for it."""
+        if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
+            return False
+        moved = state.calibration.cross @ np.where(self.model.loads, 0, state.belief.mean[-self.model.size :])
+        return bool(np.any(np.abs(moved) > BENT * np.sqrt(estimate.covariance.diagonal())))
+
+    def armed(self, state: TrackerState) -> bool:
+        """Whether the vehicle's baseline is known: before, a deviation is found, but has not jumped."""
+        return bool(np.any(state.changes.learned >= self.settings.learning))
+
+    def chi_square(self, state: TrackerState, estimate: Estimate) -> float:
+        """That of a window, less what known deviations of the measurements account for."""
+        if not self.model.size or estimate.faults:
+            return estimate.chi_square
+        found = estimate.deviating
+        known = (
+            float(state.calibration.excess[0])
+            if found is None or not found.whole
+            else dev.explained(state.belief, found)
+        )
+        return max(estimate.chi_square - known, 0.1 * estimate.chi_square)
+
+    def _at_belief(
+        self,
+        estimate: Estimate,
+        found: Deviating | None,
+        calibration: dev.DeviationRecord,
+        belief: kalman.Belief,
+        mask: BoolArray,
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Log-ratios (P,) as they are if the deviations are as believed, their covariance, sensitivities (P, H)."""
+        value = np.where(mask, estimate.log_ratio, 0.0)
+        if not self.model.size:
+            return value, estimate.covariance, np.zeros((len(value), 0))
+        here = belief.mean[-self.model.size :]
+        if found is None:
+            return value + np.where(mask, calibration.cross @ here, 0.0), estimate.covariance, calibration.cross
+        return value + np.where(mask, found.cross @ (here - found.point), 0.0), found.given, found.cross
+
+    def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
+        """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
+        H = self.model.size
+        other = (calibration.moved > 0) | self.model.loads
+        if H == 0 or not other.any():
+            return np.zeros(len(cross))
+        at = np.flatnonzero(other)
+        own = belief.covariance[-H:, -H:][at][:, at]
+        return np.asarray(((cross[:, at] @ own) * cross[:, at]).sum(axis=1))
+
+    def _of_baseline(
+        self, state: TrackerState, calibration: dev.DeviationRecord, cross: FloatArray, belief: kalman.Belief
+    ) -> FloatArray:
+        """What the deviations of the baseline's windows contribute, (P,); loads are taken out window by window.
+
+        A baseline is learned as if gains and delays were as stated, and compared at those that it was learned with.
+        """
+        if not self.model.size:
+            return np.zeros(len(cross))
+        stays = ~self.model.loads
+        learned = state.changes.learned >= self.settings.learning
+        here = np.where(stays, belief.mean[-self.model.size :], 0.0)
+        reference = np.where(stays, calibration.reference, 0.0)
+        return np.where(learned, calibration.base_cross @ reference, cross @ here)
+
+    def _learned(
+        self,
+        state: TrackerState,
+        tested: change_test.Changes,
+        calibration: dev.DeviationRecord,
+        cross: FloatArray,
+        belief: kalman.Belief,
+    ) -> dev.DeviationRecord:
+        """Sensitivities of the baseline's windows, and the deviations that it was learned with."""
+        if not self.model.size:
+            return calibration
+        first = state.changes.learned < self.settings.learning  # what refines a baseline later is taken out before
+        more = (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300)
+        gained = np.where(first & (tested.weight > 0), more, 0.0)
+        base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
+        reference = calibration.reference
+        if (state.used + 1) * self.settings.hop < dev.SETTLED:
+            here, moved = belief.mean[-self.model.size :], calibration.moved > 0
+            # What all channels share cannot be known: where it wanders, the reference of one that jumped goes along.
+            reference = np.where(moved, reference + self.model.common(here - reference, ~moved), here)
+        return replace(calibration, base_cross=base, reference=reference)
+
+    def baseline(self, state: TrackerState) -> FloatArray:
+        """Log-ratio to nominal of the vehicle's own healthy state, shape (P,); NaN before any window."""
+        calibration = state.calibration
+        base = state.changes.baseline
+        if state.weather is not None:
+            base = base + state.weather.effect + weathers.usual(state.weather, self.weather)
+        if not self.model.size:
+            return np.asarray(base)
+        reference = np.where(self.model.loads, 0.0, calibration.reference)
+        return np.asarray(base + calibration.base_cross @ reference)
+
+    def drift(self, state: TrackerState) -> Drift:
+        """value / baseline - 1 and its standard deviation; NaN before any window."""
+        level, std = state.belief.level, np.sqrt(state.belief.level_variance)
+        whole = level - self.baseline(state)
+        own = whole
+        if state.weather is not None:
+            own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)
+        spread = np.sqrt(std**2 + state.changes.baseline_variance)
+        return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
+
+
+def proper(covariance: FloatArray) -> bool:
+    """Whether a window's covariance is one: finite and positive definite."""
+    return bool(np.all(np.isfinite(covariance))) and dpotrf(covariance, lower=1)[1] == 0
+
+
+def nanoseconds(seconds: float) -> int:
+    """Rounded."""
+    return round(seconds * 1e9)
