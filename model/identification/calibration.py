@@ -25,7 +25,8 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from sprung.model.identification.deviations import deviations
-from sprung.model.identification.linearise import Chord, Linearisation, WindowBatch, WindowModel, as_rows
+from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
+from sprung.model.identification.linearise import WindowModel, as_rows
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
 
@@ -124,7 +125,7 @@ class DeviationSensitivity:
         columns = self.inputs + torch.as_tensor(np.flatnonzero(data.present))
         shown = model.spectra(after.outputs).to(kind)  # (B, F, S')
         late = -model.spectra(self.slope @ after.outputs).to(kind)
-        by_sensor = (at.whiten @ model.compression(data.present).to(at.whiten.dtype)).to(kind)
+        by_sensor = (at.whiten @ model.compression.matrix(data.present).to(at.whiten.dtype)).to(kind)
         out[..., columns] = by_sensor * shown[:, :, None]
         out[..., C + columns] = by_sensor * late[:, :, None]
         if len(self.loads) and at.x.shape[1] == len(model.simulator.k_of):  # else they are refined themselves
@@ -143,8 +144,8 @@ class DeviationSensitivity:
         """Rows (X, S') of unit noise, orthogonal to the compression: what redundant sensors say of each other."""
         key = present.tobytes()
         if key not in self._dropped:
-            noise = torch.as_tensor(self.model.sensor_noise[present])
-            kept = self.model.compression(present) * noise  # orthonormal rows
+            noise = torch.as_tensor(self.model.system.sensor_noise[present])
+            kept = self.model.compression.matrix(present) * noise  # orthonormal rows
             u, _, _ = torch.linalg.svd(torch.eye(kept.shape[1], dtype=kept.dtype) - kept.mT @ kept)
             self._dropped[key] = u[:, : kept.shape[1] - kept.shape[0]].mT / noise
         return self._dropped[key]

@@ -17,7 +17,8 @@ import torch
 from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.deviations import clock_groups, named
-from sprung.model.identification.linearise import WindowBatch, as_rows
+from sprung.model.identification.gauss_newton import WindowBatch
+from sprung.model.identification.linearise import as_rows
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.system import System
@@ -313,7 +314,7 @@ class Explainer:
                 )
             )
             residual = (
-                data.measured @ model.compression(present).mT
+                data.measured @ model.compression.matrix(present).mT
                 - s.states(every, data.w, rest) @ discrete.C.mT
                 - data.w @ discrete.D.mT
             )

@@ -15,113 +15,27 @@ parameters.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from sprung.model.identification.law_forces import Acting, Along, Slopes, slopes_of
-from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel, as_rows
+from sprung.model.identification.gauss_newton import WindowBatch
+from sprung.model.identification.law_flow import Flow
+from sprung.model.identification.law_forces import Acting, Along, slopes_of
+from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows
 from sprung.model.laws import SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.linear import Discrete, ElementValues, phi_functions
+from sprung.model.simulate.linear import phi_functions
 from sprung.model.system import System
 
 _SWEEPS = 4  # of Newton's method on the forces, at most
 _SETTLED = 0.05  # rms change of the outputs by a sweep, in the sensors' noise
 _RIDGE = 1e-11  # relative, on the normalised free responses
 _MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
-
-
-@dataclass(frozen=True, slots=True)
-class WindowPoint:
-    """Where B windows stand."""
-
-    unknowns: Tensor  # log-ratios of the linear parameters and of laws' values, then first memories, (B, U)
-    x0: Tensor  # states at the first sample, (B, N)
-    force: Tensor  # of the laws at the samples, (B, T, L)
-
-    def take(self, at: Tensor) -> WindowPoint:
-        """Some of the windows."""
-        return WindowPoint(self.unknowns[at], self.x0[at], self.force[at])
-
-    def moved(self, step: Tensor, dx0: Tensor) -> WindowPoint:
-        """After steps of the unknowns and of the first state."""
-        return WindowPoint(self.unknowns + step, self.x0 + dx0, self.force)
-
-    def towards(self, other: WindowPoint, share: float) -> WindowPoint:
-        """Between this and another one."""
-        pairs = ((self.unknowns, other.unknowns), (self.x0, other.x0), (self.force, other.force))
-        return WindowPoint(*(a + share * (b - a) for a, b in pairs))
-
-    def where(self, mask: Tensor, other: WindowPoint) -> WindowPoint:
-        """This one for windows of the mask (B,), the other one for the rest."""
-        return WindowPoint(
-            torch.where(mask[:, None], self.unknowns, other.unknowns),
-            torch.where(mask[:, None], self.x0, other.x0),
-            torch.where(mask[:, None, None], self.force, other.force),
-        )
-
-    def put(self, at: Tensor, some: WindowPoint) -> None:
-        """Replace some of the windows."""
-        self.unknowns[at], self.x0[at], self.force[at] = some.unknowns, some.x0, some.force
-
-
-@dataclass(frozen=True, slots=True)
-class Steps:
-    """The linear system over one sample at the point's values."""
-
-    values: ElementValues
-    discrete: Discrete  # outputs not compressed, absent sensors left out
-    push: tuple[Tensor, Tensor, Tensor, Tensor]  # P0, S0, P1, S1, (B, N, n)
-    direct: Tensor  # what sensors show of generalised forces at once, (B, S', n)
-    shown: Tensor  # and of forces of elements, (S', E)
-
-
-@dataclass(frozen=True, slots=True)
-class Moved:
-    """What a point's window does."""
-
-    states: Tensor  # (B, T, N)
-    outputs: Tensor  # (B, T, S')
-
-
-@dataclass(frozen=True, slots=True)
-class Columns:
-    """Gauss-Newton's products at one point; U unknowns: linear parameters, laws' values, memories."""
-
-    whiten: Tensor  # (B, F, R, R)
-    carried: Tensor  # noise of the drives in the compressed signals, (B, F, R, W/2)
-    compliance: Tensor  # (B, F, n, n)
-    free: Tensor  # whitened responses to the first state, normalised, (B, N, K)
-    free_scale: Tensor  # (B, N)
-    sensitivities: Tensor  # whitened, (B, U, K)
-    factor: Tensor  # Cholesky factor of the free responses' products, (B, N, N)
-    across: Tensor  # free responses solved for the sensitivities, (B, N, U)
-    information: Tensor  # on the unknowns, (B, U, U)
-    covariance: Tensor  # of the unknowns, weak prior included, (B, U, U)
-    precision: Tensor  # of the prior, (B, U)
-
-    def solve(self, residual: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Cost with the best first state (B,), step of the unknowns (B, U), step of the first state without it (B, N).
-
-        residual: whitened, (B, K, 1); unknowns: where they are, (B, U), the prior being around 0.  Far from a fit the
-        residual counts as so much more noise, so that the prior holds what is only weakly told.
-        """
-        along = self.free @ residual
-        part = torch.cholesky_solve(along, self.factor)
-        gradient = self.sensitivities @ residual - self.across.mT @ along
-        cost = residual.square().sum(dim=(1, 2)) - (along * part).sum(dim=(1, 2))
-        noise = (cost / residual.shape[1]).clamp_min(1.0)[:, None]
-        held = torch.linalg.inv(self.information + torch.diag_embed(noise * self.precision))
-        step = held @ (gradient - (noise * self.precision * unknowns).unsqueeze(2))
-        return cost, step.squeeze(2), part.squeeze(2) / self.free_scale
-
-    def state_step(self, alone: Tensor, step: Tensor) -> Tensor:
-        """Step of the first state (B, N) beside a step of the unknowns (B, U)."""
-        return alone - (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
 
 
 class LawWindows:
@@ -269,7 +183,7 @@ class LawWindows:
 
     def residual(self, motion: Moved, data: WindowBatch, whiten: Tensor) -> Tensor:
         """Whitened residual, (B, K, 1)."""
-        compressed = (data.measured - motion.outputs) @ self.model.compression(data.present).mT
+        compressed = (data.measured - motion.outputs) @ self.model.compression.matrix(data.present).mT
         return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
 
     def flow(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Flow:
@@ -308,7 +222,7 @@ class LawWindows:
         """What the compressed signals show, (B, R, T, N + U), of the first state and of the unknowns; and the rms of
         the memories, (B, Z)."""
         B, T, N = motion.states.shape
-        Q = self.model.compression(data.present)
+        Q = self.model.compression.matrix(data.present)
         along = self._along(motion.states, data, smooth)
         columns = self.unknowns
         load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
@@ -410,73 +324,3 @@ class LawWindows:
         whole[1, :, 1 : model.bins + 1] = model.frequency.jw[:, None] * moved
         found: FloatArray = torch.fft.irfft(whole, n=model.samples, dim=2).numpy()
         return found
-
-
-class Flow:
-    """The linear system with the laws' slopes and memories around it, from sample to sample along a motion.
-
-    With the total change of the forces f_k = K_k [x_k; z_k] + given_k and of the memories
-    z_{k+1} = ahead_k [x_k; z_k] + beyond_k x_{k+1}, forces straight between samples:
-
-        x_{k+1} = Ad x_k + g0 f_k + g1 f_{k+1} + push_k.
-    """
-
-    def __init__(self, slopes: list[Slopes], memories: list[int], pull: Tensor, steps: Steps, dt: float) -> None:
-        """memories: which laws have one; pull: deflections by the coordinates, (L, n); dt: s."""
-
-        def stacked(name: str) -> Tensor:
-            return torch.as_tensor(np.stack([getattr(s, name) for s in slopes], axis=2))
-
-        N, (L, n) = steps.discrete.Ad.shape[1], pull.shape
-        self.memories, self.N = memories, N
-        rows = torch.zeros(2, L, N, dtype=torch.float64)  # deflections and rates by the state
-        rows[0, :, :n], rows[1, :, n:] = pull, pull
-        P0, S0, P1, S1 = steps.push
-        g0, g1 = -(P0 - (S0 + S1) / dt) @ pull.T, -(P1 + (S0 + S1) / dt) @ pull.T  # (B, N, L)
-        K = stacked("by_deflection").unsqueeze(3) * rows[0] + stacked("by_rate").unsqueeze(3) * rows[1]  # (B, T, L, N)
-        self.at_first = K[:, 0]
-        after = K[:, 1:]
-        if memories:
-            by_memory = stacked("by_memory")[:, 1:, memories]  # (B, T-1, Z)
-            d0, d1, v0, v1, keep = (
-                stacked(name)[:, :, memories].unsqueeze(3) for name in ("by_d0", "by_d1", "by_v0", "by_v1", "keep")
-            )
-            self.ahead = d0 * rows[0, memories] + v0 * rows[1, memories]  # (B, T-1, Z, N)
-            self.beyond = d1 * rows[0, memories] + v1 * rows[1, memories]
-            self.keep = keep  # (B, T-1, Z, 1)
-            self.by_memory = by_memory.unsqueeze(3)
-            after = after.clone()
-            after[:, :, memories] += self.by_memory * self.beyond
-        small = torch.linalg.inv(torch.eye(L, dtype=torch.float64) - after @ g1.unsqueeze(1))  # (B, T-1, L, L)
-        self.small, self.answers = small, small @ after  # (B, T-1, L, N)
-        self.step, self.g1 = torch.cat([steps.discrete.Ad, g0], dim=2), g1
-
-    def run(self, push: Tensor | None, given: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
-        """Changes of states (B, N, T, X) and of the laws' forces (B, L, T, X).
-
-        push: (B, N, T-1, X) or none; given: forces (B, L, T, X) apart from what the motion changes; first (B, N, X).
-        """
-        B, L, T, X = given.shape
-        path = given.new_empty(B, self.N + L, T, X)
-        path[:, : self.N, 0] = first
-        path[:, self.N :, 0] = self.at_first @ first + given[:, :, 0]
-        z = given.new_zeros(B, len(self.memories), X)
-        for k in range(T - 1):
-            now = path[:, :, k]
-            u = self.step @ now if push is None else torch.baddbmm(push[:, :, k], self.step, now)
-            known = given[:, :, k + 1]
-            if self.memories:
-                z = torch.baddbmm(self.keep[:, k] * z, self.ahead[:, k], now[:, : self.N])
-                known = known.clone()
-                known[:, self.memories] += self.by_memory[:, k] * z
-            force = torch.baddbmm(self.small[:, k] @ known, self.answers[:, k], u)
-            state = torch.baddbmm(u, self.g1, force)
-            if self.memories:
-                z = torch.baddbmm(z, self.beyond[:, k], state)
-            path[:, : self.N, k + 1], path[:, self.N :, k + 1] = state, force
-        return path[:, : self.N], path[:, self.N :]
-
-    def answer(self, given: Tensor) -> Tensor:
-        """Change of the forces (B, T, L) where they are off by `given`, the motion's answer included."""
-        first = given.new_zeros(len(given), self.N, 1)
-        return self.run(None, given.mT.unsqueeze(3), first)[1].squeeze(3).mT

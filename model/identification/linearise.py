@@ -1,96 +1,25 @@
-"""A window's model linearised at given parameters, with everything weighed by the noise of sensors and inputs.
-
-Sensors that measure the same motion redundantly are compressed to independent signals of unit noise first (what is
-lost carries no information on the parameters), which also takes absent sensors out.
-"""
+"""A window's model linearised at given parameters, with everything weighed by the noise of sensors and inputs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from sprung.model.identification.compression import Compression
 from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
-from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
-from sprung.model.signals import BoolArray, FloatArray, IntArray
-from sprung.model.simulate.drives import drives_of
+from sprung.model.identification.gauss_newton import Chord, Linearisation, Transfer, WindowBatch
+from sprung.model.mechanics import DEFLECTION, FORCE
+from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
 from sprung.model.system import USUAL_NOISE, System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
 _RIDGE = 1e-11  # relative, on the normalised free responses
-
-
-@dataclass(frozen=True, slots=True)
-class WindowBatch:
-    """Windows with the same sensors present, as the model needs them."""
-
-    w: Tensor  # knots of the drives, shape (B, T, W)
-    measured: Tensor  # sensors present, shape (B, T, S')
-    present: BoolArray  # which sensors these are, shape (S,)
-
-    def take(self, at: Tensor) -> WindowBatch:
-        return self if len(at) == len(self.w) else WindowBatch(self.w[at], self.measured[at], self.present)
-
-
-@dataclass(frozen=True, slots=True)
-class Transfer:
-    """Compressed signals (R of them) over frequency, before whitening."""
-
-    compliance: Tensor  # displacement per generalised force, shape (B, F, n, n)
-    per_load: Tensor  # per generalised force, shape (B, F, R, n)
-    per_force: Tensor  # per element force, shape (B, F, R, E)
-    drive: Tensor  # per unit of every drive that follows its own slope, shape (B, F, R, W/2)
-
-
-@dataclass(frozen=True, slots=True)
-class Linearisation:
-    """Gauss-Newton's view of a batch at one point: whitened columns and their products."""
-
-    whiten: Tensor  # shape (B, F, R, R), weights of the bins included
-    transfer: Transfer
-    free: Tensor  # whitened free responses and trends, normalised, shape (B, N', K)
-    free_scale: Tensor  # what they were divided by, shape (B, N')
-    sensitivities: Tensor  # whitened, shape (B, P, K)
-    factor: Tensor  # Cholesky factor of the free responses' products, shape (B, N', N')
-    across: Tensor  # free responses solved for the sensitivities, shape (B, N', P)
-    covariance: Tensor  # of the log-ratios, weak prior included, shape (B, P, P)
-    x: Tensor  # log-ratios of this point, shape (B, P)
-    x0: Tensor  # best initial state here, shape (B, N)
-    cost: Tensor  # weighted squares with that state, shape (B,)
-    gradient: Tensor  # minus half the gradient of the cost, shape (B, P)
-    step: Tensor  # to the minimum of the linearised cost, shape (B, P)
-
-    def take(self, at: Tensor) -> Linearisation:
-        """The windows `at` of the batch."""
-        return self if len(at) == len(self.x) else _taken(self, at)
-
-    def state_after(self, step: Tensor) -> Tensor:
-        """Best initial state when the log-ratios move by `step`."""
-        moved = (self.across @ step.unsqueeze(2)).squeeze(2) / self.free_scale
-        return self.x0 - moved[:, : self.x0.shape[1]]
-
-
-@dataclass(frozen=True, slots=True)
-class Chord:
-    """A second step of Gauss-Newton with the products of the first."""
-
-    cost: Tensor  # weighted squares before the step, shape (B,)
-    step: Tensor  # shape (B, P)
-    x0: Tensor  # best initial state after it, shape (B, N)
-    error: Tensor  # rms of measured minus simulated before it, shape (B, S')
-    residual: Tensor  # whitened, before it, shape (B, K, 1)
-    outputs: Tensor  # simulated, before it, shape (B, T, S')
-    states: Tensor  # shape (B, T, N)
-
-    def take(self, at: Tensor) -> Chord:
-        """The windows `at` of the batch."""
-        return self if len(at) == len(self.cost) else _taken(self, at)
 
 
 class WindowModel:
@@ -106,10 +35,7 @@ class WindowModel:
         self.weight = torch.full((self.bins,), np.sqrt(2 / samples), dtype=torch.float64)
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
         self.input_noise = np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in system.inputs])
-        self.integrated = max((drive.integrated for drive in drives_of(system)), default=0)
-        self.sensor_noise = system.sensor_noise
-        self._compressions: dict[bytes, Tensor] = {}
-        self._trends: dict[bytes, Tensor] = {}
+        self.compression = Compression(system, samples)
 
     @property
     def states_count(self) -> int:
@@ -124,75 +50,16 @@ class WindowModel:
         sensors = windows[:, :, len(self.system.inputs) :][:, :, present]
         return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present)
 
-    def compression(self, present: BoolArray) -> Tensor:
-        """Matrix (R, S') from the sensors present to independent signals of unit noise."""
-        key = present.tobytes()
-        if key not in self._compressions:
-            mechanics = self.system.mechanics
-            kind, S = mechanics.sensor_kind[present], mechanics.S[present]
-            noise = self.sensor_noise[present]
-            blocks = []
-            for motion in (ACCELERATION, VELOCITY, DISPLACEMENT):
-                at = np.flatnonzero(kind == motion)
-                if len(at):
-                    q, r = np.linalg.qr(S[at] / noise[at, None])
-                    rank = int(np.linalg.matrix_rank(r))
-                    basis = q[:, :rank] if rank == r.shape[1] else np.linalg.svd(S[at] / noise[at, None])[0][:, :rank]
-                    block = np.zeros((rank, len(kind)))
-                    block[:, at] = basis.T / noise[at]
-                    blocks.append(block)
-            of_elements = np.flatnonzero(kind > DISPLACEMENT)
-            blocks.append(np.diag(1 / noise)[of_elements])
-            self._compressions[key] = torch.as_tensor(np.concatenate(blocks))
-        return self._compressions[key]
-
-    def open_degrees(self, kind: IntArray) -> IntArray:
-        """Highest power of time that the motion of an integrated support leaves open in sensors of a kind.
-
-        The integral of an acceleration is known up to a line, and with its offset up to a parabola, whose second
-        derivative an acceleration shows as a constant: the mean, which is left out anyway.
-        """
-        shown = np.where(kind == ACCELERATION, 2, np.where(kind == VELOCITY, 1, 0))
-        return np.maximum(self.integrated - shown, 0)
-
-    def trends(self, present: BoolArray) -> Tensor:
-        """What the compressed signals may show of the motion that integration leaves open, (T, R, X)."""
-        key = present.tobytes()
-        if key not in self._trends:
-            Q = self.compression(present).numpy()
-            degrees = self.open_degrees(self.system.mechanics.sensor_kind[present])
-            row_degree = np.array([degrees[np.argmax(np.abs(row))] for row in Q], dtype=np.int64)
-            time = np.linspace(-1, 1, self.samples)
-            columns = [(r, power) for r, degree in enumerate(row_degree) for power in range(1, degree + 1)]
-            out = np.zeros((self.samples, len(Q), len(columns)))
-            for i, (r, power) in enumerate(columns):
-                out[:, r, i] = time**power
-            self._trends[key] = torch.as_tensor(out)
-        return self._trends[key]
-
     def unknowns(self, present: BoolArray) -> int:
         """Numbers of a window that are eliminated: its first state, and trends."""
-        return self.states_count + (self.trends(present).shape[2] if self.integrated else 0)
+        return self.states_count + (self.compression.trends(present).shape[2] if self.compression.integrated else 0)
 
     def _open(self, free: Tensor, data: WindowBatch) -> Tensor:
         """Free responses (B, T, R, N) and what else is unknown of the window, (B, T, R, N')."""
-        if not self.integrated:
+        if not self.compression.integrated:
             return free
-        trends = self.trends(data.present)
+        trends = self.compression.trends(data.present)
         return torch.cat([free, trends.expand(len(free), *trends.shape)], dim=3) if trends.shape[2] else free
-
-    def _without_trends(self, error: Tensor, present: BoolArray) -> Tensor:
-        """Errors (B, T, S') without what is open of their sensors."""
-        degrees = self.open_degrees(self.system.mechanics.sensor_kind[present])
-        if not degrees.any():
-            return error
-        out = error.clone()
-        for degree in np.unique(degrees[degrees > 0]):
-            at = torch.as_tensor(np.flatnonzero(degrees == degree))
-            q, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, self.samples), degree + 1))
-            line = torch.as_tensor(q)
-            out[:, :, at] = error[:, :, at] - line @ (line.T @ error[:, :, at])
-        return out
 
     def linearise(self, x: Tensor, data: WindowBatch) -> Linearisation:
         """Everything at log-ratios x (B, P)."""
@@ -247,7 +114,7 @@ class WindowModel:
         states = s.states(discrete, data.w, x0)
         outputs = states @ discrete.C.mT + data.w @ discrete.D.mT
         error = data.measured - outputs
-        spectra = self.spectra(error @ self.compression(data.present).mT)
+        spectra = self.spectra(error @ self.compression.matrix(data.present).mT)
         r = as_rows(at.whiten @ spectra.unsqueeze(3)).mT  # (B, K, 1)
         along = at.free @ r
         free_part = torch.cholesky_solve(along, at.factor)
@@ -255,7 +122,7 @@ class WindowModel:
         step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
         cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
         x0 = x0 + ((free_part - at.across @ step).squeeze(2) / at.free_scale)[:, : x0.shape[1]]
-        error = self._without_trends(error, data.present)
+        error = self.compression.without_trends(error, data.present)
         return Chord(cost, step.squeeze(2), x0, error.square().mean(dim=1).sqrt(), r, outputs, states)
 
     def states(self, x: Tensor, x0: Tensor, data: WindowBatch) -> Tensor:
@@ -347,7 +214,7 @@ class WindowModel:
     def _signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
         """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
         select = torch.eye(len(data.present), dtype=kind)[data.present]
-        return self.compression(data.present).to(kind) @ select
+        return self.compression.matrix(data.present).to(kind) @ select
 
     def spectra(self, signals: Tensor) -> Tensor:
         """Bins within the band of signals (B, T, ...), (B, F, ...)."""
@@ -356,7 +223,7 @@ class WindowModel:
         return torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
 
     def _signals(self, data: WindowBatch) -> Tensor:
-        return data.measured @ self.compression(data.present).mT
+        return data.measured @ self.compression.matrix(data.present).mT
 
     def _present(self, discrete: Discrete, data: WindowBatch) -> Discrete:
         if data.present.all():
@@ -365,7 +232,7 @@ class WindowModel:
         return replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
 
     def compressed(self, discrete: Discrete, data: WindowBatch) -> Discrete:
-        Q, discrete = self.compression(data.present), self._present(discrete, data)
+        Q, discrete = self.compression.matrix(data.present), self._present(discrete, data)
         return replace(discrete, C=Q @ discrete.C, D=Q @ discrete.D)
 
     def transfer(self, values: ElementValues, data: WindowBatch) -> Transfer:
@@ -446,12 +313,6 @@ class WindowModel:
         )
         spectra = self.spectra(acceleration) * values.mass[:, None]
         return (-(whiten @ transfer.per_load) * spectra[:, :, None]) @ masses.T.to(transfer.per_load.dtype)
-
-
-def _taken(batch: Any, at: Tensor) -> Any:
-    """A dataclass of tensors (B, ...), nested ones included, with only the windows `at`."""
-    parts = {f.name: getattr(batch, f.name) for f in fields(batch)}
-    return replace(batch, **{n: p[at] if isinstance(p, Tensor) else _taken(p, at) for n, p in parts.items()})
 
 
 def _inverse(stiffness: Tensor) -> Tensor:

@@ -27,7 +27,8 @@ from torch import Tensor
 
 from sprung.model.chunks import alike, chunks, share
 from sprung.model.identification.calibration import DeviationSensitivity
-from sprung.model.identification.linearise import PRIOR_STD, Chord, Linearisation, WindowBatch, WindowModel
+from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
@@ -88,7 +89,7 @@ class Refiner:
     def observations(self) -> int:
         """Real numbers that a window with every sensor is compared in."""
         everything = np.ones(len(self.system.sensors), dtype=bool)
-        return 2 * self.model.bins * len(self.model.compression(everything))
+        return 2 * self.model.bins * len(self.model.compression.matrix(everything))
 
     def refine(
         self,
@@ -203,7 +204,7 @@ class Refiner:
             chosen = data.take(weak)
             share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
             identifiable[weak] &= share < NOISE_SHARE
-        signals = len(self.model.compression(data.present))
+        signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
         # What the model cannot follow is treated as more noise, so that intervals stay honest.

@@ -18,9 +18,11 @@ from torch import Tensor
 
 from sprung.model.chunks import alike, share
 from sprung.model.identification.estimates import estimates
+from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_forces import Acting
-from sprung.model.identification.law_window import LawWindows, Moved, WindowPoint
-from sprung.model.identification.linearise import PRIOR_STD, WindowBatch, WindowModel
+from sprung.model.identification.law_point import Moved, WindowPoint
+from sprung.model.identification.law_window import LawWindows
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel
 from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined, in_order
 from sprung.model.identifier import StageTimes, UnusableWindow
 from sprung.model.laws import ElementLaw
@@ -259,7 +261,7 @@ class _Search:
             chosen = data.take(weak)
             noise = w.model.noise_share(w.model.linearise(found[weak, :P], chosen), chosen)
             identifiable[weak, :P] &= noise < NOISE_SHARE
-        signals = len(w.model.compression(data.present))
+        signals = len(w.model.compression.matrix(data.present))
         taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)
         freedom = 2 * w.model.bins * signals - taken
         chi_square = self.cost / freedom.clamp_min(1)

@@ -9,7 +9,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 
 from sprung.model.identification.identify import load_identifier
-from sprung.model.identification.law_window import LawWindows, WindowPoint
+from sprung.model.identification.law_point import WindowPoint
+from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
 from sprung.model.system import System, parse_system
@@ -112,7 +113,7 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
     point, motion = model.settle(start, model.steps(start, data), data, still)
     steps = model.steps(point, data)
     columns, _ = model._shown(point, steps, motion, data, still, model.flow(point, steps, motion, data, still))
-    back = torch.linalg.pinv(model.model.compression(data.present))
+    back = torch.linalg.pinv(model.model.compression.matrix(data.present))
     whitened = torch.as_tensor(np.diag(1 / bare.sensor_noise)) @ back
     for at in range(2, model.unknowns):  # of the strut, its law, its memory
         size = 1e-3 if at < len(vehicle.tracked) else 1e-5

@@ -143,6 +143,6 @@ def test_trends_are_added_where_integration_leaves_them_open():
     model = WindowModel(system, system.window)
     present = np.ones(4, dtype=bool)
     assert model.unknowns(present) == 4 + 2 * 2  # two powers of time for the deflection and the force
-    assert torch.equal(model.trends(present)[:, :2], torch.zeros(system.window, 2, 4))
+    assert torch.equal(model.compression.trends(present)[:, :2], torch.zeros(system.window, 2, 4))
     assert WindowModel(axleboxes(), 100).unknowns(np.ones(12, dtype=bool)) == 18
     assert WindowModel(load_system(SYSTEM), 100).unknowns(np.ones(12, dtype=bool)) == 18

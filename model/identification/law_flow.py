@@ -1,0 +1,80 @@
+"""Forward sensitivities: what changes of forces and first states do along a motion, laws and memories included."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.law_forces import Slopes
+from sprung.model.identification.law_point import Steps
+
+
+class Flow:
+    """The linear system with the laws' slopes and memories around it, from sample to sample along a motion.
+
+    With the total change of the forces f_k = K_k [x_k; z_k] + given_k and of the memories
+    z_{k+1} = ahead_k [x_k; z_k] + beyond_k x_{k+1}, forces straight between samples:
+
+        x_{k+1} = Ad x_k + g0 f_k + g1 f_{k+1} + push_k.
+    """
+
+    def __init__(self, slopes: list[Slopes], memories: list[int], pull: Tensor, steps: Steps, dt: float) -> None:
+        """memories: which laws have one; pull: deflections by the coordinates, (L, n); dt: s."""
+
+        def stacked(name: str) -> Tensor:
+            return torch.as_tensor(np.stack([getattr(s, name) for s in slopes], axis=2))
+
+        N, (L, n) = steps.discrete.Ad.shape[1], pull.shape
+        self.memories, self.N = memories, N
+        rows = torch.zeros(2, L, N, dtype=torch.float64)  # deflections and rates by the state
+        rows[0, :, :n], rows[1, :, n:] = pull, pull
+        P0, S0, P1, S1 = steps.push
+        g0, g1 = -(P0 - (S0 + S1) / dt) @ pull.T, -(P1 + (S0 + S1) / dt) @ pull.T  # (B, N, L)
+        K = stacked("by_deflection").unsqueeze(3) * rows[0] + stacked("by_rate").unsqueeze(3) * rows[1]  # (B, T, L, N)
+        self.at_first = K[:, 0]
+        after = K[:, 1:]
+        if memories:
+            by_memory = stacked("by_memory")[:, 1:, memories]  # (B, T-1, Z)
+            d0, d1, v0, v1, keep = (
+                stacked(name)[:, :, memories].unsqueeze(3) for name in ("by_d0", "by_d1", "by_v0", "by_v1", "keep")
+            )
+            self.ahead = d0 * rows[0, memories] + v0 * rows[1, memories]  # (B, T-1, Z, N)
+            self.beyond = d1 * rows[0, memories] + v1 * rows[1, memories]
+            self.keep = keep  # (B, T-1, Z, 1)
+            self.by_memory = by_memory.unsqueeze(3)
+            after = after.clone()
+            after[:, :, memories] += self.by_memory * self.beyond
+        small = torch.linalg.inv(torch.eye(L, dtype=torch.float64) - after @ g1.unsqueeze(1))  # (B, T-1, L, L)
+        self.small, self.answers = small, small @ after  # (B, T-1, L, N)
+        self.step, self.g1 = torch.cat([steps.discrete.Ad, g0], dim=2), g1
+
+    def run(self, push: Tensor | None, given: Tensor, first: Tensor) -> tuple[Tensor, Tensor]:
+        """Changes of states (B, N, T, X) and of the laws' forces (B, L, T, X).
+
+        push: (B, N, T-1, X) or none; given: forces (B, L, T, X) apart from what the motion changes; first (B, N, X).
+        """
+        B, L, T, X = given.shape
+        path = given.new_empty(B, self.N + L, T, X)
+        path[:, : self.N, 0] = first
+        path[:, self.N :, 0] = self.at_first @ first + given[:, :, 0]
+        z = given.new_zeros(B, len(self.memories), X)
+        for k in range(T - 1):
+            now = path[:, :, k]
+            u = self.step @ now if push is None else torch.baddbmm(push[:, :, k], self.step, now)
+            known = given[:, :, k + 1]
+            if self.memories:
+                z = torch.baddbmm(self.keep[:, k] * z, self.ahead[:, k], now[:, : self.N])
+                known = known.clone()
+                known[:, self.memories] += self.by_memory[:, k] * z
+            force = torch.baddbmm(self.small[:, k] @ known, self.answers[:, k], u)
+            state = torch.baddbmm(u, self.g1, force)
+            if self.memories:
+                z = torch.baddbmm(z, self.beyond[:, k], state)
+            path[:, : self.N, k + 1], path[:, self.N :, k + 1] = state, force
+        return path[:, : self.N], path[:, self.N :]
+
+    def answer(self, given: Tensor) -> Tensor:
+        """Change of the forces (B, T, L) where they are off by `given`, the motion's answer included."""
+        first = given.new_zeros(len(given), self.N, 1)
+        return self.run(None, given.mT.unsqueeze(3), first)[1].squeeze(3).mT
