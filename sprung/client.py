@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
-from sprung.service.api import models
+from sprung.service.api import job_models, models
 
 M = TypeVar("M", bound=BaseModel)
 PAGE = 500
@@ -101,7 +101,7 @@ class Client:
         """Identify one window; its form is that of `POST /identify`."""
         return self._post("/identify", models.IdentifyAnswer, window, query)
 
-    def upload(self, path: Path, vehicle: str | None = None, diagnose: bool = False) -> models.Job:
+    def upload(self, path: Path, vehicle: str | None = None, diagnose: bool = False) -> job_models.Job:
         """Send a recording to be followed, or to be diagnosed; `wait` for the job."""
         boundary = uuid.uuid4().hex
         kind = mimetypes.guess_type(path.name)[0] or "application/octet-stream"
@@ -111,13 +111,13 @@ class Client:
         body = b"".join([*parts, f"--{boundary}--\r\n".encode()])
         place = "/diagnose" if diagnose else "/recordings"
         answer = self._send("POST", place, None, body, f"multipart/form-data; boundary={boundary}")
-        return models.Job.model_validate_json(answer)
+        return job_models.Job.model_validate_json(answer)
 
-    def job(self, job: str) -> models.Job:
+    def job(self, job: str) -> job_models.Job:
         """Where a job stands."""
-        return self._get(f"/jobs/{_quoted(job)}", models.Job)
+        return self._get(f"/jobs/{_quoted(job)}", job_models.Job)
 
-    def wait(self, job: str, seconds: float = 600.0, every: float = 0.5) -> models.Job:
+    def wait(self, job: str, seconds: float = 600.0, every: float = 0.5) -> job_models.Job:
         """A job once it is done or has failed.  Raises TimeoutError."""
         end = time.monotonic() + seconds
         while (found := self.job(job)).state not in ("done", "failed"):

@@ -10,7 +10,7 @@ from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse,
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
-from sprung.service.api import models
+from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
 from sprung.service.api.idempotency import OnceOf
@@ -42,7 +42,7 @@ BODY = {
 
 
 @router.post(
-    "/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics", response_model=models.Job
+    "/diagnose", status_code=202, openapi_extra=BODY, summary="Look for missing physics", response_model=job_models.Job
 )
 async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -> Response:
     """Accepts a job: of an uploaded file (multipart, as in `POST /recordings`), of a recording that was uploaded

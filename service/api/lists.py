@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from sprung.service.api import models
+from sprung.service.api import job_models, models
 from sprung.service.api.access import CoreOf, json_response, read
 from sprung.service.api.queries import After, Limit, Since, time_of, wrong_query
 from sprung.service.api.recordings import job_dict
@@ -45,7 +45,7 @@ async def alarms(
     return json_response({"alarms": [alarm_dict(row) for row in rows], "next": following})
 
 
-@router.get("/jobs", summary="Jobs", tags=["recordings"], response_model=models.JobPage)
+@router.get("/jobs", summary="Jobs", tags=["recordings"], response_model=job_models.JobPage)
 async def jobs(
     core: CoreOf,
     vehicle: OfVehicle = None,
@@ -63,7 +63,7 @@ async def jobs(
     return await _answer(core, query, "jobs", job_dict, limit)
 
 
-@router.get("/reports", summary="Mismatch reports", tags=["diagnosis"], response_model=models.ReportPage)
+@router.get("/reports", summary="Mismatch reports", tags=["diagnosis"], response_model=job_models.ReportPage)
 async def reports(
     core: CoreOf,
     vehicle: OfVehicle = None,
@@ -80,7 +80,7 @@ async def reports(
     return await _answer(core, query, "reports", report_dict, limit)
 
 
-@router.get("/recordings", summary="Recordings", tags=["recordings"], response_model=models.RecordingPage)
+@router.get("/recordings", summary="Recordings", tags=["recordings"], response_model=job_models.RecordingPage)
 async def recordings(core: CoreOf, vehicle: OfVehicle = None, limit: Limit = 100, after: After = None) -> Response:
     """What was read, newest first."""
     place = _cursor(after)
@@ -91,7 +91,7 @@ async def recordings(core: CoreOf, vehicle: OfVehicle = None, limit: Limit = 100
     return await _answer(core, query, "recordings", recording_dict, limit)
 
 
-@router.get("/deliveries", summary="Notifications", tags=["operation"], response_model=models.DeliveryPage)
+@router.get("/deliveries", summary="Notifications", tags=["operation"], response_model=job_models.DeliveryPage)
 async def deliveries(
     core: CoreOf,
     state: Literal["waiting", "delivered", "dead"] | None = None,

@@ -9,7 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from sprung.service.api import models
+from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, note, own_vehicle, read
 from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.uploads import BODY, discard, receive
@@ -26,7 +26,7 @@ router = APIRouter(tags=["recordings"])
     status_code=202,
     openapi_extra={"requestBody": BODY},
     summary="Upload a recording",
-    response_model=models.Job,
+    response_model=job_models.Job,
 )
 async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -> Response:
     """Replays the recording (MCAP, BLF, ASC, candump log, MF4, CSV and others) into the store as a job; the answer says
@@ -50,7 +50,7 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
     return await once.answer(act)
 
 
-@router.get("/jobs/{id}", summary="A job", response_model=models.Job)
+@router.get("/jobs/{id}", summary="A job", response_model=job_models.Job)
 async def job(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """Where a job stands; `state` is queued, running, done or failed."""
 
@@ -63,7 +63,7 @@ async def job(core: CoreOf, actor: ActorOf, id: str) -> Response:
     return json_response(job_dict(await read(core, query)))
 
 
-@router.post("/jobs/{id}/cancel", summary="Cancel a job", response_model=models.Job)
+@router.post("/jobs/{id}/cancel", summary="Cancel a job", response_model=job_models.Job)
 async def cancel(core: CoreOf, actor: ActorOf, id: str) -> Response:
     """A job that waits or runs is given up; it is then `failed`, and its error says that it was cancelled.  What it
     stored before stays."""

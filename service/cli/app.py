@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sprung import __version__
-from sprung.service.cli import fleet_commands
+from sprung.service.cli import fleet_commands, store_commands
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
 from sprung.service.cli.plain import PlainTyper
 from sprung.service.threads import hand_over_often, one_thread_each
@@ -344,90 +344,7 @@ def bench(
     return run(name, context.args)
 
 
-@app.command()
-def retention(
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Only tell what would be forgotten.")] = False,
-    store: StoreUrl = None,
-) -> int:
-    """Forget now what the settings SPRUNG_RETENTION_... do not keep; the service does so every hour."""
-    from sprung.service.cli.retention import run
-
-    return run(dry_run, store)
-
-
-DataDir = Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As of sprung serve.")]
-
-
-@app.command()
-def backup(
-    target: Annotated[Path, typer.Argument(help="Back-up to write, as in sprung-2026-09-21.tar.", metavar="FILE")],
-    data_dir: DataDir = None,
-    store: StoreUrl = None,
-) -> int:
-    """Back up store, uploads and reports into one file; the service may run meanwhile."""
-    from sprung.service.cli.backup import run
-
-    return run(target, data_dir, store)
-
-
-@app.command()
-def restore(
-    source: Annotated[Path, typer.Argument(help="Back-up that `sprung backup` wrote.", metavar="FILE")],
-    data_dir: DataDir = None,
-    store: StoreUrl = None,
-) -> int:
-    """Put a back-up into a data folder that has no store yet."""
-    from sprung.service.cli.backup import restore as run
-
-    return run(source, data_dir, store)
-
-
-app.command()(fleet_commands.edge)
+for command in (store_commands.retention, store_commands.backup, store_commands.restore, fleet_commands.edge):
+    app.command()(command)
 app.add_typer(fleet_commands.fleet, name="fleet")
-token = PlainTyper(help="Access tokens: who may ask the service, and what for.", no_args_is_help=True)
-app.add_typer(token, name="token")
-
-
-@token.command("create")
-def token_create(
-    name: Annotated[str, typer.Argument(help="Who or what it is for.")],
-    scope: Annotated[str, typer.Option("--scope", help="Of read, ingest, operate, admin, with commas.")] = "read",
-    fleet: Annotated[str, typer.Option("--fleet", help="Only vehicles whose ids begin so.")] = "",
-    days: Annotated[float, typer.Option("--days", min=0, help="Until it ends; 0: never.")] = 365.0,
-    store: StoreUrl = None,
-) -> int:
-    """Make a token and print it."""
-    from sprung.service.cli.token import create
-
-    return create(name, scope, fleet, days, store)
-
-
-@token.command("list")
-def token_list(json_lines: Json = False, store: StoreUrl = None) -> int:
-    """List the tokens, without what they are worth."""
-    from sprung.service.cli.token import show
-
-    return show(json_lines, store)
-
-
-@token.command("rotate")
-def token_rotate(
-    token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
-    hours: Annotated[float, typer.Option("--hours", min=0, help="For which the old one is still good.")] = 24.0,
-    store: StoreUrl = None,
-) -> int:
-    """Make a token like an old one, and let that end."""
-    from sprung.service.cli.token import rotate
-
-    return rotate(token_id, hours, store)
-
-
-@token.command("revoke")
-def token_revoke(
-    token_id: Annotated[str, typer.Argument(help="As `sprung token list` shows it.", metavar="ID")],
-    store: StoreUrl = None,
-) -> int:
-    """Make a token worthless."""
-    from sprung.service.cli.token import revoke
-
-    return revoke(token_id, store)
+app.add_typer(store_commands.token, name="token")
