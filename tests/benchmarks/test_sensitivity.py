@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from sprung.benchmarks.sensitivity import Line, Said, Subject, _rig, recordings
+from sprung.benchmarks.sensitivity import Said, Subject, figure, run, vary
+from sprung.benchmarks.sensitivity_cases import recordings, rig
 from sprung.model.diagnosis.rules import RULES, Rules
 
 HEALTHY = Said("consistent", (), ())
@@ -27,24 +29,22 @@ class Obedient:
         return HEALTHY if value > 1.9 else replace(RUBBING, p_values=(1e-9 * value,))
 
 
-def line(stage: str, name: str) -> Line:
-    return Line(stage, next(field for found, field in RULES.constants() if (found, field.name) == (stage, name)))
+def varied(stage: str, name: str) -> dict[str, Any] | None:
+    number = next(field for found, field in RULES.constants() if (found, field.name) == (stage, name))
+    return vary(cast(Subject, Obedient()), stage, number)
 
 
 def test_a_change_is_told_with_the_value_that_made_it() -> None:
-    told = line("verdict", "clear")  # 1.25 to 2.0
-    told.vary(cast(Subject, Obedient()))
-    figure = told.figure()
-    (change,) = figure["changed"]
+    told = varied("verdict", "clear")  # 1.25 to 2.0
+    assert told is not None
+    (change,) = told["changed"]
     assert change["at"] == 2.0 and change["recording"] == "made"
     assert change["verdict"] == ["missing_physics", "consistent"]
-    assert figure["p_value_decades"] == pytest.approx(0.1, abs=0.01)  # at 1.25, where the findings are the same
+    assert told["decades"] == pytest.approx(0.1, abs=0.01)  # at 1.25, where the findings are the same
 
 
 def test_a_component_test_is_not_asked_about_vehicles() -> None:
-    told = line("component", "close")
-    told.vary(cast(Subject, Obedient()))
-    assert told.tried == 0 and told.figure()["changed"] == []
+    assert varied("component", "close") is None
 
 
 def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -> None:
@@ -56,10 +56,21 @@ def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -
 
 
 def test_made_recordings_of_a_rig_repeat_with_their_seed() -> None:
-    first, again = (_rig(2.0, np.random.default_rng(1)) for _ in range(2))
+    first, again = (rig(2.0, np.random.default_rng(1)) for _ in range(2))
     assert np.array_equal(first.values, again.values) and first.values.shape == (200, 2)
 
 
 def test_all_numbers_have_a_line() -> None:
-    lines: list[dict[str, Any]] = [Line(stage, field).figure() for stage, field in RULES.constants()]
+    lines = [figure(stage, field, []) for stage, field in RULES.constants()]
     assert len({(one["stage"], one["number"]) for one in lines}) == len(lines) > 80
+
+
+def test_a_recording_that_is_done_is_not_done_again(tmp_path: Path) -> None:
+    first = list(run(stage="report", count=2, seconds=3.0, part="2/2", folder=tmp_path))
+    (kept,) = tmp_path.glob("*.json")
+    kept.write_text(kept.read_text().replace('"verdict": "missing_physics"', '"verdict": "as kept"'))
+    again = list(run(stage="report", count=2, seconds=3.0, part="2/2", folder=tmp_path))
+    assert first[0]["verdict"] == "missing_physics" and again[0]["verdict"] == "as kept"
+    assert again[1:-1] == first[1:-1]
+    other = list(run(stage="verdict", count=2, seconds=3.0, part="2/2", folder=tmp_path))
+    assert other[0]["verdict"] == "missing_physics"  # of other settings: made anew

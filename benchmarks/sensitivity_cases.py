@@ -1,0 +1,177 @@
+"""Recordings on which deciding numbers are varied: quarter cars, the bundled vehicle, component tests.
+
+Laws strong, and weak enough that a report says so; faults of sensors and of inputs; wrong set-ups; healthy ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import yaml
+
+from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
+from sprung.benchmarks.setups import Falsified, falsified, in_order
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.ride import simulate_ride
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
+
+SETUPS = ("late sensors", "scale of a node", "sign of a sensor")
+RATE = 100.0  # Hz
+RIG = """
+name: damper on a test bench
+sample_rate: 100
+window: 64
+inputs:
+  rod: {kind: displacement, displacement: {csv: d, noise: 1e-6}}
+elements:
+  damper: {upper: rod, lower: ground, stiffness: 4.0e4, damping: 1.5e3}
+sensors:
+  cell: {kind: force, element: damper, csv: F, noise: 2.0}
+"""
+QUARTER_CAR = """
+name: quarter-car
+sample_rate: 100
+window: 100
+bodies:
+  car: {mass: 8000}
+  bogie: {mass: 1300}
+inputs:
+  wheel:
+    kind: displacement
+    displacement: {csv: d, noise: 1.0e-5}
+    velocity: {csv: v, noise: 5.0e-4}
+elements:
+  primary: {upper: bogie, lower: wheel, stiffness: 2.4e+6, damping: 1.0e+4}
+  secondary: {upper: car, lower: bogie, stiffness: 4.3e+5, damping: 2.0e+4}
+sensors:
+  car_a: {kind: acceleration, body: car, noise: 0.004, csv: a}
+  car_b: {kind: acceleration, body: car, noise: 0.004, csv: b}
+  bogie_a: {kind: acceleration, body: bogie, noise: 0.03, csv: e}
+  bogie_b: {kind: acceleration, body: bogie, noise: 0.03, csv: f}
+"""
+WHEEL, VELOCITY, CAR_A, CAR_B, BOGIE_A = range(5)  # columns of its recordings
+
+
+@dataclass(frozen=True)
+class QuarterCarCase:
+    """What is wrong with a quarter car or with its recording."""
+
+    name: str
+    where: tuple[str, str] | None = None  # part of the system file
+    law: dict[str, dict[str, float]] | None = None
+    wrong: Callable[[FloatArray], None] | None = None  # changes the recorded channels (T, C) in place
+
+
+def _scaled(column: int, factor: float) -> Callable[[FloatArray], None]:
+    def change(values: FloatArray) -> None:
+        values[:, column] *= factor
+
+    return change
+
+
+def _exchanged(values: FloatArray) -> None:
+    values[:, [CAR_A, BOGIE_A]] = values[:, [BOGIE_A, CAR_A]]
+
+
+def _late(values: FloatArray) -> None:
+    values[:, CAR_B] = np.roll(values[:, CAR_B], 5)
+
+
+def _noisy(values: FloatArray) -> None:
+    values[:, BOGIE_A] += 0.03 * np.random.default_rng(1).standard_normal(len(values))
+
+
+def _law(name: str, part: str, law: str, **values: float) -> QuarterCarCase:
+    return QuarterCarCase(name, ("elements", part), {law: values})
+
+
+CASES = (
+    _law("friction", "secondary", "coulomb_friction", force=300, smoothing=2e-3),
+    _law("weak friction", "secondary", "coulomb_friction", force=12, smoothing=2e-3),
+    _law("cubic spring", "secondary", "cubic_stiffness", k3=4e9),
+    QuarterCarCase("gain", ("sensors", "bogie_a"), {"sensor_gain": {"gain": 0.95}}),
+    QuarterCarCase("scale", wrong=_scaled(CAR_A, 2.0)),
+    QuarterCarCase("healthy"),
+    _law("blow-off", "secondary", "damper_blowoff", knee=0.02, ratio=0.3),
+    # beyond the quick ones
+    _law("weak cubic spring", "secondary", "cubic_stiffness", k3=1.5e9),
+    _law("bump stop", "secondary", "bump_stop", gap=4e-3, stiffness=4e5),
+    _law("weak bump stop", "secondary", "bump_stop", gap=6e-3, stiffness=2e5),
+    _law("hysteresis", "secondary", "bouc_wen", alpha=2e5, beta=1000.0, n=1.0),
+    _law("asymmetry", "secondary", "damper_asymmetry", a=0.3),
+    _law("weak asymmetry", "secondary", "damper_asymmetry", a=0.04),
+    _law("series spring", "secondary", "series_stiffness", ks=1.2e6),
+    _law("primary friction", "primary", "coulomb_friction", force=60, smoothing=2e-3),
+    QuarterCarCase("lag", ("sensors", "bogie_a"), {"sensor_lag": {"time": 2e-3}}),
+    QuarterCarCase("small gain", ("sensors", "car_a"), {"sensor_gain": {"gain": 0.985}}),
+    QuarterCarCase("noise", wrong=_noisy),
+    QuarterCarCase("input", wrong=_scaled(VELOCITY, 1.05)),
+    QuarterCarCase("sign", wrong=_scaled(BOGIE_A, -1.0)),
+    QuarterCarCase("exchanged", wrong=_exchanged),
+    QuarterCarCase("late", wrong=_late),
+    QuarterCarCase("healthy"),
+    _law("softening spring", "secondary", "time_varying_stiffness", p=-0.1, tau=5.0),
+)
+
+
+def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
+    """Recordings of a vehicle, wrong set-ups among them, then component tests; budget: quick, cases or full."""
+    rigs = max(1, count // 8)
+    made = _vehicles if budget == "full" else quarter_cars
+    for number, (what, system, record) in enumerate(made(count - rigs, seconds, seed)):
+        yield f"{number}-{what}", system, record
+    for number in range(rigs):
+        yield f"rig-{number}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2 + number))
+
+
+def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
+    """The bundled vehicle, laws strong and weak, by the independent generator."""
+    system, vehicle = load_system(), read_vehicle(MANCHESTER)
+    kinds = ["clean", "coulomb_friction", "bump_stop", "sensor_gain", "sensor_noise", "bouc_wen", "damper_asymmetry"]
+    random = np.random.default_rng(seed)
+    strong = draw_cases(vehicle, (count + 1) // 2, seed, kinds, 0.3)
+    cases = [*strong, *draw_cases(vehicle, count - len(strong), seed + 1, kinds, 1.5)]
+    for number, made in enumerate(make_recordings(vehicle, cases, seconds)):
+        values = in_order(system, made.values)
+        record, what = Falsified("", frozenset(), values), made.case.kind
+        if what == "clean" and number < len(strong):  # the others stay healthy
+            record = falsified(system, values, SETUPS[number % len(SETUPS)], random)
+            what = record.kind
+        yield what, system, record
+
+
+def quarter_cars(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
+    """A quarter car on a road of random phases, whose parameters differ from the file's by 8 %."""
+    system = parse_system(QUARTER_CAR)
+    for number in range(count):
+        random = np.random.default_rng(seed + number)
+        case = CASES[number % len(CASES)]
+        file = yaml.safe_load(QUARTER_CAR)
+        if case.where is not None:
+            file[case.where[0]][case.where[1]]["laws"] = [case.law]
+        time = np.arange(round(seconds * RATE)) / RATE
+        f, phase = np.linspace(0.5, 18, 160), random.uniform(0, 2 * np.pi, 160)
+        angle = 2 * np.pi * f * time[:, None] + phase
+        road = np.column_stack([np.sin(angle) @ (6e-4 / f), np.cos(angle).sum(axis=1) * 6e-4 * 2 * np.pi])
+        values = {p.name: p.nominal * float(np.exp(0.08 * random.standard_normal())) for p in system.parameters}
+        sensors = simulate_ride(parse_system(yaml.safe_dump(file)), road, values, noise=random).sensors
+        shown = road + np.array([1e-5, 5e-4]) * random.standard_normal(road.shape)
+        channels = np.column_stack([shown, sensors])
+        if case.wrong is not None:
+            case.wrong(channels)
+        yield case.name, system, Falsified("", frozenset(), channels)
+
+
+def rig(seconds: float, random: np.random.Generator) -> Falsified:
+    """A damper with dry friction under two sines."""
+    t = np.arange(int(seconds * RATE)) / RATE
+    sines = [(0.012, 0.7, 0.3), (0.004, 1.9, 1.0)]
+    d: FloatArray = sum(size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines)  # type: ignore[assignment]
+    v: FloatArray = sum(  # type: ignore[assignment]
+        size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines
+    )
+    force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * np.tanh(v / 1e-3)
+    noise = random.standard_normal((2, len(t)))
+    return Falsified("", frozenset(), np.column_stack([d + 1e-6 * noise[0], force + 2.0 * noise[1]]))
