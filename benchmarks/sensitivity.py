@@ -3,8 +3,8 @@
 Every number of `model.diagnosis.rules` is set to both ends of its range, one at a time, and recordings are diagnosed
 again: healthy vehicles, laws strong and weak, faults of sensors, wrong set-ups, component tests.  They are those of the
 independent generator, with the budgets `quick` and `cases` those of a simulated quarter car.  Work that a number
-cannot change is not done again: a number of the verdict or the report is varied on finished investigations, one of the evidence or the
-selection on begun ones, and fits, screenings and starts that are known are remembered.
+cannot change is not done again: a number of the verdict or the report is varied on finished investigations, one of
+the evidence or the selection on begun ones, and fits, screenings and starts that are known are remembered.
 
 One line per recording, with the numbers that change what is said of it; then one line per number: on how many
 recordings it was varied, where verdict, place or name changed and to what, and by how many decades p-values moved
