@@ -118,14 +118,21 @@ class Jobs:
             raise Busy(f"{self._waiting} jobs are waiting already; try again later", retry_after=30)
 
     def submit(self, kind: str, recording: work.RecordingRow | None = None, vehicle: str | None = None) -> work.JobRow:
-        """Accept a job: it is in the store when this returns.  Raises Busy when too many wait."""
+        """Accept a job: it is in the store when this returns.  Raises Busy when too many wait.
+
+        One that does the same and has not ended is the answer instead.
+        """
         self.reserve()
         now = now_ns()
         recording_id = None if recording is None else recording.id
-        job = work.JobRow(work.new_id(), kind, "queued", recording_id, vehicle, 0.0, None, None, now, now)
         with self._store.write() as connection:
             if recording is not None and work.get_recording(connection, recording.id) is None:
                 work.add_recording(connection, recording)
+            if recording_id is not None:
+                waiting = work.waiting_job(connection, kind, recording_id, vehicle)
+                if waiting is not None:
+                    return waiting
+            job = work.JobRow(work.new_id(), kind, "queued", recording_id, vehicle, 0.0, None, None, now, now)
             work.add_job(connection, job)
         self._enqueue(job.id)
         return job

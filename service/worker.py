@@ -33,6 +33,7 @@ Emit = Callable[[Message], None]
 Task = Callable[[Request, Emit[Message]], Result]  # a function of a module: the new process imports it by name
 
 POLL_SECONDS = 0.1
+START_SECONDS = 600.0  # to import what a task needs: seconds of work, minutes where the machine has no time
 END_SECONDS = 5.0  # a process that was killed is gone long before
 PR_SET_PDEATHSIG = 1
 
@@ -43,13 +44,18 @@ class WorkerFailed(RuntimeError):
 
 @dataclass(frozen=True, slots=True)
 class ProcessLimits:
-    """What a process may use."""
+    """What a process may use, once it has begun with its task."""
 
     silence_seconds: float  # without any message
     seconds: float  # in all, waiting for the parent included
     memory_bytes: int | None = None  # private memory; None: as much as there is
     cpu_seconds: int | None = None  # of processor time
     niceness: int = 10  # how far it stands back behind others
+
+
+@dataclass(frozen=True, slots=True)
+class _Begun:
+    """Everything is imported."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,11 +92,12 @@ class Worker(Generic[Message, Result]):
         self._connection, theirs = context.Pipe()
         self._process = context.Process(
             target=_run,
-            args=(task, request, theirs, limits, os.getpid()),
+            args=(_Tether(os.getpid()), task, request, theirs, limits),  # the tether first: see there
             name="sprung-worker",
             daemon=True,
         )
-        self._begun = time.monotonic()
+        self._started = time.monotonic()
+        self._begun: float | None = None
         self._process.start()
         theirs.close()
 
@@ -115,6 +122,8 @@ class Worker(Generic[Message, Result]):
         try:
             while True:
                 match self._next(check):
+                    case _Begun():
+                        self._begun = time.monotonic()
                     case _Said(message):
                         yield message
                     case _Done(result):
@@ -139,11 +148,14 @@ class Worker(Generic[Message, Result]):
         try:
             while True:
                 check()
-                if time.monotonic() - self._begun > self._limits.seconds:
+                if self._begun is not None and time.monotonic() - self._begun > self._limits.seconds:
                     raise UserError(f"{self._what} took longer than {self._limits.seconds:.0f} s")
                 if self._connection.poll(POLL_SECONDS):
                     return self._connection.recv()
-                if time.monotonic() - silent_since > self._limits.silence_seconds:
+                if self._begun is None:
+                    if time.monotonic() - self._started > START_SECONDS:
+                        raise UserError(f"the process of {self._what} did not begin within {START_SECONDS:.0f} s")
+                elif time.monotonic() - silent_since > self._limits.silence_seconds:
                     raise UserError(f"{self._what} made no progress for {self._limits.silence_seconds:.0f} s")
         except (EOFError, OSError, pickle.UnpicklingError):
             check()
@@ -160,11 +172,33 @@ class Worker(Generic[Message, Result]):
         return f"the process of {self._what} ended without an answer (status {code})"
 
 
-def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits: ProcessLimits, parent: int) -> None:
+class _Tether:
+    """Ties a new process to its parent as soon as this is unpickled there, before a task's imports take their time."""
+
+    def __init__(self, parent: int) -> None:
+        self._parent = parent
+
+    def __reduce__(self) -> tuple[Callable[[int], int], tuple[int]]:
+        return _tie, (self._parent,)
+
+
+def _tie(parent: int) -> int:
+    """Have the kernel end this process with its parent, where it can; returns the parent."""
+    if sys.platform == "linux":
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it died before we asked
+        os._exit(1)
+    return parent
+
+
+def _run(
+    _parent: object, task: Task[Any, Any, Any], request: Any, connection: Connection, limits: ProcessLimits
+) -> None:
     """The new process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    end_with_parent(connection, parent)
+    _end_with_pipe(connection)
     be_modest(limits)
     sending = threading.Lock()
 
@@ -172,6 +206,7 @@ def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits
         with sending:
             connection.send(thing)
 
+    say(_Begun())
     try:
         say(_Done(task(request, lambda message: say(_Said(message)))))
     except MemoryError:
@@ -183,13 +218,8 @@ def _run(task: Task[Any, Any, Any], request: Any, connection: Connection, limits
         say(_Broken(traceback.format_exc()))
 
 
-def end_with_parent(lifeline: Connection, parent: int) -> None:
-    """End this process when its parent dies, even by SIGKILL: asked of the kernel on Linux, and seen at the pipe."""
-    if sys.platform == "linux":
-        with suppress(OSError, AttributeError):
-            ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it died before we asked
-        os._exit(1)
+def _end_with_pipe(lifeline: Connection) -> None:
+    """End this process when its parent has gone, on platforms where the kernel does not see to it."""
 
     def watch() -> None:
         with suppress(EOFError, OSError):

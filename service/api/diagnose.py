@@ -108,7 +108,7 @@ async def _of_upload(request: Request, core: Core, actor: Actor) -> JobRow:
         own_vehicle(actor, found.vehicle)
         return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)
     except BaseException:
-        discard(core.settings, found.row)
+        discard(core.settings, found)
         raise
 
 

@@ -32,7 +32,8 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
     """Replays the recording (MCAP, BLF, ASC, candump log, MF4, CSV and others) into the store as a job; the answer says
     where to ask for it.
 
-    `vehicle` names whose it is; without it the recording's own metadata or the file's name does.
+    `vehicle` names whose it is; without it the recording's own metadata or the file's name does.  A file that was
+    sent before is not kept twice: while its job waits or runs, that job is the answer.
     """
 
     async def act() -> Response:
@@ -42,7 +43,7 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
             own_vehicle(actor, found.vehicle)
             job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle)
         except BaseException:
-            discard(core.settings, found.row)
+            discard(core.settings, found)
             raise
         await note(core, actor, "upload", job.id, {"name": found.row.name, "vehicle": found.vehicle})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -52,6 +53,7 @@ class Upload:
 
     row: RecordingRow
     vehicle: str | None
+    fresh: bool = True  # False: it was sent before and is still kept; the row is that one's
 
 
 async def receive(request: Request, settings: Settings, store: Store) -> Upload:
@@ -77,7 +79,7 @@ async def receive(request: Request, settings: Settings, store: Store) -> Upload:
                 await run_in_threadpool(form.feed, bytes(held))
                 held.clear()
         await run_in_threadpool(form.feed, bytes(held))
-        return await run_in_threadpool(form.finish)
+        return await run_in_threadpool(_once, settings, store, await run_in_threadpool(form.finish))
     except FormParserError as error:
         raise ApiProblem(422, f"the body is no multipart/form-data: {error}") from error
     finally:
@@ -114,7 +116,9 @@ class Form:
         self._header = (bytearray(), bytearray())
         self._values: dict[str, bytearray] = {}
         self._label: str | None = None
-        self._stored = ""
+        self._extension = ""
+        self._digest = hashlib.sha256()  # of the file so far
+        self._part_file = ""
         self._id = work.new_id()
         self._target: BinaryIO | None = None
         self._ended = False
@@ -153,17 +157,18 @@ class Form:
         self._target.flush()
         os.fsync(self._target.fileno())
         self._target.close()
-        (self._uploads / f"{self._stored}.part").replace(self._uploads / self._stored)
+        stored = work.upload_name(self._digest.hexdigest(), self._id, self._extension)
+        (self._uploads / self._part_file).replace(self._uploads / stored)
         sync_folder(self._uploads)
-        row = RecordingRow(self._id, None, self._label, "upload", self._stored, self.size, None, now_ns(), None)
+        row = RecordingRow(self._id, None, self._label, "upload", stored, self.size, None, now_ns(), None)
         return Upload(row, vehicle)
 
     def close(self) -> None:
         """Delete what was not finished."""
         if self._target is not None and not self._target.closed:
             self._target.close()
-        if self._stored:
-            (self._uploads / f"{self._stored}.part").unlink(missing_ok=True)
+        if self._part_file:
+            (self._uploads / self._part_file).unlink(missing_ok=True)
 
     def _begin_part(self) -> None:
         self._parts += 1
@@ -188,9 +193,9 @@ class Form:
             raise ApiProblem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
         name = options[b"filename"].decode("utf-8", "replace")
         self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
-        extension = known_extension(self._label)
-        self._stored = f"{self._id}{extension}"  # the client has no part in it but a known extension
-        self._target = open(self._uploads / f"{self._stored}.part", "xb")  # noqa: SIM115 (closed by `close`)
+        self._extension = known_extension(self._label)
+        self._part_file = f"{self._id}.part"
+        self._target = open(self._uploads / self._part_file, "xb")  # noqa: SIM115 (closed by `close`)
 
     def _content(self, data: bytes, start: int, end: int) -> None:
         if self._part.is_file:
@@ -199,6 +204,7 @@ class Form:
             if self.size > self._room:
                 raise NoSpace("no room for this upload is left; try again later")
             self._target.write(memoryview(data)[start:end])
+            self._digest.update(memoryview(data)[start:end])
             return
         value = self._values.setdefault(self._part.name, bytearray())
         value += data[start:end]
@@ -218,7 +224,17 @@ def known_extension(label: str) -> str:
     return extension
 
 
-def discard(settings: Settings, row: RecordingRow) -> None:
+def discard(settings: Settings, upload: Upload) -> None:
     """Delete an upload that was received and could not be accepted after all."""
-    if row.file is not None:
-        (settings.uploads / row.file).unlink(missing_ok=True)
+    if upload.fresh and upload.row.file is not None:
+        (settings.uploads / upload.row.file).unlink(missing_ok=True)
+
+
+def _once(settings: Settings, store: Store, upload: Upload) -> Upload:
+    """The same upload; where it was sent before and is still kept, that one, and the new file goes."""
+    with store.read() as connection:
+        before = work.same_upload(connection, upload.row, upload.vehicle)
+    if before is None or before.file is None or not (settings.uploads / before.file).is_file():
+        return upload
+    discard(settings, upload)
+    return Upload(before, upload.vehicle, fresh=False)

@@ -12,6 +12,7 @@ from sqlalchemy import Connection, Table, func, insert, select, update
 from sprung.service.store.schema import jobs, recordings, reports
 
 UNFINISHED = ("queued", "running")
+DIGITS = 32  # of the SHA-256 of an upload in its file's name
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,39 @@ def get_recording(connection: Connection, recording_id: str) -> RecordingRow | N
     """A recording by id."""
     row = _one(connection, recordings, recording_id)
     return None if row is None else RecordingRow(*row)
+
+
+def upload_name(digest: str, recording_id: str, extension: str) -> str:
+    """The name of an upload's file: what is in it, whose row it is, and an extension; nothing that a client chose."""
+    return f"{digest[:DIGITS]}-{recording_id[:8]}{extension}"
+
+
+def same_upload(connection: Connection, row: RecordingRow, vehicle: str | None) -> RecordingRow | None:
+    """An upload with the same content and name, sent for the same vehicle before, whose file is still kept."""
+    if row.file is None or len(row.file) <= DIGITS or row.source != "upload":
+        return None
+    query = (
+        select(recordings)
+        .join(jobs, jobs.c.recording_id == recordings.c.id)
+        .where(recordings.c.file.startswith(f"{row.file[:DIGITS]}-", autoescape=True))
+        .where(recordings.c.name == row.name, recordings.c.source == "upload")
+        .where(jobs.c.vehicle_id.is_not_distinct_from(vehicle))
+        .limit(1)
+    )
+    found = connection.execute(query).first()
+    return None if found is None else RecordingRow(*found)
+
+
+def waiting_job(connection: Connection, kind: str, recording_id: str, vehicle: str | None) -> JobRow | None:
+    """A job that does the same and has not ended."""
+    query = select(jobs).where(
+        jobs.c.kind == kind,
+        jobs.c.recording_id == recording_id,
+        jobs.c.vehicle_id.is_not_distinct_from(vehicle),
+        jobs.c.state.in_(UNFINISHED),
+    )
+    found = connection.execute(query.limit(1)).first()
+    return None if found is None else JobRow(*found)
 
 
 def add_job(connection: Connection, row: JobRow) -> None:

@@ -186,6 +186,29 @@ def test_a_running_diagnosis_is_cancelled_over_http_and_does_not_hold_up_a_stop(
         assert stored(core.store, second).state == "queued"
 
 
+def test_a_file_that_is_sent_twice_is_kept_once_and_diagnosed_once_at_a_time(core: Core) -> None:
+    with TestClient(create_app(core)) as client:
+        first = ask_for(client, "endless.mcap")
+        eventually(lambda: stored(core.store, first).progress > 0)
+        assert ask_for(client, "endless.mcap") == first
+        for_another = client.post(
+            "/diagnose", files={"file": ("endless.mcap", b"x" * 100)}, data={"vehicle": "another"}
+        ).json()
+        assert for_another["id"] != first and for_another["recording"] != stored(core.store, first).recording_id
+        other_content = client.post("/diagnose", files={"file": ("endless.mcap", b"y" * 100)}).json()
+        assert other_content["id"] not in (first, for_another["id"])
+        assert len(list(core.settings.uploads.iterdir())) == 3
+        client.post(f"/jobs/{first}/cancel")
+        again = ask_for(client, "endless.mcap")
+        assert again != first and stored(core.store, again).recording_id == stored(core.store, first).recording_id
+        assert len(list(core.settings.uploads.iterdir())) == 3
+        kept = core.settings.uploads
+        for path in kept.iterdir():  # gone, as after a restoration without uploads: sent again, it is kept again
+            path.unlink()
+        assert stored(core.store, ask_for(client, "endless.mcap")).recording_id not in (None, again)
+        assert len(list(kept.iterdir())) == 1
+
+
 def test_what_a_dead_process_left_half_written_is_deleted_at_start(core: Core) -> None:
     uploads, reports = core.settings.uploads, core.settings.reports
     for path in (uploads / "a.mcap.part", uploads / "nobodys.csv", uploads / "kept.csv", reports / "x.7.part" / "y"):

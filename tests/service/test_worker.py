@@ -16,7 +16,7 @@ import pytest
 from sprung.model.system import load_system
 from sprung.service.errors import UserError
 from sprung.service.worker import ProcessLimits, Worker, WorkerFailed
-from tests import service_tasks
+from tests import service_slow, service_tasks
 from tests.service_tasks import count, misbehave
 
 EASY = ProcessLimits(silence_seconds=60, seconds=60)
@@ -100,9 +100,17 @@ def test_giving_up_ends_the_process() -> None:
     assert gone(worker.pid)
 
 
-def ended_by(end: Callable[[int], None], note: Path) -> int:
+def test_a_slow_start_is_no_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPRUNG_TEST_NOTE", str(tmp_path / "pid"))
+    monkeypatch.setenv("SPRUNG_TEST_IMPORT", "1.0")
+    worker: Worker[str, str] = Worker(service_slow.answer, "yes", ProcessLimits(0.5, 0.9), "the work")
+    assert list(worker.messages()) == []
+    assert worker.result == "yes"
+
+
+def ended_by(end: Callable[[int], None], note: Path, program: str = service_tasks.__file__) -> int:
     """The worker of a parent that is ended while it works."""
-    parent = subprocess.Popen([sys.executable, service_tasks.__file__, str(note)], env=os.environ.copy())
+    parent = subprocess.Popen([sys.executable, program, str(note)], env=os.environ.copy())
     deadline = time.monotonic() + 60
     while not (note.exists() and note.read_text()):
         assert time.monotonic() < deadline and parent.poll() is None
@@ -115,6 +123,16 @@ def ended_by(end: Callable[[int], None], note: Path) -> int:
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM])
 def test_a_worker_does_not_outlive_its_parent(tmp_path: Path, how: signal.Signals) -> None:
     pid = ended_by(lambda parent: os.kill(parent, how), tmp_path / "pid")
+    assert gone(pid)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel is asked on Linux")
+def test_a_worker_that_still_imports_does_not_outlive_its_parent(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SPRUNG_TEST_NOTE", str(tmp_path / "pid"))
+    monkeypatch.setenv("SPRUNG_TEST_IMPORT", "100")
+    pid = ended_by(lambda parent: os.kill(parent, signal.SIGKILL), tmp_path / "pid", service_slow.__file__)
     assert gone(pid)
 
 
