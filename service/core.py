@@ -29,6 +29,7 @@ from sprung.service.jobs import Jobs, Kind
 from sprung.service.live import LiveFeed
 from sprung.service.metrics import Metrics
 from sprung.service.notify.notices import Notices
+from sprung.service.oidc import Provider, provider_of
 from sprung.service.operations import Operations
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import RecordingJobs
@@ -69,6 +70,7 @@ class Core:
     ingest: Ingest
     telling: FleetTelling
     archive: Archive | None = None
+    oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
     requests: Histogram | None = None  # durations of requests
 
@@ -153,6 +155,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         Ingest(pipeline, settings.late_seconds),
         FleetTelling(engine, store, pipeline.model_id),
         archive,
+        provider_of(settings),
         feeds,
     )
     waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}

@@ -64,7 +64,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
         listening = stack.enter_context(_listen(settings))
         core = build_core(settings, engine)
         stack.callback(core.close)
-        notice = access_notice(settings, core.tokens.any)
+        notice = access_notice(settings, core.tokens.any or core.oidc is not None)
         core.feeds = [live_feed(core, text, feeds.vehicle) for text in feeds.buses]
         files = threading.Thread(target=_feed_files, args=(core, feeds, watch), daemon=True)
 

@@ -45,6 +45,13 @@ class Settings(BaseSettings):
     max_upload_bytes: int = Field(default=2_000_000_000, gt=0)
     admin_token: SecretStr | None = None  # one more token that allows everything, of at least 20 characters
     open: bool = False  # take requests without tokens on any address: only behind something that asks for them
+    oidc_issuer: str = ""  # of an OpenID Connect provider, as in https://login.example.org/realms/works; empty: none
+    oidc_client_id: str = ""  # the provider's name for this service
+    oidc_client_secret: SecretStr | None = None  # where the provider gave one
+    oidc_audience: str = ""  # of access tokens that programs send; empty: the client's id
+    oidc_claim: str = "groups"  # where tokens name groups, as in realm_access.roles
+    oidc_groups: dict[str, list[str]] = {}  # scopes by group, as JSON: {"maintenance": ["operate", "fleet:north-"]}
+    oidc_session_hours: float = Field(default=8.0, gt=0, le=24)  # before people sign in again
     allowed_hosts: tuple[
         str, ...
     ] = ()  # host names that are served, as a JSON list; none: any, where tokens are needed

@@ -60,7 +60,7 @@ class Tokens:
         self._admin = None if admin_token is None else digest_of(admin_token)
         self._clock = clock
         self._known: OrderedDict[str, tuple[float, TokenRow | None]] = OrderedDict()
-        self._sessions: OrderedDict[str, tuple[float, str]] = OrderedDict()
+        self._sessions: OrderedDict[str, tuple[float, Callable[[], Actor]]] = OrderedDict()
         self._counted: tuple[float, bool] = (-1e9, False)
         self._lock = threading.Lock()
 
@@ -139,11 +139,15 @@ class Tokens:
         return self._valid(row)
 
     def sign_in(self, text: str) -> str:
-        """A session of the token's owner.  Raises Refused."""
+        """A session of the token's owner, that ends with the token.  Raises Refused."""
         self.actor(text)
+        return self.open_session(lambda: self.actor(text), SESSION_SECONDS)
+
+    def open_session(self, owner: Callable[[], Actor], seconds: float) -> str:
+        """A session; `owner` is asked with each request and may raise Refused."""
         session = secrets.token_urlsafe(32)
         with self._lock:
-            self._sessions[digest_of(session)] = (time.monotonic() + SESSION_SECONDS, text)
+            self._sessions[digest_of(session)] = (time.monotonic() + seconds, owner)
             while len(self._sessions) > MOST_SESSIONS:
                 self._sessions.popitem(last=False)
         return session
@@ -156,10 +160,10 @@ class Tokens:
     def session(self, session: str) -> Actor:
         """Whose session it is; ends with its token.  Raises Refused."""
         with self._lock:
-            ends, text = self._sessions.get(digest_of(session), (0.0, ""))
+            ends, owner = self._sessions.get(digest_of(session), (0.0, Actor))
         if ends < time.monotonic():
             raise Refused("the session is over; sign in again")
-        return self.actor(text)
+        return owner()
 
     def _valid(self, row: TokenRow) -> Actor:
         if row.revoked_ns is not None:

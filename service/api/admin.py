@@ -1,8 +1,7 @@
-"""Signing in, tokens, the audit log, and a look at what the process does."""
+"""Tokens, the audit log, and a look at what the process does."""
 
 from __future__ import annotations
 
-import asyncio
 import sys
 import threading
 import time
@@ -10,19 +9,16 @@ from collections import Counter
 from types import FrameType
 from typing import Annotated, Any, Literal
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, Query
 from fastapi.concurrency import run_in_threadpool
-from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
+from fastapi.responses import PlainTextResponse, Response
 from pydantic import Field
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response, read
 from sprung.service.api.bodies import StrictBody
-from sprung.service.api.guard import COOKIE, session_of
-from sprung.service.pages.render import render
 from sprung.service.store import audit
 from sprung.service.store.tokens import TokenRow
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.tokens import SESSION_SECONDS, Refused
 
 router = APIRouter(tags=["operation"])
 pages = APIRouter(include_in_schema=False)
@@ -40,39 +36,6 @@ class TokenBody(StrictBody):
     scopes: Annotated[list[Scope], Field(min_length=1, max_length=4)]
     fleet: Annotated[str, Field(max_length=128, description="vehicles whose ids begin so; empty: all")] = ""
     days: Annotated[float | None, Field(gt=0, lt=36_500, description="until it ends; null: never")] = 365.0
-
-
-@pages.get("/signin")
-async def sign_in_page(to: Annotated[str, Query(max_length=500)] = "/") -> HTMLResponse:
-    """A form for a token."""
-    return HTMLResponse(render("signin.html", to=_inside(to), wrong=""))
-
-
-@pages.post("/signin")
-async def sign_in(request: Request, core: CoreOf) -> Response:
-    """Take a token, give a session."""
-    form = await request.form(max_fields=4)
-    to = _inside(str(form.get("to", "/")))
-    try:
-        session = await run_in_threadpool(core.tokens.sign_in, str(form.get("token", "")).strip())
-    except Refused as refused:
-        await asyncio.sleep(0.5)  # whoever guesses has time
-        return HTMLResponse(render("signin.html", to=to, wrong=str(refused)), 401)
-    response = RedirectResponse(to, 303)
-    secure = request.url.scheme == "https"
-    response.set_cookie(COOKIE, session, max_age=int(SESSION_SECONDS), httponly=True, samesite="strict", secure=secure)
-    return response
-
-
-@pages.post("/signout")
-async def sign_out(request: Request, core: CoreOf) -> Response:
-    """End the session."""
-    session = session_of(request.headers)
-    if session is not None:
-        core.tokens.sign_out(session)
-    response = RedirectResponse("/signin", 303)
-    response.delete_cookie(COOKIE)
-    return response
 
 
 @router.get("/tokens", summary="Access tokens", response_model=list[dict[str, Any]])
@@ -157,8 +120,3 @@ def token_dict(row: TokenRow) -> dict[str, Any]:
         "expires": optional_iso(row.expires_ns),
         "revoked": optional_iso(row.revoked_ns),
     }
-
-
-def _inside(to: str) -> str:
-    """A path of this service: not of another one."""
-    return to if to.startswith("/") and not to.startswith(("//", "/\\")) else "/"

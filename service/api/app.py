@@ -25,6 +25,7 @@ from sprung.service.api import (
     problems,
     recordings,
     signals,
+    signin,
 )
 from sprung.service.api.description import PROBLEMS, describe
 from sprung.service.api.guard import Guard
@@ -87,8 +88,13 @@ def create_app(
         health,
         docs,
     )
-    for router in (*(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)), admin.pages):
+    for router in (
+        *(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)),
+        admin.pages,
+        signin.pages,
+    ):
         app.include_router(router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
+    app.include_router(signin.returns)
     app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes
     system = core.engine.system
@@ -98,5 +104,5 @@ def create_app(
         paths={"/recordings": uploads, "/diagnose": uploads},
     )
     app.add_middleware(HeadAsGet)
-    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests)
+    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests, oidc=core.oidc)
     return app

@@ -14,12 +14,14 @@ from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
 
 from prometheus_client import Histogram
+from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sprung.service.api.problems import ApiProblem, problem_response
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, need_of, place_of
 from sprung.service.logs import request_id
+from sprung.service.oidc import Provider, Unreachable, looks_like_jwt
 from sprung.service.settings import Settings
 from sprung.service.tokens import Actor, Refused, Tokens
 
@@ -54,9 +56,17 @@ HEADERS = {
 class Guard:
     """ASGI middleware, the outermost."""
 
-    def __init__(self, app: ASGIApp, settings: Settings, tokens: Tokens, requests: Histogram | None = None) -> None:
-        """requests: takes the durations of requests."""
+    def __init__(
+        self,
+        app: ASGIApp,
+        settings: Settings,
+        tokens: Tokens,
+        requests: Histogram | None = None,
+        oidc: Provider | None = None,
+    ) -> None:
+        """requests: takes the durations of requests; oidc: whose tokens are taken, too."""
         self.app = app
+        self._oidc = oidc
         self._requests = requests
         self._settings = settings
         self._tokens = tokens
@@ -102,7 +112,7 @@ class Guard:
         try:
             need = need_of(scope["method"], path)
             self._check_host(headers)
-            actor, by_cookie = self._actor(scope, headers, need)
+            actor, by_cookie = await self._foreign(headers) or self._actor(scope, headers, need)
             self._limiter.take(actor.name if actor.name != "local" else _address(scope))
             self._check_browser(scope, headers, need, by_cookie)
             self._check_scope(actor, need, path)
@@ -119,7 +129,22 @@ class Guard:
     @property
     def required(self) -> bool:
         """Whether requests need a token."""
-        return not self._settings.open and (not self._local or self._tokens.any)
+        return not self._settings.open and (not self._local or self._oidc is not None or self._tokens.any)
+
+    async def _foreign(self, headers: Headers) -> tuple[Actor, bool] | None:
+        """Whose token of the provider it is; None where it is none.  Off the event loop: keys may have to be asked
+        for."""
+        kind, _, text = headers.get("authorization", "").partition(" ")
+        if self._oidc is None or kind.lower() != "bearer" or not looks_like_jwt(text.strip()):
+            return None
+        try:
+            return await run_in_threadpool(self._oidc.actor, text.strip()), False
+        except Refused as refused:
+            raise _unauthorized(str(refused)) from None
+        except Unreachable as error:
+            log.error("the OpenID Connect provider: %s", error)
+            detail = "the provider that the token is of cannot be asked now"
+            raise ApiProblem(503, detail, headers={"Retry-After": "10"}) from None
 
     def _actor(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
         """Who asks, and whether a browser said so by itself (with a cookie, or because nobody needs to)."""

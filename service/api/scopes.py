@@ -25,6 +25,8 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/health/ready"): Need(PUBLIC),
     ("GET", "/signin"): Need(PUBLIC),
     ("POST", "/signin"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
+    ("GET", "/signin/oidc"): Need(PUBLIC),
+    ("GET", "/signin/oidc/callback"): Need(PUBLIC),
     ("POST", "/signout"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
     ("GET", "/static/{path}"): Need(PUBLIC),
     ("GET", "/docs"): Need("read", by_fleet=True),
