@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,7 +13,6 @@ from sprung.model.simulate.ride import Ride, fitted_start, simulate_ride
 from sprung.model.system import System, load_system
 from sprung.replay.record import Record
 from sprung.service.errors import UserError
-from sprung.service.opening import open_record
 
 SYSTEM_FILES = (".yaml", ".yml")
 _LEAST = 32  # samples that both need
@@ -43,15 +43,16 @@ class Comparison:
         return float(np.sqrt(np.mean(shown**2))) if len(shown) else float("nan")
 
 
-def compare(measured: Path, other: Path, system: System, dbc: Path | None) -> Comparison:
+def compare(measured: Path, other: Path, system: System, load: Callable[[Path], Record]) -> Comparison:
     """Lay a recording beside another one, or beside what a system file simulates on its inputs.
 
+    load: reads a recording of the system's channels.
     Errors: `UserError` when they have nothing in common; the readers' own.
     """
-    record = open_record(measured, system, dbc)
+    record = load(measured)
     if other.suffix.lower() in SYSTEM_FILES:
         return _against_system(record, load_system(other, system.catalogue), (measured.name, other.name))
-    second = open_record(other, system, dbc)
+    second = load(other)
     first, last, offset = _overlap(record, second, measured, other)
     inputs = len(system.inputs)
     return Comparison(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TypeVar
 from sprung.model.signals import Channel, TimeColumn
 from sprung.replay.inspection import Inspection, inspect
 from sprung.replay.record import Record, load_record
+from sprung.service.reading import Apart, Here, Reading, ReadRequest, ReadWindows
 from sprung.service.recordings import SLOWEST_BYTES_PER_SECOND
 from sprung.service.settings import Settings, settings_with
 from sprung.service.worker import Emit, ProcessLimits, Task, Worker
@@ -58,6 +60,15 @@ def load(request: RecordRequest) -> Record:
 def look(request: InspectionRequest) -> Inspection:
     """What is in the file.  Raises as `load`."""
     return _apart(inspect_task, request, request.path)
+
+
+def windows(request: ReadRequest) -> Iterator[ReadWindows]:
+    """The windows of a recording.  Raises as `load`."""
+    with open(request.path, "rb"):  # an absent file is told without a process
+        pass
+    limits = own_limits(settings_with({}), request.path)
+    reading: Reading = Here(request) if limits is None else Apart(request, limits)
+    return reading.pieces(lambda: None)
 
 
 def load_task(request: RecordRequest, _emit: Emit[None]) -> Record:

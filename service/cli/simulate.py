@@ -11,6 +11,7 @@ import numpy as np
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
+from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.cli import apart
 from sprung.service.comparison import Comparison, compare
@@ -68,7 +69,11 @@ def show(
     """Print the errors of every sensor; with a folder, draw them."""
     system = load_system(system_file or MANCHESTER, catalogue)
     database = dbc or (MANCHESTER_DBC if system_file is None else None)
-    found = compare(measured, other, system, database)
+
+    def load(path: Path) -> Record:
+        return apart.load(apart.RecordRequest(path, system.channels, system.sample_rate, database, system.time, None))
+
+    found = compare(measured, other, system, load)
     per_sensor = {
         name: round(float(value), 6)
         for name, value in zip(system.sensors, found.nrmse, strict=True)

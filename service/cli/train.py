@@ -14,15 +14,16 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.service.cli import apart
 from sprung.service.cli.console import errors
 from sprung.service.errors import UserError
-from sprung.service.opening import open_stream
-from sprung.service.reading import windower_of
+from sprung.service.reading import ReadRequest
 
 OPTIONAL = (
     "training is optional: without weights every window is refined from the nominal values, to the same result; "
     "weights give it a nearer start"
 )
+TOGETHER = 128  # windows that the reader hands over at once
 
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
@@ -53,14 +54,11 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
 
 
 def whole_windows(system: System, paths: list[Path], dbc: Path | None) -> FloatArray:
-    """Windows of all recordings that were not dropped, shape (B, T, C)."""
+    """Windows of all recordings that were not dropped, read apart, shape (B, T, C)."""
     found = []
     for path in paths:
-        recording = open_stream(path, system, dbc)
-        windower = windower_of(system, recording.stamped)
-        for block in recording.at_rate(system.sample_rate):
-            found += [w.values for w in windower.push(block) if w.outcome != "dropped"]
-        found += [w.values for w in windower.flush() if w.outcome != "dropped"]
+        for piece in apart.windows(ReadRequest(path, system, dbc, TOGETHER)):
+            found += [w.values for w in piece.windows if w.outcome != "dropped"]
     if not found:
         raise UserError(f"{paths[0]}: no whole window to train from")
     return np.stack(found)

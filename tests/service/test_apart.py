@@ -8,8 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from sprung.model.system import System
+from sprung.model.system import MANCHESTER, System
 from sprung.replay import UnreadableRecording
+from sprung.service import reading
 from sprung.service.cli import apart, main
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
@@ -55,6 +56,25 @@ def test_processor_time_goes_with_the_size_and_nobody_stands_back(tmp_path: Path
     limits = apart.own_limits(Settings(data_dir=tmp_path, worker_memory_bytes=7), path)
     assert limits is not None and limits.cpu_seconds == 160 and limits.niceness == 0 and limits.memory_bytes == 7
     assert apart.own_limits(Settings(data_dir=tmp_path, isolate_reading=False), path) is None
+
+
+@pytest.mark.parametrize(
+    "command", ["compare FILE FILE", "train --recordings FILE --out OUT", "simulate --inputs FILE --out OUT.csv"]
+)
+def test_no_command_reads_a_recording_in_its_own_process(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def refused(*_: object) -> None:
+        raise UserError("read apart")
+
+    monkeypatch.setattr(apart, "Worker", refused)
+    monkeypatch.setattr(reading, "Worker", refused)
+    (tmp_path / "a.csv").write_text("time,acc\n0,1\n")
+    given = command.replace("FILE", str(tmp_path / "a.csv")).replace("OUT", str(tmp_path / "out"))
+    if command.startswith("simulate"):
+        given += f" {MANCHESTER}"
+    assert main(given.split()) == 2
+    assert capsys.readouterr().err.splitlines()[-1] == "sprung: read apart"
 
 
 def test_an_absent_file_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
