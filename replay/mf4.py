@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import gc
+import logging
+import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
-from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME, nanoseconds
+from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME
 
 
 def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
@@ -19,29 +24,63 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         from asammdf import MDF
     except ImportError:
         raise UnreadableRecording(f"{path}: reading MF4 needs asammdf; install sprung[mf4]") from None
-    try:
-        with MDF(path) as mdf:
-            start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
-            groups = list(_groups(mdf, account))
-            mdf_version = mdf.version
-    except Exception as error:  # asammdf raises what its parser happens to raise
-        line = " ".join(str(error).split())[:200] or type(error).__name__
-        raise UnreadableRecording(f"{path}: not an MDF file that can be read: {line}") from error
+    with _quietly():
+        wrong = ""
+        try:
+            with MDF(path) as mdf:
+                start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
+                groups = list(_groups(mdf, account))
+                mdf_version = mdf.version
+        except Exception as error:  # asammdf raises what its parser happens to raise
+            wrong = " ".join(str(error).split())[:200] or type(error).__name__
+        if wrong:
+            gc.collect()  # what was left half made complains at its end: here, where nobody listens
+    if wrong:
+        raise UnreadableRecording(f"{path}: not an MDF file that can be read: {wrong}")
     if not groups:
         raise UnreadableRecording(f"{path}: MDF {mdf_version} without a CAN_DataFrame group (no bus log)")
     width = 64 if max(group[2].max(initial=0) for group in groups) > 8 else 8
-    since, timely = nanoseconds(np.concatenate([group[0] for group in groups]))
-    timely &= (since <= LATEST - max(start, 0)) & (since >= EARLIEST - min(start, 0))
+    time, timely = _absolute(np.concatenate([group[0] for group in groups]), start)
     account.corrupt(int((~timely).sum()), OUT_OF_TIME)
     identifier = np.concatenate([group[1] for group in groups])
     length = np.concatenate([group[2] for group in groups])
     data = np.concatenate([_fit(group[3], width) for group in groups])
     data[np.arange(width) >= length[:, None]] = 0
-    order = np.argsort(since, kind="stable")
+    order = np.argsort(time, kind="stable")
     order = order[timely[order]]
     for first in range(0, len(order), BLOCK_FRAMES):
         rows = order[first : first + BLOCK_FRAMES]
-        yield FrameBlock(start + since[rows], identifier[rows], length[rows], data[rows])
+        yield FrameBlock(time[rows], identifier[rows], length[rows], data[rows])
+
+
+def _absolute(seconds: FloatArray, start: int) -> tuple[IntArray, BoolArray]:
+    """Times in ns of seconds since `start`, and which of them are times at all.
+
+    They may lie before it by years: a file that was converted begins, for its writer, when that was done.
+    """
+    with np.errstate(invalid="ignore", over="ignore"):
+        scaled = np.round(seconds * 1e9)
+        good = (np.abs(scaled) <= LATEST) & (EARLIEST <= start <= LATEST)  # False for NaN
+    time = (start if EARLIEST <= start <= LATEST else 0) + np.where(good, scaled, 0.0).astype(np.int64)
+    return time, good & (time >= EARLIEST) & (time <= LATEST)
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """asammdf's objects print tracebacks when they end before they were whole; its log is for its authors."""
+    hook, log = sys.unraisablehook, logging.getLogger("asammdf")
+    level = log.level
+    sys.unraisablehook = lambda unraisable: None if _of_asammdf(unraisable.object) else hook(unraisable)
+    log.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        sys.unraisablehook = hook
+        log.setLevel(level)
+
+
+def _of_asammdf(thing: Any) -> bool:
+    return (getattr(thing, "__module__", None) or "").startswith("asammdf")
 
 
 def _groups(mdf: Any, account: Account) -> Iterator[tuple[Any, Any, Any, Any]]:

@@ -91,8 +91,9 @@ SEEDS: dict[str, tuple[str, Callable[[Path], None]]] = {  # name -> file name, w
     "parquet": ("a.parquet", _parquet),
     "hdf5": ("a.h5", _hdf5),
     "tdms": ("a.tdms", _tdms),
+    "mf4": ("a.mf4", write_can),
 }
 CHECKED = ("mcap", "mcap-lz4", "mcap-plain", "blf")  # every sample is under a checksum that the reader verifies
-NEEDS = {"parquet": "pyarrow", "hdf5": "h5py", "tdms": "nptdms"}  # optional packages
+NEEDS = {"parquet": "pyarrow", "hdf5": "h5py", "tdms": "nptdms", "mf4": "asammdf"}  # optional packages
 
 __all__ = ["CHECKED", "GROUPED", "NEEDS", "SEEDS", "START", "TABLE", "TIMES", "VALUES"]

@@ -28,10 +28,11 @@ NO_WINDOW = {"same-time.mcap", "apart.mcap"}
 def test_mutants_are_read_or_refused(name):
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
-    outcome = run(name, 60, seed=2026)
+    count = 15 if name == "mf4" else 60  # asammdf takes a tenth of a second for each
+    outcome = run(name, count, seed=2026)
     assert not outcome.faults, outcome.faults
     assert outcome.silent == 0
-    assert outcome.read + outcome.refused == outcome.mutants == 60
+    assert outcome.read + outcome.refused == outcome.mutants == count
 
 
 @pytest.mark.slow
