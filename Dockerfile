@@ -1,7 +1,7 @@
 # syntax=docker/dockerfile:1
 # Two stages: the first installs into /opt/sprung, the second holds only that and an interpreter.
-# pin the base by digest where you build for good: docker buildx imagetools inspect python:3.11-slim-bookworm
-ARG BASE=python:3.11-slim-bookworm
+# the base by its digest (of all platforms); a newer one: docker buildx imagetools inspect python:3.11-slim-bookworm
+ARG BASE=python:3.11-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 FROM ${BASE} AS build
 ARG TORCH_INDEX=https://download.pytorch.org/whl/cpu
 WORKDIR /src

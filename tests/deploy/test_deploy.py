@@ -82,6 +82,16 @@ def test_compose_tells_somebody_and_has_no_usual_password() -> None:
 
 
 @pytest.mark.skipif(shutil.which("amtool") is None, reason="needs amtool, of the package prometheus-alertmanager")
+def test_images_of_others_are_pinned_by_digest() -> None:
+    compose = yaml.safe_load((DEPLOY / "docker-compose.yaml").read_text())
+    names = [part["image"] for part in compose["services"].values() if "build" not in part]
+    dockerfile = (DEPLOY.parent / "Dockerfile").read_text()
+    names += re.findall(r"^ARG BASE=(.*)$", dockerfile, re.MULTILINE)
+    names += [name for name in re.findall(r"^FROM (\S+)", dockerfile, re.MULTILINE) if name != "${BASE}"]
+    assert len(names) >= 4
+    assert [name for name in names if not re.search(r":[\w.-]+@sha256:[0-9a-f]{64}$", name)] == []
+
+
 def test_the_configuration_of_alertmanager_is_one() -> None:
     command = ["amtool", "check-config", str(DEPLOY / "prometheus" / "alertmanager.yml")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
