@@ -44,8 +44,8 @@ $(VENV)/.installed: requirements.lock requirements.hashes.lock pyproject.toml
 	$(PIP) --no-deps --editable .
 	@touch $@
 
-$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock
-	$(PIP) -r requirements-dev.lock
+$(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock requirements-dev.hashes.lock
+	$(PIP) --no-deps --require-hashes -r requirements-dev.hashes.lock
 	@touch $@
 
 fleet-demo: install-fleet
@@ -86,13 +86,15 @@ sbom: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
 	$(BIN)/cyclonedx-py requirements requirements.lock --of JSON -o sbom.json
 
-# the SHA-256 of every file of the packages in requirements.lock; torch comes from an index of the user's choice
-lock: install-dev
+# the SHA-256 of every file of the packages in both locks; torch comes from an index of the user's choice
+# (needs only uv: works also before what was added to a lock is installed)
+lock: install
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "uv>=0.5,<1"
-	grep -v "^torch==" requirements.lock > .lock.in
-	(head -2 requirements.hashes.lock; $(BIN)/uv pip compile .lock.in --no-deps --generate-hashes --no-annotate --no-header \
-		--quiet --python-version 3.11) > .lock.out
-	mv .lock.out requirements.hashes.lock
+	for lock in requirements requirements-dev; do \
+		grep -v -e "^torch==" -e "^#" $$lock.lock > .lock.in; \
+		(grep "^#" $$lock.hashes.lock; $(BIN)/uv pip compile .lock.in --no-deps --generate-hashes --no-annotate --no-header \
+			--quiet --python-version 3.11) > .lock.out && mv .lock.out $$lock.hashes.lock || exit 1; \
+	done
 	rm .lock.in
 
 # which licence each installed package has

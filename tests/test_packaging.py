@@ -231,12 +231,13 @@ def test_the_steps_of_the_image_make_a_service_that_answers(tmp_path: Path) -> N
         assert process.wait(30) == 0
 
 
-def test_the_lock_with_hashes_is_the_lock() -> None:
+@pytest.mark.parametrize("lock", ["requirements", "requirements-dev"])
+def test_the_lock_with_hashes_is_the_lock(lock: str) -> None:
     def pinned(name: str) -> list[str]:
         lines = (ROOT / name).read_text(encoding="utf-8").splitlines()
         found = [line.split()[0].lower().partition("==") for line in lines if "==" in line and not line.startswith("#")]
         return sorted(f"{re.sub('[-_.]+', '-', package)}=={version}" for package, _, version in found)
 
-    plain = [line for line in pinned("requirements.lock") if not line.startswith("torch==")]
-    assert pinned("requirements.hashes.lock") == plain, "run `make lock`"
-    assert (ROOT / "requirements.hashes.lock").read_text(encoding="utf-8").count("--hash=sha256:") >= len(plain)
+    plain = [line for line in pinned(f"{lock}.lock") if not line.startswith("torch==")]
+    assert pinned(f"{lock}.hashes.lock") == plain, "run `make lock`"
+    assert (ROOT / f"{lock}.hashes.lock").read_text(encoding="utf-8").count("--hash=sha256:") >= len(plain)
