@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from sprung.model.diagnosis.ambient.decay import decay_begin
+from sprung.model.diagnosis.ambient.decay import decay_stretch
 from sprung.model.diagnosis.ambient.diagnose import diagnose_unforced
 from sprung.model.diagnosis.component.diagnose import diagnose_components
 from sprung.model.diagnosis.component.measured import covariates, is_component_test
@@ -62,10 +62,10 @@ def diagnose(
     if system.on_track or not system.file.inputs:
         whole = replace(options.rules.record, longest=len(record.values))
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
-        begin = None if system.on_track else decay_begin(prepared.signals, system.sensor_noise)
-        if begin is None:
+        decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise)
+        if decay is None:
             return diagnose_unforced(system, prepared, record, options, tell)
-        record = RecordedPart(record.sample_rate, record.values[begin:], record.lost)
+        record = RecordedPart(record.sample_rate, record.values[decay], record.lost)
     outcome = investigate(system, record, options, tell)
     tell(0.95, "report")
     report = narrate(outcome, record)

@@ -175,7 +175,8 @@ class ComponentRules:
     close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
     surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
-    named: float = rule(0.5, "of the excess power; derived: named laws explain more than they leave", 0.3, 0.7)
+    named: float = rule(0.8, "of the excess power; chosen: laws that leave more are not the component's", 0.6, 0.9)
+    at_noise: float = rule(1.2, "of the power of the record's own noise; derived: a level's scatter", 1.1, 1.4)
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
 

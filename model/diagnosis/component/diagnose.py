@@ -18,7 +18,13 @@ from sprung.model.diagnosis.component.search import (
     Step,
     search,
 )
-from sprung.model.diagnosis.component.words import finding_of, leftover_words, preload_finding, reversed_finding
+from sprung.model.diagnosis.component.words import (
+    finding_of,
+    leftover_words,
+    preload_finding,
+    reversed_finding,
+    unknown_finding,
+)
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, HeldOutErrors, verdict_of
 from sprung.model.diagnosis.report.report import (
@@ -45,7 +51,8 @@ class Judged:
     final: ComponentFit
     floor: float  # N
     reversed: bool  # the force or the motion was measured with the other sign
-    surface: Step | None  # what no law explains, as an unnamed force
+    surface: Step | None = None  # what no law explains, as an unnamed force
+    named: bool = True  # the laws explain enough to be the component's; else they are what comes closest
 
     @property
     def size(self) -> float:
@@ -84,12 +91,13 @@ def _judge(one: ComponentRecord, tell: Told) -> Judged:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, tell=tell)
     base, final = found.base, found.final
-    judged = Judged(one, found, base, final, noise_floor(one, final), turned, None)
-    left = float(np.max(judged.errors.unexplained()))
+    judged = Judged(one, found, base, final, noise_floor(one, final), turned)
     share = judged.errors.explained()
-    if left > 0 and (not found.steps or (share is not None and share < one.task.rules.named)):
+    left = bool(np.any(judged.errors.unexplained() > 0))
+    carried = bool(found.steps) and share is not None and share >= one.task.rules.named
+    if left and not carried:
         tell("what is left, as an unnamed force")
-        judged = _with_surface(judged)
+        judged = replace(_with_surface(judged), named=False)
     return judged
 
 
@@ -113,11 +121,8 @@ def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
     declared counts where the record shows less, up to a fiftieth of the force.
     """
     task = one.task
-    cell = max(one.measured_noise, min(one.declared, task.rules.declared * float(np.std(task.force))))
-    through = np.hypot(
-        fit.element.stiffness * task.motion.deflection_noise, fit.element.damping * task.motion.rate_noise
-    )
-    return float(np.hypot(cell, min(float(through), task.rules.declared * float(np.std(task.force)))))
+    most = task.rules.declared * float(np.std(task.force))
+    return float(np.hypot(max(task.noise, min(one.declared, most)), min(fit.motion_noise, most)))
 
 
 def _with_surface(judged: Judged) -> Judged:
@@ -140,7 +145,8 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
     for one in judged:
         findings += _findings(one)
     findings.sort(key=_rank)
-    verdict = verdict_of([f.effect for f in findings], errors)
+    rules = replace(options.rules.verdict, carried=options.rules.component.named)
+    verdict = verdict_of([f.effect for f in findings], errors, rules)
     explained = errors.explained() if any(f.effect not in NO_FAULTS for f in findings) else None
     left = errors.unexplained()
     names = [j.record.sensor for j in judged]
@@ -182,22 +188,13 @@ def _findings(one: Judged) -> list[Finding]:
     findings = []
     if one.reversed:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
-    for index, step in enumerate(one.found.steps):
+    for index, step in enumerate(one.found.steps if one.named else ()):
         findings.append(
             finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names))
         )
-    if one.surface is not None:
-        step = one.surface
-        findings.append(
-            Finding(
-                one.record.element,
-                "unknown",
-                (),
-                step.p_value,
-                bic(step.gain, len(SURFACE.signs), int(step.chosen.count)),
-                sentence=f"{one.record.element}: a force that no law of the catalogue explains; its map is reported",
-            )
-        )
+    step = one.surface or (None if one.named else next(iter(one.found.steps), None))
+    if step is not None:
+        findings.append(unknown_finding(one.record.element, step, one.found.steps, mapped=one.surface is not None))
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     sign = -1.0 if one.reversed else 1.0
     if abs(one.final.preload) > 5 * max(deviation, one.floor / np.sqrt(one.record.task.split)):

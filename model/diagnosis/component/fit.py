@@ -45,6 +45,7 @@ class ComponentTask:
     nominal: NominalValues = NominalValues(None, None)
     rules: ComponentRules = RULES.component
     signals: tuple[Covariate, ...] = ()  # that its parameters may follow
+    noise: float = 0.0  # N, of the force as the record itself shows it, apart from any model
 
     @cached_property
     def seen(self) -> Seen:
@@ -119,6 +120,23 @@ class ComponentFit:
     def force(self) -> FloatArray:
         """Modelled force, N, (T,)."""
         return self.task.force - self.residual
+
+    @property
+    def motion_noise(self) -> float:
+        """What spring and damper make of the motion's noise, N."""
+        motion = self.task.motion
+        return float(
+            np.hypot(self.element.stiffness * motion.deflection_noise, self.element.damping * motion.rate_noise)
+        )
+
+    @property
+    def at_noise(self) -> bool:
+        """Whether nothing is left but noise that the record shows apart from any model: then no law is missing.
+
+        The noise of a differentiated motion lies in few bins, so that its chance patterns look like laws.
+        """
+        level = self.task.rules.at_noise * (self.task.noise**2 + self.motion_noise**2)
+        return max(self.error, self.held_out) < level
 
     def strengths_of(self, index: int) -> FloatArray:
         counts = [len(piece.signs) for piece in self.model.pieces]
@@ -250,6 +268,9 @@ def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) ->
         gradient = np.zeros((len(centre), len(start)))
         for j in range(len(start)):
             step = _RELATIVE * max(abs(start[j]), 1e-9)
-            gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
-        result.append(np.sqrt(np.maximum(np.diag(gradient @ block @ gradient.T), 0.0)) if len(centre) else centre)
+            with np.errstate(over="ignore", invalid="ignore"):  # what a huge exponent leaves open is infinite
+                gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
+        with np.errstate(over="ignore", invalid="ignore"):
+            variance = np.diag(gradient @ block @ gradient.T) if len(centre) else centre
+        result.append(np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, np.inf), 0.0)))
     return result[0], result[1]

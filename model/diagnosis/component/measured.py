@@ -31,14 +31,7 @@ class ComponentRecord:
     sensor: str
     task: ComponentTask
     declared: float  # N, noise of the force as the system file states it; 0: it states none
-    rest: float | None  # N, noise of the force at standstill
-    white: float  # N, noise of the force at the highest frequencies
     notes: tuple[str, ...]
-
-    @property
-    def measured_noise(self) -> float:
-        """Noise of the force as the record itself shows it, apart from any model, N."""
-        return max(self.rest or 0.0, self.white)
 
 
 def is_component_test(system: System, values: FloatArray) -> bool:
@@ -117,18 +110,8 @@ def _record(
             if end != "ground":
                 notes.append(f"{end} hardly moves under the measured force: taken for ground")
             continue
-        source = system.file.inputs[end]
-        if not isinstance(source, SupportInput) or not {"displacement", "velocity"} & source.measured.keys():
-            raise DiagnosisError(f"input {end}: a component test needs its displacement or its velocity measured")
-        rate: FloatArray | None = None
-        if "velocity" in source.measured:
-            rate = _column(values, names, f"{end}.velocity")
-        if "displacement" in source.measured:
-            displacement += sign * _column(values, names, f"{end}.displacement")
-        else:
-            assert rate is not None
-            displacement += sign * _integral(rate, sample_rate)
-            notes.append(f"{end}.displacement was integrated from its velocity")
+        moved, rate = _motion_of(system, end, values, names, sample_rate, notes)
+        displacement += sign * moved
         if rate is None:
             has_velocity = False
         else:
@@ -164,10 +147,28 @@ def _record(
     motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
     nominal = NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
     signals = covariates(system, values, sample_rate, element, notes)
-    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals=signals)
-    return ComponentRecord(
-        element, sensor, task, system.file.sensors[sensor].noise, rest, white_noise(f[run]), tuple(notes)
-    )
+    noise = max(rest or 0.0, white_noise(f[run]))
+    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals=signals, noise=noise)
+    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes))
+
+
+def _motion_of(
+    system: System, end: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Displacement of a support (T,), and its rate where that is measured."""
+    source = system.file.inputs[end]
+    if not isinstance(source, SupportInput):
+        raise DiagnosisError(f"input {end}: a component test needs its motion measured, not a force on it")
+    rate = _column(values, names, f"{end}.velocity") if "velocity" in source.measured else None
+    if "displacement" in source.measured:
+        return _column(values, names, f"{end}.displacement"), rate
+    if rate is None:
+        raise DiagnosisError(
+            f"input {end} is measured by its acceleration alone, whose twofold integral wanders: a component test "
+            "needs its displacement or its velocity measured"
+        )
+    notes.append(f"{end}.displacement was integrated from its velocity")
+    return _integral(rate, sample_rate), rate
 
 
 def covariates(

@@ -85,6 +85,8 @@ def search(
     steps: list[Step] = []
     screened: dict[str, float] = {}
     for number in range(rules.most + rules.per_signal * len(task.signals)):
+        if current.fit.at_noise:
+            break
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
         ranked = _next_laws(current.fit, pieces, rules)
         if number == 0:

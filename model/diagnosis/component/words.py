@@ -143,6 +143,35 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
     )
 
 
+def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped: bool) -> Finding:
+    """A force that no law explains; the laws that come closest are no finding, but worth a word.
+
+    step: the unnamed force as it was found; mapped: its map is reported.
+    """
+    sentence = f"{element}: a force that no law of the catalogue explains{'; its map is reported' if mapped else ''}"
+    closest = None
+    if laws:
+        last = laws[-1].chosen
+        names = " and ".join(dict.fromkeys(s.chosen.last.effect.replace("_", " ") for s in laws))
+        left = np.sqrt(last.fit.held_out / max(laws[0].before.fit.held_out, 1e-300))
+        sentence += f"; {names} would come closest and leave {100 * left:.0f} % of the error"
+        first = laws[0].chosen
+        closest = (
+            first.last.effect,
+            bic(first.gain, len(first.last.signs) + len(first.last.shapes), int(first.count)),
+        )
+    return Finding(
+        element,
+        "unknown",
+        (),
+        step.p_value,
+        bic(step.gain, len(step.chosen.last.signs) + len(step.chosen.last.shapes), int(step.chosen.count)),
+        runner_up=closest,
+        runner_up_location=None if closest is None else element,
+        sentence=sentence,
+    )
+
+
 def reversed_finding(sensor: str, element: str) -> Finding:
     """A force or a motion with the other sign."""
     return Finding(

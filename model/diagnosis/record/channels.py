@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
+from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS
@@ -160,6 +161,7 @@ def _by_role(
     displacement, velocity, force, integrated, accelerated = [], [], [], [], []
     support_names, force_names = [], []
     column = 0
+    levelled: FloatArray | None = None  # the acceleration of a support that nothing else tells of
     frozen = {name for name, _ in stuck}
     for name, source in system.file.inputs.items():
         if not isinstance(source, SupportInput):
@@ -175,12 +177,10 @@ def _by_role(
         column += len(quantities)
         if not there:
             raise DiagnosisError(_missing(name, frozen))
-        if set(there) == {"acceleration"}:  # over a whole recording the noise of its integral goes by metres
-            raise DiagnosisError(
-                f"input {name} is measured by its acceleration alone: windows are identified with it, but a whole "
-                "recording cannot be diagnosed; measure its displacement or velocity as well"
-            )
-        if "displacement" not in there and "displacement" in quantities:
+        if set(there) == {"acceleration"}:
+            _require_common_motion(system, name)
+            levelled = there["acceleration"]
+        elif "displacement" not in there and "displacement" in quantities:
             notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
         d, v = _moved(source, there, 1 / sample_rate)
         displacement.append(d)
@@ -195,6 +195,9 @@ def _by_role(
     for name in np.array(system.sensors)[~present]:
         if name not in frozen:
             notes.append(f"sensor {name} is missing: diagnosed without it")
+    if levelled is not None:  # then it is the only support
+        kept = _second_derivative(displacement[0], levelled, 1 / sample_rate)
+        sensors = _without_offsets(sensors, kept, system.mechanics.sensor_kind == ACCELERATION)
     empty = np.zeros((len(values), 0))
     signals = Signals(
         sample_rate=sample_rate,
@@ -222,6 +225,45 @@ def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> 
     noise = {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured}
     d, _ = motion(by_order, dt, noise)
     return d, measured.get("velocity", apart) if set(measured) == {"velocity"} else apart
+
+
+def _require_common_motion(system: System, name: str) -> None:
+    """Over a whole recording the twofold integral of an acceleration wanders by metres.
+
+    What is carried by that one support alone wanders with it, and no deflection or acceleration sees it.
+    """
+    others = [n for n, source in system.file.inputs.items() if isinstance(source, SupportInput) and n != name]
+    grounded = [n for n, e in system.file.elements.items() if "ground" in (e.upper, e.lower)]
+    kinds = (DISPLACEMENT, VELOCITY)
+    absolute = [n for n, kind in zip(system.sensors, system.mechanics.sensor_kind, strict=True) if kind in kinds]
+    for what, reason in (
+        (others, "moves on its own beside it"),
+        (grounded, "is held by the ground, which does not wander"),
+        (absolute, "measures a motion that does not wander"),
+    ):
+        if what:
+            raise DiagnosisError(
+                f"input {name} is measured by its acceleration alone, which a whole recording can be diagnosed with "
+                f"where nothing but {name} carries the bodies; {what[0]} {reason}; measure the displacement or "
+                f"velocity of {name} as well"
+            )
+
+
+def _without_offsets(sensors: FloatArray, base: FloatArray, accelerations: np.ndarray) -> FloatArray:
+    """Sensors (T, S), the accelerations among them level in the long run with that of the support, (T,).
+
+    A taper that vanishes with its slope at both ends takes the mean of a relative acceleration to some
+    (2 pi / duration)^2 of the relative displacement: nothing.
+    """
+    taper = np.hanning(len(base))
+    offset = taper @ (sensors - base[:, None]) / taper.sum()
+    return np.where(accelerations, sensors - offset, sensors)
+
+
+def _second_derivative(displacement: FloatArray, acceleration: FloatArray, dt: float) -> FloatArray:
+    """A measured acceleration (T,) less what its twofold integral, the displacement (T,), has lost of it."""
+    lost = np.mean(acceleration[1:-1] - np.diff(displacement, 2) / dt**2)
+    return acceleration - lost
 
 
 def _missing(name: str, frozen: set[str]) -> str:

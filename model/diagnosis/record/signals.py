@@ -136,11 +136,11 @@ def declared_noise(system: System, signals: Signals) -> Noise:
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
     levels = np.array(sensors)
-    least = _LEAST * np.minimum(levels, _roughness(signals.sensors))
+    least = _LEAST * np.minimum(levels, roughness(signals.sensors))
     return Noise(np.array(displacement), np.array(velocity), np.array(acceleration), np.array(force), levels, least)
 
 
-def _roughness(series: FloatArray) -> FloatArray:
+def roughness(series: FloatArray) -> FloatArray:
     """The strongest white noise that series (T, m) can hold, (m,): that of their differences of high order."""
     differences = np.diff(series, _ORDER, axis=0)
     return np.asarray(np.std(differences, axis=0) / np.sqrt(comb(2 * _ORDER, _ORDER)))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sprung.model.diagnosis.ambient.decay import decay_begin
+from sprung.model.diagnosis.ambient.decay import decay_stretch
 from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.signals import FloatArray
@@ -109,11 +109,12 @@ def test_a_free_decay_is_known_from_vibration_that_goes_on() -> None:
         size=(1000, 2)
     )
     noise = system.sensor_noise
-    assert decay_begin(prepare(system, decay, RATE).signals, noise) == 0
-    assert decay_begin(prepare(system, shaken, RATE).signals, noise) is None
+    found = decay_stretch(prepare(system, decay, RATE).signals, noise)
+    assert found is not None and found.start == 0
+    assert decay_stretch(prepare(system, shaken, RATE).signals, noise) is None
     later = np.concatenate([0.001 * np.random.default_rng(9).normal(size=(200, 2)), decay])
-    begin = decay_begin(prepare(system, later, RATE).signals, noise)
-    assert begin is not None and abs(begin - 200) < 5
+    found = decay_stretch(prepare(system, later, RATE).signals, noise)
+    assert found is not None and abs(found.start - 200) < 5
 
 
 def test_windows_that_tell_nothing_are_refused() -> None:

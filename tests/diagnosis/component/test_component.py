@@ -249,3 +249,31 @@ def test_standstill_is_found_and_its_noise_measured() -> None:
     assert 560 <= stretch.stop <= 620
     force = np.random.default_rng(4).standard_normal(len(series)) * 3.0
     assert noise_at_rest(force, [stretch]) == pytest.approx(3.0, rel=0.1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_a_differentiated_motion_is_no_law(seed: int) -> None:
+    """A sine at one amplitude: the noise that passes with it lies in few bins and looks like a knee at the top."""
+    random = np.random.default_rng(seed)
+    t = np.arange(3000) / RATE
+    d, v = 0.025 * np.sin(6.6 * t), 0.165 * np.cos(6.6 * t)
+    columns = [d + 2e-5 * random.standard_normal(len(t)), 800 * d + 1e3 * v + 0.5 * random.standard_normal(len(t))]
+    found = diagnose(system(0.5), RigRecording(np.column_stack(columns)))
+    assert (found.verdict, laws(found)) == ("consistent", [])
+
+
+def test_what_a_law_leaves_large_is_not_that_law() -> None:
+    """A slider driven through a play that stays where it was pushed: no law of the catalogue is near."""
+    random, t = np.random.default_rng(4), np.arange(4000) / RATE
+    waves = [np.sin(2 * np.pi * f * t + random.uniform(0, 6)) for f in random.uniform(0.2, 3.0, 12)]
+    d = 0.006 * np.interp(t, [0, 3, 8, 20], [0, 1, 1, 0.1]) * np.sum(waves, axis=0)
+    place, force, forces = 0.0, 0.0, []
+    for at in d:
+        moved = float(np.clip(place, at - 0.004, at + 0.004))
+        force = float(np.clip(force + 2e6 * (moved - place), -9000.0, 9000.0))
+        place = moved
+        forces.append(force)
+    found = report(np.array(forces), d, noise=20.0, declared=20.0)
+    assert found.verdict == "unknown_physics"
+    assert laws(found) == ["unknown"]
+    assert "would come closest" in (found.findings[0].sentence or "")

@@ -21,10 +21,36 @@ def ride(motions):
     return system, simulate_runs(system, np.zeros((1, 4)), 2000, np.random.default_rng(0))
 
 
-def test_accelerations_alone_are_refused_in_one_line():
+def test_an_acceleration_alone_is_enough_where_one_support_carries_everything():
     system, runs = ride(A)
-    with pytest.raises(DiagnosisError, match=r"^input road is measured by its acceleration alone: .* as well$"):
-        prepare(system, runs.values[0], 200.0)
+    values = runs.values[0].copy()
+    values[:, 0] += 0.3  # the offsets of two accelerometers
+    values[:, 1] -= 0.2
+    signals = prepare(system, values, 200.0).signals
+    plain = prepare(system, runs.values[0], 200.0).signals
+    assert signals.accelerated.all() and signals.integrated.all()
+    np.testing.assert_allclose(signals.displacement, plain.displacement, atol=1e-9)
+    np.testing.assert_allclose(signals.sensors, plain.sensors, atol=1e-9)
+    curvature = np.diff(signals.displacement[:, 0], 2) * 200.0**2
+    assert np.std(curvature - (values[1:-1, 0] - values[:, 0].mean())) < 0.05 * np.std(values[:, 0])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (("lower: unsprung", "lower: ground"), "strut"),
+        (("kind: acceleration, body: sprung", "kind: displacement, body: sprung"), "body"),
+    ],
+)
+def test_what_does_not_wander_with_an_integrated_support_needs_more_than_its_acceleration(change, said):
+    text = QUARTER_CAR.replace(f"{D}, {V}", A)
+    assert change[0] in text
+    system = parse_system(text.replace(*change))
+    values = np.random.default_rng(0).standard_normal((2000, len(system.channels)))
+    with pytest.raises(
+        DiagnosisError, match=rf"^input road is measured by its acceleration alone, .*({said}).* as well$"
+    ):
+        prepare(system, values, 200.0)
 
 
 @pytest.mark.parametrize("beside", [D, V, f"{D}, {V}"])
