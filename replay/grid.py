@@ -27,6 +27,8 @@ REACH = 8  # grid periods of context that resampling and repair look at on eithe
 KAISER_BETA = 7.0  # stop band -70 dB
 NEIGHBOURS = 3  # valid samples on either side that a repair uses
 FEWEST = 4  # samples below which a channel's clock cannot be told
+MOST_EVEN, SCATTER = 64, 0.005  # samples, and scatter of stamps in periods, below which it does not matter
+SMOOTH_ORDER, SURE = 4, 5.0  # of the differences that tell; deviations from which they do
 EVEN, WELL_EVEN = 0.45, 0.9  # resultant length of phases: the stamps have an even clock; they show it clearly
 PUNCTUAL = 0.2  # share of samples with about the least delay, without which it is no delay but disorder
 STEADY = 0.45  # grid periods by which the least delay may change while no sample is lost
@@ -132,6 +134,32 @@ def uneven(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int
     if len(even) < FEWEST or np.isnan(even).all():
         return nothing
     return _on_rows(even, start, period, rows, longest)
+
+
+def taken_at_stamps(offset: FloatArray, value: FloatArray) -> bool:
+    """Whether samples were taken when their stamps say, rather than on the even clock that the stamps scatter about.
+
+    A sample that is taken early or late by e shows the signal's slope times e more than an even one.  Differences of
+    high order of the values, which leave nothing of a smooth signal, are regressed on those of slope times e: the
+    factor is 1 where the stamps are right and 0 where only they scatter.  Offsets in grid periods, sorted.
+    """
+    good = np.isfinite(value) & (np.diff(offset, prepend=-np.inf) > 1e-6)
+    offset, value = offset[good], value[good]
+    if len(offset) < MOST_EVEN:
+        return False
+    steps = np.rint(np.diff(offset) / float(np.median(np.diff(offset))))
+    count = np.r_[0.0, np.cumsum(steps)]
+    period, start = np.polyfit(count, offset, 1)
+    early = offset - start - period * count
+    whole = np.convolve(steps == 1, np.ones(SMOOTH_ORDER), "valid") > SMOOTH_ORDER - 0.5
+    shown = np.diff(np.gradient(value) / period * early, SMOOTH_ORDER)[whole]
+    measured = np.diff(value, SMOOTH_ORDER)[whole]
+    size = float(shown @ shown)
+    if size <= 0 or float(np.std(early)) < SCATTER * period:
+        return False
+    factor = float(shown @ measured) / size
+    deviation = float(np.sqrt(np.mean((measured - factor * shown) ** 2) * 2 * SMOOTH_ORDER / size))
+    return factor > 0.5 and factor > SURE * deviation
 
 
 def by_count(offset: FloatArray, value: FloatArray, rows: FloatArray, longest: int = 2) -> Resampled | None:

@@ -11,7 +11,7 @@ from cantools.database import Database
 
 from sprung.model.signals import ANY_TIME, BoolArray, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.grid import REACH, place, resample, uneven
+from sprung.replay.grid import REACH, place, resample, taken_at_stamps, uneven
 from sprung.replay.recording import Recording, open_recording
 from sprung.replay.stream import ClockJump, Order
 
@@ -131,21 +131,36 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
         )
     placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
-    for channel in np.flatnonzero(placed.off_grid.any(axis=0)):
+    told = [recording.stamped and _taken_at_stamps(block, offset, channel) for channel in range(len(channels))]
+    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | told):
         own = block.channel == channel
-        values[:, channel], between = _resample_long(offset[own], block.value[own], rows, recording.stamped)
+        values[:, channel], between = _resample_long(
+            offset[own], block.value[own], rows, recording.stamped, told[channel]
+        )
         if between:
             steps = np.diff(np.sort(block.time[own])) / 1e6
             low, high = np.percentile(steps, [1, 99])
+            reason = "its samples were taken at uneven times" if told[channel] else "its time stamps fit no even clock"
             recording.account.note(
-                f"{channels[channel].name}: its time stamps fit no even clock (steps of {low:.3g} to {high:.3g} ms) in "
+                f"{channels[channel].name}: {reason} (steps of {low:.3g} to {high:.3g} ms) in "
                 f"{100 * between / rows:.2g} % of the record: interpolated between them (cubic spline)"
             )
     return start, values
 
 
-def _resample_long(offset: FloatArray, value: FloatArray, rows: int, stamped: bool) -> tuple[FloatArray, int]:
-    """Values at the rows, and how many of them had to be interpolated between uneven stamps."""
+def _taken_at_stamps(block: SampleBlock, offset: FloatArray, channel: int) -> bool:
+    own = block.channel == channel
+    order = np.argsort(offset[own], kind="stable")
+    return taken_at_stamps(offset[own][order], block.value[own][order])
+
+
+def _resample_long(
+    offset: FloatArray, value: FloatArray, rows: int, stamped: bool, told: bool
+) -> tuple[FloatArray, int]:
+    """Values at the rows, and how many of them had to be interpolated between uneven stamps.
+
+    told: the samples were taken when their stamps say.
+    """
     order = np.argsort(offset, kind="stable")
     offset, value = offset[order], value[order]
     column = np.full(rows, np.nan)
@@ -154,8 +169,8 @@ def _resample_long(offset: FloatArray, value: FloatArray, rows: int, stamped: bo
         last = min(first + ROWS_AT_ONCE, rows)
         near = slice(*np.searchsorted(offset, [first - 4 * REACH, last + 4 * REACH]))
         at = np.arange(first, last, dtype=np.float64)
-        result = resample(offset[near], value[near], at)
-        if not result.even and stamped:
+        result = None if told else resample(offset[near], value[near], at)
+        if result is None or (not result.even and stamped):
             result = uneven(offset[near], value[near], at)
             between += last - first
         result.value[result.bridged] = np.nan

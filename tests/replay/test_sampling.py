@@ -196,3 +196,26 @@ def test_a_record_beyond_any_memory_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("time,force,position\n" + rows)
     with pytest.raises(UnreadableRecording, match="more than can be analysed in one piece"):
         load_record(tmp_path / "a.csv", CSV_CHANNELS, 1.0e3 / 900, pause=1e9)
+
+
+@pytest.mark.parametrize("scatter", [0.03, 0.2, 0.4])
+def test_uneven_stamps_are_believed_where_the_samples_were_taken_then(tmp_path, scatter):
+    """A table's stamps scatter: either the samples do too, or only the stamps; the signal tells which."""
+    rng = np.random.default_rng(2)
+    even = np.arange(2000) / 200.0
+    stamps = even + scatter / 200.0 * rng.uniform(-1, 1, len(even))
+
+    def signal(at):
+        return np.sin(2 * np.pi * 1.3 * at) + 0.4 * np.sin(2 * np.pi * 4.1 * at + 1)
+
+    for taken in (stamps, even):
+        noisy = signal(taken) + 1e-3 * rng.standard_normal(len(even))
+        path = tmp_path / "rig.csv"
+        rows = "\n".join(f"{t:.7f},{v:.7g}" for t, v in zip(stamps, noisy, strict=True))
+        path.write_text("time,x\n" + rows + "\n")
+        record = load_record(path, (Channel("x", "m", 1e-6, csv="x"),), 200.0)
+        at = record.start / 1e9 + np.arange(len(record.values)) / 200.0
+        at -= at[0] - stamps[0]
+        error = (record.values[:, 0] - signal(at))[20:-20]
+        shift = np.std(error - np.mean(error))
+        assert shift < (3.5e-3 if taken is stamps else 0.004 + 0.06 * scatter)

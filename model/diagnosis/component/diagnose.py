@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, ComponentTask, covariance, fitted, spread
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentTask, covariance, fitted, spread
+from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.piece import SURFACE
 from sprung.model.diagnosis.component.search import (
@@ -31,6 +32,7 @@ from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
     FitFigures,
+    IdentifiedLaw,
     RecordingFacts,
     Report,
     ReportedParameter,
@@ -89,7 +91,7 @@ def _judge(one: ComponentRecord, tell: Told) -> Judged:
     turned = _turned(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, tell=tell)
+    found = search(one.task, tell=tell, given=one.given)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, noise_floor(one, final), turned)
     share = judged.errors.explained()
@@ -170,6 +172,8 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
         },
         candidates=tuple(c for j in judged for c in _candidates(j)),
         explained=explained,
+        laws=tuple(law for j in judged for law in _laws(j)),
+        noise={j.record.sensor: j.record.task.noise for j in judged if j.record.task.noise > 0},
         unexplained=unexplained,
         summary=_summary(verdict, findings, explained, unexplained),
         advice=tuple(advice if verdict != "consistent" else []),
@@ -188,7 +192,7 @@ def _findings(one: Judged) -> list[Finding]:
     findings = []
     if one.reversed:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
-    for index, step in enumerate(one.found.steps if one.named else ()):
+    for index, step in enumerate(one.found.steps if one.named else (), len(one.record.given.pieces)):
         findings.append(
             finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names))
         )
@@ -200,6 +204,12 @@ def _findings(one: Judged) -> list[Finding]:
     if abs(one.final.preload) > 5 * max(deviation, one.floor / np.sqrt(one.record.task.split)):
         findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
     return findings
+
+
+def _laws(one: Judged) -> tuple[IdentifiedLaw, ...]:
+    """What a system file takes over: laws that are given or named, and the preload."""
+    count = len(one.record.given.pieces) + (len(one.found.steps) if one.named else 0)
+    return identified_laws(one.final, one.record.element, count, *covariance(one.final), -1.0 if one.reversed else 1.0)
 
 
 def _parameters(system: System, element: str, fit: ComponentFit) -> list[ReportedParameter]:
@@ -265,13 +275,10 @@ def _arrays(judged: list[Judged], sample_rate: float) -> dict[str, np.ndarray]:
         arrays["validation.noise"] = np.array([j.floor for j in judged])
     arrays["localization.names"] = np.array([j.record.element for j in judged], dtype=str)
     arrays["localization.score"] = np.array([j.found.base.error for j in judged])
-    for number, (one, index) in enumerate((j, i) for j in judged for i in range(len(j.found.steps))):
+    for number, (one, columns) in enumerate((j, columns) for j in judged for columns in _columns_of_findings(j)):
         task = one.final.task
         thin = slice(None, None, max(1, len(task.force) // 4000))
-        own = ComponentModel.columns(one.final.model, task)
-        counts = [len(p.signs) for p in one.final.model.pieces]
-        columns = slice(sum(counts[:index]), sum(counts[: index + 1]))
-        law = own[:, columns] @ one.final.strengths[columns]
+        law = one.final.model.columns(task)[:, columns] @ one.final.strengths[columns]
         key = f"finding.{number}"
         arrays[f"{key}.time"], arrays[f"{key}.deflection"] = task.motion.time[thin], task.motion.deflection[thin]
         arrays[f"{key}.rate"] = task.motion.rate[thin]
@@ -281,6 +288,15 @@ def _arrays(judged: list[Judged], sample_rate: float) -> dict[str, np.ndarray]:
         arrays[f"{key}.total_measured"] = task.force[thin]
         arrays[f"{key}.total_modelled"] = one.final.force[thin]
     return arrays
+
+
+def _columns_of_findings(one: Judged) -> list[slice]:
+    """Which columns of the model every finding is: one law's, or all of what is unnamed."""
+    counts = [len(piece.signs) for piece in one.final.model.pieces]
+    given, steps = len(one.record.given.pieces), len(one.found.steps)
+    if not one.named:
+        return [slice(sum(counts[:given]), sum(counts))]
+    return [slice(sum(counts[:i]), sum(counts[: i + 1])) for i in range(given, given + steps)]
 
 
 def _fine_split(one: Judged) -> int:

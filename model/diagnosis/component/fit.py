@@ -95,6 +95,9 @@ class ComponentModel:
         return sum(len(p.signs) + len(p.shapes) for p in self.pieces)
 
 
+NO_LAWS = ComponentModel()
+
+
 @dataclass(frozen=True)
 class ComponentFit:
     """A fitted model."""

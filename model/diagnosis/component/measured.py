@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentTask, NominalValues
+from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
+from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES, DiagnosisError, TooLittleError
 from sprung.model.laws.following import Covariate
@@ -32,6 +33,7 @@ class ComponentRecord:
     task: ComponentTask
     declared: float  # N, noise of the force as the system file states it; 0: it states none
     notes: tuple[str, ...]
+    given: ComponentModel = NO_LAWS  # laws of the system file
 
 
 def is_component_test(system: System, values: FloatArray) -> bool:
@@ -149,7 +151,8 @@ def _record(
     signals = covariates(system, values, sample_rate, element, notes)
     noise = max(rest or 0.0, white_noise(f[run]))
     task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals=signals, noise=noise)
-    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes))
+    given = given_model(system, element, notes)
+    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes), given)
 
 
 def _motion_of(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import (
+    NO_LAWS,
     ComponentFit,
     ComponentModel,
     ComponentTask,
@@ -73,13 +74,17 @@ def search(
     task: ComponentTask,
     pieces: tuple[LawPiece, ...] = PIECES,
     tell: Progress = lambda text: None,
+    given: ComponentModel = NO_LAWS,
 ) -> Search:
-    """Grow a model of the component until the rest is noise, or nothing explains enough of it."""
+    """Grow a model of the component until the rest is noise, or nothing explains enough of it.
+
+    given: laws that the system file puts in place; what is found comes beside them.
+    """
     rules = task.rules
     pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)))
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
-    base = fitted(quick, ComponentModel())
+    base = refined(quick, given)
     count = effective_count(base.residual[: quick.split])
     current = Ranked(base, 0.0, 0.0, count)
     steps: list[Step] = []
@@ -96,11 +101,11 @@ def search(
         if step is None:
             break
         steps.append(step)
-        current = _swapped(step.chosen, pieces, rules)
+        current = _swapped(step.chosen, pieces, rules, len(given.pieces))
         if current is not step.chosen:  # an earlier law gives way to one that suits the later better
-            steps = _renamed(steps, current)
+            steps = _renamed(steps, current, len(given.pieces))
     final = refined(fine, current.fit.model)
-    return Search(fitted(fine, ComponentModel()), final, tuple(steps), screened)
+    return Search(refined(fine, base.model), final, tuple(steps), screened)
 
 
 def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules) -> list[Ranked]:
@@ -220,13 +225,13 @@ def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> S
     return Step(chosen, before, rivals, p_value)
 
 
-def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> Ranked:
-    """The same with one earlier law exchanged for another, where that is worth the margin."""
+def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules, given: int) -> Ranked:
+    """The same with one earlier law, but those that are given, exchanged for another where that is worth the margin."""
     model = chosen.fit.model
     if len(model.pieces) < 2:
         return chosen
     best = chosen
-    for index in range(len(model.pieces) - 1):
+    for index in range(given, len(model.pieces) - 1):
         rest = fitted(chosen.fit.task, model.without(index))
         for rival in _next_laws(rest, pieces, rules)[:2]:
             same = _rank([rival.fit, best.fit], rest, rules)
@@ -235,11 +240,11 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     return best
 
 
-def _renamed(steps: list[Step], current: Ranked) -> list[Step]:
+def _renamed(steps: list[Step], current: Ranked, given: int) -> list[Step]:
     """Steps of an exchanged model: every law against the model without it."""
     model = current.fit.model
     result = []
-    for index in range(len(model.pieces)):
+    for index in range(given, len(model.pieces)):
         without = fitted(current.fit.task, model.without(index))
         gain = level_gain(without.error, current.fit.error, current.count)
         ranked = Ranked(without, 0.0, 0.0, current.count)

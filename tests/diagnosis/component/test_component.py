@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
 from sprung.model.laws.reversals import bouc_wen_memory
-from sprung.model.system import System, parse_system
+from sprung.model.system import System, load_system, parse_system
+from sprung.service.improved import write_improved
 
 RATE = 200.0
 K, C = 4.0e4, 1.5e3
@@ -26,17 +28,20 @@ class RigRecording:
 
 
 def system(noise: float = 1.0, more: str = "", stiffness: str = "4.0e4") -> System:
-    return parse_system(f"""
+    return parse_system(TEXT.replace("noise: 1.0", f"noise: {noise}").replace("4.0e4", stiffness) + more)
+
+
+TEXT = f"""
 name: damper on a test bench
 sample_rate: {RATE}
 window: 64
 inputs:
   rod: {{kind: displacement, displacement: {{csv: d, noise: 1e-6}}}}
 elements:
-  damper: {{upper: rod, lower: ground, stiffness: {stiffness}, damping: 1.5e3}}
+  damper: {{upper: rod, lower: ground, stiffness: 4.0e4, damping: 1.5e3}}
 sensors:
-  cell: {{kind: force, element: damper, csv: F, noise: {noise}}}
-{more}""")
+  cell: {{kind: force, element: damper, csv: F, noise: 1.0}}
+"""
 
 
 def sweep(seconds: float = 20.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -277,3 +282,33 @@ def test_what_a_law_leaves_large_is_not_that_law() -> None:
     assert found.verdict == "unknown_physics"
     assert laws(found) == ["unknown"]
     assert "would come closest" in (found.findings[0].sentence or "")
+
+
+def test_what_was_found_is_written_into_the_system_file_and_found_there(tmp_path: Path) -> None:
+    _, d, v = sweep(8.0)
+    random = np.random.default_rng(2)
+    force = K * d + C * v + 60 * np.tanh(v / 1e-3) + 3e7 * (d - 0.5 * (d.max() + d.min())) ** 3 + 150
+    columns = np.column_stack([d + 1e-6 * random.standard_normal(len(d)), force + random.standard_normal(len(d))])
+    first = diagnose(system(), RigRecording(columns))
+    assert {law.effect for law in first.laws} == {"coulomb_friction", "cubic_stiffness", "preload"}
+    source = tmp_path / "rig.yaml"
+    source.write_text(TEXT)
+    write_improved(tmp_path / "better.yaml", source, system(), first)
+    improved = load_system(tmp_path / "better.yaml")
+    again = diagnose(improved, RigRecording(columns))
+    assert (again.verdict, laws(again)) == ("consistent", [])
+    assert again.baseline_validation.nrmse == pytest.approx(first.augmented_validation.nrmse, rel=0.02)
+    assert {law.effect for law in again.laws} == {law.effect for law in first.laws}
+
+
+def test_a_law_of_the_system_file_is_no_finding_and_what_is_beside_it_is() -> None:
+    _, d, v = sweep(8.0)
+    stop = "laws: [{coulomb_friction: {force: 40, smoothing: 1.0e-3}}]"
+    text = TEXT.replace("damping: 1.5e3", f"damping: 1.5e3, {stop}")
+    force = K * d + C * v + 60 * np.tanh(v / 1e-3) + 3e7 * (d - 0.5 * (d.max() + d.min())) ** 3
+    random = np.random.default_rng(3)
+    columns = np.column_stack([d + 1e-6 * random.standard_normal(len(d)), force + random.standard_normal(len(d))])
+    found = diagnose(parse_system(text), RigRecording(columns))
+    assert laws(found) == ["cubic_stiffness"]
+    friction = next(law for law in found.laws if law.effect == "coulomb_friction")
+    assert friction.parameters[0].value == pytest.approx(60, rel=0.05)

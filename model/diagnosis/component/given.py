@@ -1,0 +1,71 @@
+"""Laws between a component test and its system file: those that the file puts in place, and those to be written."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, spread
+from sprung.model.diagnosis.component.piece import Piece
+from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
+from sprung.model.laws.placed import PlacedLaw
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+PRELOAD = "preload"  # every component test has one
+
+
+def given_model(system: System, element: str, notes: list[str]) -> ComponentModel:
+    """The laws of the system file at an element with the shapes they have there; strengths are estimated anew.
+
+    notes: gets a line for every law that a component test cannot take over.
+    """
+    model = ComponentModel()
+    for placed in system.laws:
+        if placed.location != element or placed.law.name == PRELOAD:
+            continue
+        piece, shape = _piece(placed)
+        if piece is None:
+            notes.append(f"{element}: {placed.law.name} of the system file is left out: component tests do not fit it")
+            continue
+        model = model.plus(piece, shape)
+    return model
+
+
+def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
+    for piece in PIECES:
+        if piece.law.name == placed.law.name and len(piece.law.parameters) == len(placed.values):
+            return piece, piece.shape_of(placed.values)
+        if piece.acting is not None and piece.acting.name == placed.law.name:
+            return piece, placed.values[1:]  # strength and time of a branch
+    return None, ()
+
+
+def identified_laws(
+    fit: ComponentFit, element: str, count: int, full: FloatArray, names: list[str], sign: float
+) -> tuple[IdentifiedLaw, ...]:
+    """The first `count` laws of a fit and its preload as a system file has them.
+
+    full, names: covariance of the fit; sign: -1 where the measured force was turned.  What follows a measured signal
+    has no place in a system file and is left out.
+    """
+    found = []
+    for index, piece in enumerate(fit.model.pieces[:count]):
+        if not isinstance(piece, Piece):
+            continue
+        law, numbers = piece.law, [value for value, _ in fit.values(index).values()]
+        sigma = np.asarray(spread(fit, index, full, names)[0])
+        if piece.acting is not None and piece.acting_parameters is not None:
+            law = piece.acting
+            numbers = list(piece.acting_parameters(fit.strengths_of(index), fit.model.shapes[index], fit.element))
+            sigma = np.zeros(len(numbers))
+        parameters = tuple(
+            LawParameter(spec.name, float(value), float(s) if np.isfinite(s) else 0.0, spec.unit)
+            for spec, value, s in zip(law.parameters, numbers, sigma, strict=True)
+        )
+        found.append(IdentifiedLaw(element, law.name, parameters))
+    deviation = float(np.sqrt(max(full[0, 0], 0.0)))
+    if abs(fit.preload) > deviation:
+        parameter = LawParameter("force", sign * fit.preload, deviation, "N")
+        found.append(IdentifiedLaw(element, PRELOAD, (parameter,)))
+    return tuple(found)
