@@ -23,6 +23,8 @@ WORDS = {  # in names of signals without a unit
 PLAIN = re.compile(r"^[A-Za-z/][\w/.-]*$")
 YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
 OVERSAMPLED = 10.0  # times the highest frequency that matters, beyond which a lower rate is proposed
+FINE = 100.0  # the same of a component test: friction and stops are told by what they do within a cycle
+FEWEST = 4000  # samples that a lower rate must leave
 LEAST_WINDOW = 64  # samples
 
 
@@ -38,22 +40,22 @@ def kind_of_signal(signal: Signal) -> tuple[str | None, str | None]:
     return None, None
 
 
-def sample_rate(inspection: Inspection) -> float:
+def sample_rate(inspection: Inspection, oversampled: float = OVERSAMPLED) -> float:
     """A rate for the system file: that of the slowest signal, reduced when nothing needs as much."""
     rates = [signal.rate for signal in inspection.signals if signal.rate and not signal.constant]
     if not rates:
         return 100.0
     rate = min(rates)
     tops = [signal.band[1] for signal in inspection.signals if signal.band is not None]
-    if not tops or rate <= OVERSAMPLED * max(tops):
+    if not tops or rate <= oversampled * max(tops):
         return float(f"{rate:.6g}")
-    divisor = max(int(rate / (OVERSAMPLED * max(*tops, 1.0))), 1)
+    divisor = min(rate / (oversampled * max(*tops, 1.0)), inspection.seconds * rate / FEWEST)
+    divisor = max(int(divisor), 1)
     return float(f"{rate / divisor:.6g}")
 
 
 def skeleton(inspection: Inspection, name: str, time: dict[str, object]) -> str:
     """The text; it is a valid system file, with values to be replaced marked by TODO."""
-    rate = sample_rate(inspection)
     usable = [
         signal
         for signal in inspection.signals
@@ -63,6 +65,7 @@ def skeleton(inspection: Inspection, name: str, time: dict[str, object]) -> str:
     motions = [s for s in usable if kinds[s.name][0] in ("displacement", "velocity")]
     forces = [s for s in usable if kinds[s.name][0] == "force"]
     test = bool(motions and forces) and not any(kind == "acceleration" for kind, _ in kinds.values())
+    rate = sample_rate(inspection, FINE if test else OVERSAMPLED)
     lines = [
         f"# System file for {inspection.file}, begun by sprung inspect.",
         "# Everything marked TODO is a guess: replace it.",
