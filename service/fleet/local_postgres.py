@@ -104,7 +104,7 @@ class PostgresServer:
 @contextmanager
 def server(durable: bool = False) -> Iterator[PostgresServer]:
     """A running server; it is gone afterwards."""
-    with tempfile.TemporaryDirectory(prefix="sprung-pg-", dir="/tmp") as name:
+    with tempfile.TemporaryDirectory(prefix="sprung-pg-", dir="/tmp") as name:  # nosec B108: a new folder
         folder = Path(name)
         user = _user()
         if os.geteuid() == 0 and user is not None:
