@@ -31,6 +31,8 @@ def from_iso(text: str) -> int:
 
     Raises ValueError when it is neither: RFC 3339 has a time of day and a zone, and guessing either is off by hours.
     """
+    if not text.isascii() or "_" in text or text != text.strip():  # Python takes more for a number than anybody sends
+        raise ValueError(f"{text!r} is no time")
     try:
         return round(float(text) * NANOSECONDS)
     except (ValueError, OverflowError):

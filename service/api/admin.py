@@ -62,7 +62,9 @@ async def revoke_token(core: CoreOf, actor: ActorOf, id: str) -> Response:
 
 @router.get("/audit", summary="Who did what", response_model=list[dict[str, Any]])
 async def audit_log(
-    core: CoreOf, limit: Annotated[int, Query(ge=1, le=1000)] = 100, before: Annotated[int | None, Query(ge=0)] = None
+    core: CoreOf,
+    limit: Annotated[int, Query(ge=1, le=1000)] = 100,
+    before: Annotated[int | None, Query(ge=0, le=2**53)] = None,
 ) -> Response:
     """The newest deeds first; `before`: older than the one with this id."""
     rows = await read(core, lambda connection: audit.entries(connection, limit, before))

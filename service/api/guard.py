@@ -32,6 +32,7 @@ METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
+MOST_HEADERS, MOST_HEADER_BYTES = 100, 32_000  # of one request: browsers send twenty, and cookies of 4 kB at most
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -111,6 +112,8 @@ class Guard:
         path = scope["path"]
         try:
             need = need_of(scope["method"], path)
+            if len(scope["headers"]) > MOST_HEADERS or sum(map(_length, scope["headers"])) > MOST_HEADER_BYTES:
+                raise ApiProblem(431, f"more than {MOST_HEADERS} headers, or {MOST_HEADER_BYTES // 1000} kB of them")
             self._check_host(headers)
             actor, by_cookie = await self._foreign(headers) or self._actor(scope, headers, need)
             self._limiter.take(actor.name if actor.name != "local" else _address(scope))
@@ -278,6 +281,10 @@ def _is_address(host: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _length(header: tuple[bytes, bytes]) -> int:
+    return len(header[0]) + len(header[1])
 
 
 def _known(method: str) -> str:

@@ -66,7 +66,8 @@ def from_validation(error: ValidationError, prefix: str = "") -> ApiProblem:
     """422 that names the fields which are wrong; the values themselves are not repeated."""
     found = error.errors(include_url=False, include_input=False, include_context=False)
     errors = [
-        {"field": prefix + (".".join(map(str, e["loc"])) or "body"), "detail": e["msg"]} for e in found[:SHOWN_ERRORS]
+        {"field": (prefix + ".".join(map(str, e["loc"]))).strip(".") or "body", "detail": e["msg"]}
+        for e in found[:SHOWN_ERRORS]
     ]
     first = errors[0]
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""

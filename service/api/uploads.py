@@ -28,6 +28,7 @@ from sprung.service.times import now_ns
 CHUNK = 1 << 20
 MOST_PARTS = 8
 MOST_FIELD_BYTES = 4096
+LONGEST_BOUNDARY = 70  # RFC 2046
 _VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
 
 BODY: dict[str, Any] = {
@@ -66,6 +67,8 @@ async def receive(request: Request, settings: Settings, store: Store) -> Upload:
     boundary = options.get(b"boundary")
     if kind != b"multipart/form-data" or not boundary:
         raise ApiProblem(415, "send multipart/form-data with a file")
+    if len(boundary) > LONGEST_BOUNDARY:
+        raise ApiProblem(422, f"the boundary of the form is longer than {LONGEST_BOUNDARY} characters")
     stated = request.headers.get("content-length", "")
     room = await run_in_threadpool(room_for_uploads, settings, store)
     if room <= (int(stated) if stated.isdigit() else 0):

@@ -175,6 +175,30 @@ def test_a_window_of_the_future_is_refused_before_it_is_identified(client: TestC
     assert response.json()["errors"][0]["field"] == "start"
 
 
+@pytest.mark.parametrize(
+    "start", ["\uff11\uff17\uff19\uff10", "1_790_000_000", " 1790000000", "1790000000\n", "0x6AB1"]
+)
+def test_a_start_that_only_python_would_take_for_a_number_is_none(client: TestClient, body: Any, start: str) -> None:
+    assert client.post("/identify?track=true", json=body | {"start": start}).status_code == 422
+
+
+@pytest.mark.parametrize("boundary", ["b" * 71, "b" * 5000, "\xff"])
+def test_a_boundary_that_is_none_is_told(client: TestClient, boundary: str) -> None:
+    content_type = f"multipart/form-data; boundary={boundary}".encode("latin-1")
+    assert client.post("/recordings", content=b"x", headers={b"content-type": content_type}).status_code == 422
+
+
+@pytest.mark.parametrize("headers", [{"x": "a" * 40_000}, {f"x-{number}": "a" for number in range(200)}])
+def test_headers_without_end_are_not_taken(client: TestClient, headers: dict[str, str]) -> None:
+    answer = client.get("/health/live", headers=headers)
+    assert answer.status_code == 431 and answer.headers["content-type"] == "application/problem+json"
+
+
+def test_numbers_beyond_those_of_the_store_are_wrong_and_no_fault_of_ours(client: TestClient) -> None:
+    for path in ("/audit?before=", "/audit?limit=", "/vehicles?limit=", "/?page=", "/alarms?limit="):
+        assert client.get(f"{path}{10**30}").status_code == 422, path
+
+
 @pytest.fixture
 def core(engine: Engine, tmp_path: Path) -> Core:
     return build_core(settings(tmp_path, max_uploads_bytes=50_000), engine)
