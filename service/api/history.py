@@ -141,7 +141,12 @@ def columns(
 
 
 def _rounded(values: FloatArray, known: Any) -> list[float | None]:
-    return [float(f"{v:.{DIGITS}g}") if ok else None for v, ok in zip(values.tolist(), known.tolist(), strict=True)]
+    """Values with `DIGITS` significant digits; None where they are not known."""
+    with np.errstate(divide="ignore"):
+        places = np.where(values != 0.0, DIGITS - 1 - np.floor(np.log10(np.abs(values))), 0.0)
+    up, down = 10.0 ** np.maximum(places, 0.0), 10.0 ** np.maximum(-places, 0.0)  # both whole: divisions stay exact
+    short = np.round(values * up / down) / up * down
+    return [value if ok else None for value, ok in zip(short.tolist(), known.tolist(), strict=True)]
 
 
 def _names(core: Core, asked: list[str] | None, needed: bool) -> list[str]:
