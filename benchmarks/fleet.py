@@ -53,7 +53,8 @@ def run(
 ) -> Figures:
     """Figures of one part.
 
-    recordings, seconds: of identity and scaling; workers: Ray's cores; minutes, every (s): of chaos, and between kills.
+    recordings, seconds: of identity and scaling; workers: Ray's cores; minutes: of chaos, and of many vehicles in
+    ingest (0: none); every: s between kills.
     """
     one_thread_each()
     if part not in PARTS:
@@ -63,7 +64,7 @@ def run(
     if part == "scaling":
         yield from scaling(recordings, seconds, workers)
     if part == "ingest":
-        yield from ingest(workers, seconds)
+        yield from ingest(workers, seconds, minutes)
     if part in ("edge", "quick"):
         yield from edge(min(seconds, 120.0))
     if part == "chaos":

@@ -12,8 +12,9 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -29,15 +30,22 @@ from sprung.service.times import to_iso
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
 CLIENTS = 48
+VEHICLES = 2_000
+SLOWER = 100  # than real time
 HOP = 500_000_000  # ns
 
 
 class LoadClient(threading.Thread):
-    """One vehicle: its windows one after the other, evenly at a rate or as fast as they are taken."""
+    """Some vehicles in turns, each one's windows in order: evenly at a rate or as fast as they are taken."""
 
-    def __init__(self, port: int, path: str, body: dict[str, Any], vehicle: str, until: float, period: float) -> None:
+    def __init__(
+        self, port: int, path: str, body: dict[str, Any], vehicles: Sequence[str], until: float, period: float
+    ) -> None:
+        """vehicles: their ids; period: s between windows of this client, 0: none is waited for."""
         super().__init__(daemon=True)
-        self._port, self._path, self._body = port, path, body | {"vehicle": vehicle}
+        self._port, self._path, self._vehicles = port, path, vehicles
+        rest = {key: value for key, value in body.items() if key not in ("vehicle", "start")}
+        self._rest = json.dumps(rest)[1:]  # written once: the client shares the machine with what it measures
         self._until, self._period = until, period
         self.seconds: list[float] = []
         self.refused = 0
@@ -46,7 +54,9 @@ class LoadClient(threading.Thread):
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
         number, due = 0, time.monotonic()
         while time.monotonic() < self._until:
-            body = json.dumps(self._body | {"start": to_iso(FIRST + number * HOP)})
+            round_of, turn = divmod(number, len(self._vehicles))
+            head = {"vehicle": self._vehicles[turn], "start": to_iso(FIRST + round_of * HOP)}
+            body = f"{json.dumps(head)[:-1]}, {self._rest}".encode()
             time.sleep(max(0.0, due - time.monotonic()))
             begun = time.monotonic()
             connection.request("POST", self._path, body, {"content-type": "application/json"})
@@ -62,8 +72,8 @@ class LoadClient(threading.Thread):
         connection.close()
 
 
-def ingest(workers: int, seconds: float) -> Figures:
-    """Windows a second, and latencies at 70 % of the most."""
+def ingest(workers: int, seconds: float, minutes: float) -> Figures:
+    """Windows a second, latencies at 70 % of the most, and many vehicles at a hundredth of their rate."""
     if find_spec("ray") is None:
         raise UserError("bench fleet ingest: Ray is not installed; pip install 'sprung[fleet]'")
     if reason := postgres.missing():
@@ -72,9 +82,13 @@ def ingest(workers: int, seconds: float) -> Figures:
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="sprung-load-"))
         server = stack.enter_context(postgres.server(durable=True))
-        port = _served(stack, ["serve", "--port"], folder, {"SPRUNG_STORE": server.database()}, "/health/live")
-        alone, _, _ = load(port, "/identify?track=true", body, 1, seconds, 0.0)
-        yield {"figure": "windows per second, one process, one client", "value": round(alone, 1)}
+        single = SentLoad("/identify?track=true", body, _named(1))
+        with ExitStack() as alone:
+            store = {"SPRUNG_STORE": server.database()}
+            port = _served(alone, ["serve", "--port"], folder, store, "/health/live")
+            single.send(port, min(5.0, seconds), 0.0)  # warm
+            rate_alone = single.send(port, seconds, 0.0).rate
+        yield {"figure": "windows per second, one process, one client", "value": round(rate_alone, 1)}
         more = {
             "SPRUNG_STORE": server.database(),
             "SPRUNG_LATE_SECONDS": "0",
@@ -82,40 +96,78 @@ def ingest(workers: int, seconds: float) -> Figures:
         }
         command = ["fleet", "serve", "--workers", str(workers), "--cores", "0.5", "--port"]
         fleet = _served(stack, command, f"{folder}/fleet", more, "/health/ready")
-        load(fleet, "/ingest/windows", body, CLIENTS, min(10.0, seconds), 0.0)  # warm
-        most, _, refused = load(fleet, "/ingest/windows", body, CLIENTS, seconds, 0.0)
-        yield {
-            "figure": "windows per second, Ray Serve",
-            "value": round(most, 1),
-            "clients": CLIENTS,
-            "refused": refused,
-        }
-        yield {"figure": "ratio", "value": round(most / alone, 2), "target": 4.0, "load": os.getloadavg()[0]}
-        period = CLIENTS / (0.7 * most)
-        rate, times, _ = load(fleet, "/ingest/windows", body, CLIENTS, seconds, period)
-        low, high = np.percentile(times, [50, 99])
-        yield {"figure": "latency at 70 % load, p99", "value": round(float(high), 3), "unit": "s", "target": 1.0}
-        yield {
-            "figure": "latency at 70 % load, p50",
-            "value": round(float(low), 3),
-            "unit": "s",
-            "rate": round(rate, 1),
-        }
+        yield from _fleet_figures(fleet, body, rate_alone, seconds)
+        if minutes:
+            yield from _many_vehicles(fleet, body, minutes)
 
 
-def load(
-    port: int, path: str, body: dict[str, Any], clients: int, seconds: float, period: float
-) -> tuple[float, list[float], int]:
-    """Windows a second that were stored, their latencies, and how many were refused."""
-    begun = time.monotonic()
+def _fleet_figures(port: int, body: dict[str, Any], rate_alone: float, seconds: float) -> Figures:
+    many = SentLoad("/ingest/windows", body, _named(CLIENTS))
+    many.send(port, min(10.0, seconds), 0.0)  # warm: replicas are added
+    most = many.send(port, seconds, 0.0)
+    yield {"figure": "windows per second, Ray Serve", "value": round(most.rate, 1)} | most.told()
+    yield {"figure": "ratio", "value": round(most.rate / rate_alone, 2), "target": 4.0, "load": os.getloadavg()[0]}
+    eased = many.send(port, seconds, CLIENTS / (0.7 * most.rate))
+    low, high = np.percentile(eased.seconds, [50, 99])
+    yield {"figure": "latency at 70 % load, p99", "value": round(float(high), 3), "unit": "s", "target": 1.0}
+    yield {"figure": "latency at 70 % load, p50", "value": round(float(low), 3), "unit": "s"} | eased.told()
+
+
+def _many_vehicles(port: int, body: dict[str, Any], minutes: float) -> Figures:
+    """Vehicles that each send a window every 50 s, HOP apart in their own time."""
+    named = _named(VEHICLES)
+    rate = VEHICLES / (HOP / 1e9) / SLOWER
+    sent = SentLoad("/ingest/windows", body, named, CLIENTS).send(port, 60 * minutes, CLIENTS / rate)
+    low, high = np.percentile(sent.seconds, [50, 99])
+    yield {
+        "figure": f"{VEHICLES} vehicles at 1/{SLOWER} of the real rate, latency p99",
+        "value": round(float(high), 3), "p50": round(float(low), 3), "unit": "s", "target": 1.0, "minutes": minutes,
+        "windows_per_second": round(sent.rate, 1), "wanted": rate,
+    } | sent.told()  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What became of a load."""
+
+    rate: float  # windows a second that were stored
+    seconds: list[float]  # their latencies
+    refused: int
+    clients: int
+
+    def told(self) -> dict[str, Any]:
+        """Beside a figure."""
+        return {"clients": self.clients, "windows": len(self.seconds), "refused": self.refused}
+
+
+class SentLoad:
+    """Windows of some vehicles to one path; sent again, they go on with new vehicles."""
+
+    def __init__(self, path: str, body: dict[str, Any], vehicles: Sequence[str], clients: int | None = None) -> None:
+        self._path, self._body, self._vehicles = path, body, vehicles
+        self._clients = clients or len(vehicles)
+        self._times = 0
+
+    def send(self, port: int, seconds: float, period: float) -> Answered:
+        """For so long, every client a window each `period` seconds; 0: as fast as they are taken."""
+        begun = time.monotonic()
+        self._times += 1
+        names = [f"{name}-{self._times}" for name in self._vehicles]
+        share = [names[i :: self._clients] for i in range(self._clients)]
+        running = [LoadClient(port, self._path, self._body, part, begun + seconds, period) for part in share]
+        for client in running:
+            client.start()
+        for client in running:
+            client.join()
+        times = [one for client in running for one in client.seconds]
+        rate = len(times) / (time.monotonic() - begun)
+        return Answered(rate, times, sum(client.refused for client in running), self._clients)
+
+
+def _named(count: int) -> list[str]:
+    """New vehicles."""
     name = f"load{os.urandom(2).hex()}"
-    running = [LoadClient(port, path, body, f"{name}-{i}", begun + seconds, period) for i in range(clients)]
-    for client in running:
-        client.start()
-    for client in running:
-        client.join()
-    times = [one for client in running for one in client.seconds]
-    return len(times) / (time.monotonic() - begun), times, sum(client.refused for client in running)
+    return [f"{name}-{i}" for i in range(count)]
 
 
 def _served(stack: ExitStack, command: list[str], folder: str, more: dict[str, str], ready: str) -> int:

@@ -62,12 +62,12 @@ def _outcome(window: Window, estimate: Estimate | None) -> tuple[str, str | None
     return window.outcome, window.reason
 
 
-@dataclass(slots=True)
-class _Vehicle:
+@dataclass(frozen=True, slots=True)
+class HeldVehicle:
     """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
 
     revision: int
-    last_window_ns: int
+    last_window_ns: int  # start of the newest window that it has seen; -1 before the first
     state: TrackerState
 
 
@@ -76,7 +76,7 @@ class Folded:
     """Windows that are tracked and stored in a transaction which may not be committed yet."""
 
     batch: Batch
-    after: _Vehicle
+    after: HeldVehicle
 
 
 class Pipeline:
@@ -105,7 +105,7 @@ class Pipeline:
         self._clock = clock
         self._on_alarms = on_alarms
         self._shown = staging is None
-        self._vehicles: OrderedDict[str, _Vehicle] = OrderedDict()
+        self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
         self._lock = threading.Lock()
         with store.write() as connection:
             self.model_id = fleet.ensure_model(
@@ -192,19 +192,20 @@ class Pipeline:
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
+        held: HeldVehicle | None = None,
     ) -> Folded:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
 
         The vehicle is held until the transaction ends: whoever folds several takes them in the order of their ids, and
-        calls `partitions.prepare` before.
+        calls `partitions.prepare` before.  `held`: what `hold` said in this transaction; the caller has left out what
+        is stored already.
         """
         now = self._clock()
         started = time.perf_counter()
-        fleet.ensure_vehicle(connection, vehicle, now, listed=self._shown)
-        fleet.hold_vehicle(connection, vehicle)
-        at = self._current(connection, vehicle)
-        # another process may have stored some of them while this one was identifying
-        raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+        at = held or self.hold(connection, vehicle)
+        raced: dict[int, WindowRecord] = {}
+        if held is None:  # another process may have stored some of them while this one was identifying
+            raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
         records, after = self._follow(at, windows, estimates, set(raced), now)
         new = [record for record in records if record.start not in raced]
         tracked = time.perf_counter()
@@ -229,18 +230,19 @@ class Pipeline:
         self._remember(folded.batch.vehicle, folded.after)
         self.tell(folded.batch)
 
-    def last_window(self, connection: Connection, vehicle: str) -> int:
-        """Start of the newest window that the vehicle's tracker has seen, ns; -1 before the first."""
-        return self._current(connection, vehicle).last_window_ns
+    def hold(self, connection: Connection, vehicle: str) -> HeldVehicle:
+        """Keep others from folding windows of a vehicle until the transaction ends; how its tracker stands."""
+        fleet.take_vehicle(connection, vehicle, self._clock(), listed=self._shown)
+        return self._current(connection, vehicle)
 
     def _follow(
         self,
-        at: _Vehicle,
+        at: HeldVehicle,
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         skip: set[int],
         now: int,
-    ) -> tuple[list[WindowRecord], _Vehicle]:
+    ) -> tuple[list[WindowRecord], HeldVehicle]:
         """Feed the windows that are not skipped, in order."""
         tracker = self.engine.tracker
         followed = Followed(at.state, at.last_window_ns)
@@ -266,7 +268,7 @@ class Pipeline:
             )
         return records, replace(at, state=followed.state, last_window_ns=followed.last)
 
-    def _current(self, connection: Connection, vehicle: str) -> _Vehicle:
+    def _current(self, connection: Connection, vehicle: str) -> HeldVehicle:
         """The vehicle's tracker: from memory when that is still what is stored, else read anew."""
         with self._lock:
             held = self._vehicles.get(vehicle)
@@ -277,8 +279,8 @@ class Pipeline:
         if row is None:
             # a back-fill must not depend on which vehicle is done first
             new = self._newcomer(connection) if self._shown else self.engine.tracker.initial_state()
-            return _Vehicle(0, -1, new)
-        return _Vehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
+            return HeldVehicle(0, -1, new)
+        return HeldVehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
 
     def _newcomer(self, connection: Connection) -> TrackerState:
         """State of a vehicle never seen: what weather does to springs, others of its fleet have learned."""
@@ -326,7 +328,7 @@ class Pipeline:
         status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
 
     def _save_status(
-        self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]
+        self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
     ) -> None:
         last = next((record for record in reversed(new) if record.solved is not None), None)
         view = vehicle_view(self.engine, vehicle, at.state, last)
@@ -343,7 +345,9 @@ class Pipeline:
         reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
         status.add_reasons(connection, vehicle, self.model_id, reasons)
 
-    def _save(self, connection: Connection, vehicle: str, at: _Vehicle, now: int, new: Sequence[WindowRecord]) -> None:
+    def _save(
+        self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
+    ) -> None:
         row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
         fleet.save_tracker(connection, vehicle, self.model_id, row, now)
         changes = fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
@@ -353,7 +357,7 @@ class Pipeline:
             self._on_alarms(connection, vehicle, changes)
         self._save_status(connection, vehicle, at, now, new)
 
-    def _remember(self, vehicle: str, at: _Vehicle) -> None:
+    def _remember(self, vehicle: str, at: HeldVehicle) -> None:
         with self._lock:
             self._vehicles[vehicle] = at
             self._vehicles.move_to_end(vehicle)

@@ -18,10 +18,10 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.pipeline import Folded, Pipeline
-from sprung.service.store import fleet, pending
+from sprung.service.store import pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
-from sprung.service.store.windows import known_windows, newest_start
+from sprung.service.store.windows import known_starts, newest_start
 from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
 
 log = logging.getLogger("sprung.ingest")
@@ -75,7 +75,7 @@ class Ingest:
         with self._pipeline.store.write() as connection:
             for vehicle in sorted(by_vehicle):  # in the order of their ids: nobody waits in a circle
                 for i in by_vehicle[vehicle]:
-                    taken[i] = self._one(connection, messages[i], now, folded)
+                    taken[i] = self._fold_due(connection, messages[i], now, folded)
         self._settle(folded)
         return [taken[i] for i in range(len(messages))]
 
@@ -105,8 +105,8 @@ class Ingest:
         for vehicle in overdue:
             folded: list[Folded] = []
             with self._pipeline.store.write() as connection:
-                self._hold(connection, vehicle, now)
-                count += self._fold_due(connection, vehicle, [], now, folded)
+                taken = self._fold_due(connection, Message(vehicle, self._pipeline.engine.digest, ()), now, folded)
+            count += taken.folded
             self._settle(folded)
         return count
 
@@ -114,30 +114,20 @@ class Ingest:
         for one in folded:
             self._pipeline.settle(one)
 
-    def _hold(self, connection: Connection, vehicle: str, now: int) -> None:
-        fleet.ensure_vehicle(connection, vehicle, now)
-        fleet.hold_vehicle(connection, vehicle)
-
-    def _one(self, connection: Connection, message: Message, now: int, folded: list[Folded]) -> Taken:
+    def _fold_due(self, connection: Connection, message: Message, now: int, folded: list[Folded]) -> Taken:
+        """Fold what is due of what waited and what came; keep the rest."""
         vehicle, model = message.vehicle, self._pipeline.model_id
-        self._hold(connection, vehicle, now)
-        known = known_windows(connection, vehicle, model, [w.start for w in message.windows])
-        fresh = [w for w in message.windows if w.start not in known]
-        count = self._fold_due(connection, vehicle, fresh, now, folded)
-        left = {row.start for row in pending.waiting(connection, vehicle, model)}
-        waits = sum(w.start in left for w in fresh)
-        return Taken(vehicle, count, waits, len(message.windows) - len(fresh))
-
-    def _fold_due(
-        self, connection: Connection, vehicle: str, fresh: Sequence[WindowEstimate], now: int, folded: list[Folded]
-    ) -> int:
-        """Fold what is due of what waited and what came; keep the rest.  How many were folded."""
-        model = self._pipeline.model_id
+        if folded and folded[-1].batch.vehicle == vehicle:  # by a message before, in this transaction
+            at = folded[-1].after
+        else:
+            at = self._pipeline.hold(connection, vehicle)
         waited = pending.waiting(connection, vehicle, model)
-        held = {row.start: row for row in waited}
+        starts = {row.start for row in waited} | {w.start for w in message.windows}
+        known = known_starts(connection, vehicle, model, starts)
+        fresh = [w for w in message.windows if w.start not in known]
+        held = {row.start: row for row in waited if row.start not in known}
         came = {w.start: w for w in fresh if w.start not in held}
-        last = self._pipeline.last_window(connection, vehicle)
-        last = newest_start(connection, vehicle, model, last)  # a window that was dropped is no gap
+        last = newest_start(connection, vehicle, model, at.last_window_ns)  # a window that was dropped is no gap
         stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
         if stepped_back is not None:  # the clock was set: what waits is from before, then the rest as it came
             due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))
@@ -149,14 +139,16 @@ class Ingest:
         if order:
             width = len(self._pipeline.engine.system.channels)
             windows = [w.window(self._pipeline.engine.system.sample_rate, width) for w in order]
-            one = self._pipeline.fold(connection, vehicle, windows, [w.estimate for w in order])
-            folded.append(one)
-        pending.release(connection, vehicle, model, [start for start in due if start in held])
+            estimates = [w.estimate for w in order]
+            folded.append(self._pipeline.fold(connection, vehicle, windows, estimates, held=at))
+        done = set(due) | known
+        pending.release(connection, vehicle, model, [row.start for row in waited if row.start in done])
         digest = self._pipeline.engine.digest
         rest = set(came) - set(due)
         rows = [Waiting(s, now, encode(Message(vehicle, digest, (came[s],)), "exact")) for s in sorted(rest)]
         pending.keep(connection, vehicle, model, rows)
-        return len(order)
+        waits = sum(w.start not in done for w in fresh)
+        return Taken(vehicle, len(order), waits, len(message.windows) - len(fresh))
 
     def _check(self, message: Message, now: int) -> None:
         digest = self._pipeline.engine.digest

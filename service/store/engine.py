@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -126,7 +127,7 @@ def migrate(store: Store) -> None:
 def insert_or_ignore(connection: Connection, table: Table, rows: Sequence[dict[str, Any]]) -> None:
     """Insert rows; one whose key is there already is left as it is."""
     if rows:
-        connection.execute(_dialect_insert(connection)(table).on_conflict_do_nothing(), rows)
+        connection.execute(_ignoring(connection.dialect.name, table), rows)
 
 
 def upsert(connection: Connection, table: Table, rows: Sequence[dict[str, Any]], key: Sequence[str]) -> None:
@@ -136,13 +137,22 @@ def upsert(connection: Connection, table: Table, rows: Sequence[dict[str, Any]],
     """
     if not rows:
         return
-    statement = _dialect_insert(connection)(table)
-    changed = {name: statement.excluded[name] for name in rows[0] if name not in key}
-    connection.execute(statement.on_conflict_do_update(index_elements=list(key), set_=changed), rows)
+    connection.execute(_overwriting(connection.dialect.name, table, tuple(rows[0]), tuple(key)), rows)
 
 
-def _dialect_insert(connection: Connection) -> Any:
-    return {"sqlite": sqlite.insert, "postgresql": postgresql.insert}[connection.dialect.name]
+_INSERTS: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
+
+
+@cache  # making a statement takes longer than sending it
+def _ignoring(dialect: str, table: Table) -> Any:
+    return _INSERTS[dialect](table).on_conflict_do_nothing()
+
+
+@cache
+def _overwriting(dialect: str, table: Table, names: tuple[str, ...], key: tuple[str, ...]) -> Any:
+    statement = _INSERTS[dialect](table)
+    changed = {name: statement.excluded[name] for name in names if name not in key}
+    return statement.on_conflict_do_update(index_elements=list(key), set_=changed)
 
 
 def _postgresql_engine(url: URL) -> Engine:

@@ -63,6 +63,17 @@ def ensure_vehicle(connection: Connection, vehicle: str, now: int, listed: bool 
         insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
 
 
+def take_vehicle(connection: Connection, vehicle: str, now: int, listed: bool = True) -> None:
+    """`hold_vehicle`; one that is not known, or is to be listed and is not, is made so before."""
+    there = select(vehicles.c.id, fleet_status.c.vehicle_id.label("listed"))
+    there = there.join(fleet_status, fleet_status.c.vehicle_id == vehicles.c.id, isouter=True)
+    there = there.where(vehicles.c.id == vehicle).with_for_update(key_share=True, of=vehicles)
+    row = connection.execute(there).first()
+    if row is None or (listed and row.listed is None):
+        ensure_vehicle(connection, vehicle, now, listed)
+        hold_vehicle(connection, vehicle)
+
+
 def staging_models() -> Select[tuple[int]]:
     """Models whose history is not shown yet."""
     return select(models.c.id).where(models.c.digest.startswith(STAGING))

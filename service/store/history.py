@@ -9,13 +9,13 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from sqlalchemy import Column, Connection, Table, func, literal, select
+from sqlalchemy import Column, Connection, Table, func, literal, select, tuple_
 
 from sprung.model.signals import FloatArray, IntArray
 from sprung.service.store.archive import Archive, ArchivedPosterior
 from sprung.service.store.engine import upsert
 from sprung.service.store.schema import rollups, windows
-from sprung.service.store.windows import WindowRecord, pack, unpack
+from sprung.service.store.windows import IN_LIMIT, WindowRecord, pack, unpack
 from sprung.service.times import NANOSECONDS
 
 Older = Callable[[int, int], Iterable[ArchivedPosterior]]  # of since and until
@@ -57,26 +57,25 @@ def add_to_rollups(
         for r in records
         if r.posterior is not None
     ]
-    for level in LEVELS:
-        fresh = {point.time: point for point in bucketed(points, level)}
-        for stored in _stored(connection, vehicle, model_id, level, list(fresh)):
-            fresh[stored.time] = stored.merged(fresh[stored.time])
-        rows = [
-            {
-                "vehicle_id": vehicle,
-                "model_id": model_id,
-                "resolution_s": level,
-                "bucket_ns": point.time,
-                "windows": point.windows,
-                "mean": pack(point.mean),
-                "std": pack(point.std),
-                "low": pack(point.low),
-                "high": pack(point.high),
-                "updated_ns": now,
-            }
-            for point in fresh.values()
-        ]
-        upsert(connection, rollups, rows, key=("vehicle_id", "model_id", "resolution_s", "bucket_ns"))
+    fresh = {(level, point.time): point for level in LEVELS for point in bucketed(points, level)}
+    for place, stored in _stored(connection, vehicle, model_id, list(fresh)):
+        fresh[place] = stored.merged(fresh[place])
+    rows = [
+        {
+            "vehicle_id": vehicle,
+            "model_id": model_id,
+            "resolution_s": level,
+            "bucket_ns": point.time,
+            "windows": point.windows,
+            "mean": pack(point.mean),
+            "std": pack(point.std),
+            "low": pack(point.low),
+            "high": pack(point.high),
+            "updated_ns": now,
+        }
+        for (level, _), point in fresh.items()
+    ]
+    upsert(connection, rollups, rows, key=("vehicle_id", "model_id", "resolution_s", "bucket_ns"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,14 +225,17 @@ def bucketed(points: Iterable[HistoryPoint], resolution: float) -> Iterator[Hist
         yield current
 
 
-def _stored(connection: Connection, vehicle: str, model_id: int, level: int, buckets: list[int]) -> list[HistoryPoint]:
+def _stored(
+    connection: Connection, vehicle: str, model_id: int, places: list[tuple[int, int]]
+) -> Iterator[tuple[tuple[int, int], HistoryPoint]]:
+    """Stored buckets among `places`, each the level and the bucket."""
     table = rollups
-    query = (
-        select(table.c.bucket_ns, table.c.windows, table.c.mean, table.c.std, table.c.low, table.c.high)
-        .where(table.c.vehicle_id == vehicle, table.c.model_id == model_id, table.c.resolution_s == level)
-        .where(table.c.bucket_ns.in_(buckets))
-    )
-    return [HistoryPoint(row[0], row[1], *map(unpack, row[2:])) for row in connection.execute(query)]
+    by = (table.c.resolution_s, table.c.bucket_ns)
+    query = select(*by, table.c.windows, table.c.mean, table.c.std, table.c.low, table.c.high)
+    query = query.where(table.c.vehicle_id == vehicle, table.c.model_id == model_id)
+    for first in range(0, len(places), IN_LIMIT // 2):
+        for row in connection.execute(query.where(tuple_(*by).in_(places[first : first + IN_LIMIT // 2]))):
+            yield (row[0], row[1]), HistoryPoint(row[1], row[2], *map(unpack, row[3:]))
 
 
 def fitting_resolution(

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
+from sqlalchemy import ColumnElement, Connection, Select, and_, func, literal, or_, select
 
 from sprung.service.store.engine import upsert
 from sprung.service.store.fleet import staging_models
@@ -95,9 +95,13 @@ def save_status(
 ) -> None:
     """Replace a vehicle's row; `counts` are added to its windows, `earlier` alarms looked up."""
     table = fleet_status
-    old = connection.execute(select(table).where(table.c.vehicle_id == vehicle)).first()
+    asked = select(literal(vehicle).label("id")).subquery()  # one row, whether the vehicle has one or not
+    query = select(table, *_open_alarms(vehicle, model_id))
+    query = query.select_from(asked.outerjoin(table, table.c.vehicle_id == asked.c.id))
+    row = connection.execute(query).one()
+    old = None if row.vehicle_id is None else row
     same = old is not None and old.model_id == model_id
-    earlier = _open_of_other_models(connection, vehicle, model_id)
+    earlier = row.open_of_others
     numbers = {name: (getattr(old, name) if same else 0) + counts[name] for name in COUNTED}
     values = asdict(status)
     if status.nrmse is None and same and old is not None:
@@ -110,7 +114,7 @@ def save_status(
         "earlier": earlier,
         "received_ns": now if old is None or any(counts.values()) else old.received_ns,
     }
-    values |= _urgency(connection, vehicle, values["health"])
+    values |= _urgency(values["health"], row.open_in_all, row.open_unseen)
     upsert(connection, table, [values], key=("vehicle_id",))
 
 
@@ -119,7 +123,8 @@ def refresh_urgency(connection: Connection, vehicle: str) -> None:
     table = fleet_status
     row = connection.execute(select(table.c.health).where(table.c.vehicle_id == vehicle)).first()
     if row is not None:
-        values = _urgency(connection, vehicle, row.health)
+        _, *counts = connection.execute(select(*_open_alarms(vehicle, 0))).one()
+        values = _urgency(row.health, *counts)
         connection.execute(table.update().where(table.c.vehicle_id == vehicle).values(**values))
 
 
@@ -323,21 +328,18 @@ def _fleet_row(row: Any) -> FleetRow:
     return FleetRow(id=row.vehicle_id, windows={name: getattr(row, name) for name in COUNTED}, **own)
 
 
-def _open_of_other_models(connection: Connection, vehicle: str, model_id: int) -> int:
-    query = select(func.count()).where(
-        alarms.c.vehicle_id == vehicle,
-        alarms.c.model_id != model_id,
-        alarms.c.closed_ns.is_(None),
-        alarms.c.model_id.not_in(staging_models()),
-    )
-    return int(connection.execute(query).scalar_one())
-
-
-def _urgency(connection: Connection, vehicle: str, health: str) -> dict[str, int]:
+def _open_alarms(vehicle: str, model_id: int) -> Sequence[ColumnElement[int]]:
+    """Open alarms of a vehicle: how many of other models, in all, and not acknowledged."""
     shown = alarms.c.model_id.not_in(staging_models())
-    open_ = (alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None), shown)
-    unseen = func.count().filter(alarms.c.acknowledged_ns.is_(None))
-    total, unacknowledged = connection.execute(select(func.count(), unseen).where(*open_)).one()
+    open_ = select(func.count()).where(alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None), shown)
+    return (
+        open_.where(alarms.c.model_id != model_id).scalar_subquery().label("open_of_others"),
+        open_.scalar_subquery().label("open_in_all"),
+        open_.where(alarms.c.acknowledged_ns.is_(None)).scalar_subquery().label("open_unseen"),
+    )
+
+
+def _urgency(health: str, total: int, unacknowledged: int) -> dict[str, int]:
     rank = HEALTHS.index(health) if health in HEALTHS else 1
     number = min(total, MOST_COUNTED) + (MOST_COUNTED + 1) * (unacknowledged > 0)
     return {"unacknowledged": unacknowledged, "urgency": rank * 1_000_000 + number}

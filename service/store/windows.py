@@ -99,6 +99,15 @@ def known_windows(
     return found
 
 
+def known_starts(connection: Connection, vehicle: str, model_id: int, starts: Iterable[int]) -> set[int]:
+    """Which of the windows are stored already."""
+    query = select(windows.c.start_ns).where(windows.c.vehicle_id == vehicle, windows.c.model_id == model_id)
+    found: set[int] = set()
+    for part in _parts(starts):
+        found.update(connection.execute(query.where(windows.c.start_ns.in_(part))).scalars())
+    return found
+
+
 def windows_between(
     connection: Connection, vehicle: str, model_id: int, since: int, until: int, together: int
 ) -> Iterator[list[WindowRecord]]:
