@@ -1,8 +1,9 @@
 """Kill -9 of whatever is there, again and again, while vehicles send: is everything stored once, and how soon again.
 
-Vehicles publish estimates to NATS JetStream; two processes (`sprung fleet consume`) fold them into PostgreSQL with
-`fsync`.  Every so often one of the four is killed and started anew.  At the end the store is compared with one that was
-filled by one process, in order, without any disturbance.
+Some vehicles publish estimates to NATS JetStream, which two processes (`sprung fleet consume`) fold into PostgreSQL
+with `fsync`; where Ray is installed, the others post theirs to Ray Serve (`sprung fleet serve`).  Every so often one of
+these is killed and, unless Ray does it, started anew: NATS, a consumer, the database, a replica of Serve, or the head
+of the Ray cluster.  At the end the store is compared with one that was filled by one process, in order, undisturbed.
 """
 
 from __future__ import annotations
@@ -17,9 +18,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from sprung.service.fleet.backfill import engine_of
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.nats_broker import NatsLink
+from sprung.service.fleet.sending import HttpLink, Link
 from sprung.service.fleet.spool import SpoolEntry
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
@@ -45,9 +48,11 @@ from sprung.service.store.schema import windows
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
 VEHICLES = 4
+NAMES = tuple(f"chaos-{v}" for v in range(VEHICLES))
 PER_MESSAGE = 5  # windows
 MOST_WINDOWS = 240  # of a vehicle that are identified; the ride is repeated later in time
 RECOVERY_TARGET = 10.0  # s
+LONGEST_WAIT = 120.0  # s: for a recovery
 
 
 @dataclass
@@ -57,6 +62,7 @@ class KilledPart:
     name: str
     start: Callable[[], subprocess.Popen[bytes] | None]
     kill: Callable[[subprocess.Popen[bytes] | None], None]
+    fed: Sequence[str]  # vehicles whose windows come through it
     process: subprocess.Popen[bytes] | None = None
     kills: int = 0
 
@@ -84,29 +90,34 @@ def chaos(minutes: float, every: float) -> Figures:
         url = server.database()
         watched = open_store(url)
         stack.callback(watched.close)
-        address = f"nats://127.0.0.1:{_free_port()}"
+        address, port = f"nats://127.0.0.1:{_free_port()}", _free_port()
+        posting = NAMES[VEHICLES // 2 :] if find_spec("ray") else ()
+        published = tuple(name for name in NAMES if name not in posting)
         parts = [
-            KilledPart("nats", lambda: _nats(program, address, folder), _kill),
-            KilledPart("worker 1", lambda: _worker(address, url, folder / "1"), _kill),
-            KilledPart("worker 2", lambda: _worker(address, url, folder / "2"), _kill),
-            KilledPart("postgresql", lambda: _started(server), lambda process: os.kill(server.pid(), signal.SIGKILL)),
+            KilledPart("nats", lambda: _nats(program, address, folder), _kill, published),
+            KilledPart("consumer 1", lambda: _worker(address, url, folder / "1"), _kill, published),
+            KilledPart("consumer 2", lambda: _worker(address, url, folder / "2"), _kill, published),
+            KilledPart("postgresql", lambda: _started(server), lambda _: os.kill(server.pid(), signal.SIGKILL), NAMES),
         ]
-        for part in parts[:3]:
-            part.process = part.start()
-            stack.callback(_end_part, part)
+        if posting:
+            head = KilledPart("head of Ray", lambda: _serving(port, url, folder / "ray"), _kill_head, posting)
+            parts += [head, KilledPart("replica of Serve", lambda: None, lambda _: _kill_replica(head), posting)]
+        for part in parts:
+            if part.name != "postgresql":
+                part.process = part.start()
+                stack.callback(_end_part, part)
         rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
         messages = _messages(engine, rounds)
         told = ChaosTold()
-        publisher = threading.Thread(target=_publish, args=(address, messages, 60 * minutes, told), daemon=True)
-        publisher.start()
-        _disturb(parts, watched, 60 * minutes, every, told)
-        publisher.join()
+        links: list[tuple[Link, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
+        links += [(HttpLink(f"http://127.0.0.1:{port}", None, name), [name]) for name in posting]
+        _ride(links, messages, parts, watched, (60 * minutes, every), told)
         expected = sum(len(m.windows) for m in messages)
-        settled = _await(lambda: _count(watched) >= expected, 120.0)
+        settled = _await(lambda: _count(watched, NAMES) >= expected, 120.0)
         time.sleep(settings.late_seconds + 3.0)  # what waits behind a gap is folded at last
-        stored = _count(watched)
+        stored = _count(watched, NAMES)
         alone = _undisturbed(engine, messages, folder)
-        found = differences(alone, watched, engine.digest, [f"chaos-{v}" for v in range(VEHICLES)])
+        found = differences(alone, watched, engine.digest, list(NAMES))
         alone.close()
     worst = max((seconds for _, seconds in told.recoveries), default=0.0)
     yield {"figure": "minutes", "value": minutes, "kills": {part.name: part.kills for part in parts}}
@@ -120,8 +131,29 @@ def chaos(minutes: float, every: float) -> Figures:
         "value": round(worst, 1),
         "unit": "s",
         "target": RECOVERY_TARGET,
+        "load": os.getloadavg()[0],
     }
     yield {"figure": "recoveries", "value": [[name, round(seconds, 1)] for name, seconds in told.recoveries]}
+
+
+def _ride(
+    links: list[tuple[Link, Sequence[str]]],
+    messages: list[Message],
+    parts: list[KilledPart],
+    store: Store,
+    times: tuple[float, float],
+    told: ChaosTold,
+) -> None:
+    """Send over all links at once for times[0] seconds, disturbed every times[1]; returns when all is taken."""
+    senders = []
+    for link, vehicles in links:
+        mine = [message for message in messages if message.vehicle in vehicles]
+        sender = threading.Thread(target=_publish, args=(link, mine, times[0], told), daemon=True)
+        sender.start()
+        senders.append(sender)
+    _disturb(parts, store, *times, told)
+    for sender in senders:
+        sender.join()
 
 
 def _messages(engine: Any, rounds: int) -> list[Message]:
@@ -146,9 +178,9 @@ def _messages(engine: Any, rounds: int) -> list[Message]:
     return messages
 
 
-def _publish(address: str, messages: list[Message], seconds: float, told: ChaosTold) -> None:
-    """As an edge does: each until the broker has it, evenly over the time."""
-    link, begun = NatsLink(address, "chaos"), time.monotonic()
+def _publish(link: Link, messages: list[Message], seconds: float, told: ChaosTold) -> None:
+    """As an edge does: each until it is taken, evenly over the time."""
+    begun = time.monotonic()
     for i, message in enumerate(messages):
         time.sleep(max(0.0, begun + seconds * i / len(messages) - time.monotonic()))
         entry = SpoolEntry(i, "estimates", "", encode(message, "exact"))
@@ -169,13 +201,12 @@ def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float
         part.kills += 1
         time.sleep(1.0)
         part.process = part.start() or part.process
-        restarted, before = time.monotonic(), None
-        while before is None or _count(store) <= before:
-            before = _count(store) if before is None else before
-            if before < 0:
-                before = None
-            if time.monotonic() - restarted > 60 or told.published < 0:
+        restarted, before = time.monotonic(), -1
+        while time.monotonic() - restarted < LONGEST_WAIT:
+            now = _count(store, part.fed)
+            if 0 <= before < now:
                 break
+            before = now if before < 0 else before
             time.sleep(0.1)
         told.recoveries.append((part.name, time.monotonic() - restarted))
 
@@ -189,10 +220,12 @@ def _undisturbed(engine: Any, messages: list[Message], folder: Path) -> Store:
     return store
 
 
-def _count(store: Store) -> int:
+def _count(store: Store, vehicles: Sequence[str]) -> int:
+    """Windows that are stored of some vehicles; -1 when the database does not answer."""
+    query = select(func.count()).select_from(windows).where(windows.c.vehicle_id.in_(vehicles))
     try:
         with store.read() as connection:
-            return int(connection.execute(select(func.count()).select_from(windows)).scalar_one())
+            return int(connection.execute(query).scalar_one())
     except (SQLAlchemyError, OSError):
         return -1
 
@@ -230,8 +263,62 @@ def _worker(address: str, url: str, folder: Path) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
 
 
+def _serving(port: int, url: str, folder: Path) -> subprocess.Popen[bytes]:
+    """Ray Serve on this machine; returns when requests are taken."""
+    command = [sys.executable, "-m", "sprung", "fleet", "serve", "--store", url, "--port", str(port), "--cores", "0.5"]
+    running = subprocess.Popen(
+        [*command, "--workers", "2", "--replicas", "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=os.environ | {"SPRUNG_DATA_DIR": str(folder)},
+    )  # fmt: skip
+    _await(lambda: _listens(port) or running.poll() is not None, 240.0)
+    return running
+
+
+def _kill_head(process: subprocess.Popen[bytes] | None) -> None:
+    """Kill the head's process; the command that started it has to notice, as whoever starts it anew waits for that."""
+    for pid in _below(process, "gcs_server"):
+        os.kill(pid, signal.SIGKILL)
+    if process is not None:
+        process.wait(LONGEST_WAIT)
+
+
+def _kill_replica(head: KilledPart) -> None:
+    """Kill one that folds or identifies; Ray starts another one."""
+    found = [pid for name in ("fold", "identify") for pid in _below(head.process, f"ServeReplica:sprung:{name}")]
+    if found:
+        os.kill(random.Random(len(found)).choice(found), signal.SIGKILL)
+
+
+def _below(process: subprocess.Popen[bytes] | None, text: str) -> list[int]:
+    """Processes that descend from one and have a text in their command."""
+    parents: dict[int, int] = {}
+    commands: dict[int, str] = {}
+    for place in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(place.name)] = int((place / "stat").read_text().rsplit(")", 1)[1].split()[1])
+            commands[int(place.name)] = (place / "cmdline").read_text(errors="replace")
+        except OSError:
+            continue
+
+    def descends(pid: int) -> bool:
+        while pid in parents:
+            pid = parents[pid]
+            if process is not None and pid == process.pid:
+                return True
+        return False
+
+    return [pid for pid, command in commands.items() if text in command and descends(pid)]
+
+
 def _end_part(part: KilledPart) -> None:
-    _kill(part.process)
+    if part.name == "head of Ray" and part.process is not None:
+        part.process.terminate()  # it ends what it has started
+        try:
+            part.process.wait(60)
+        except subprocess.TimeoutExpired:
+            _kill(part.process)
+    else:
+        _kill(part.process)
 
 
 def _kill(process: subprocess.Popen[bytes] | None) -> None:

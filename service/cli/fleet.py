@@ -109,9 +109,12 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
     stopping = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stopping.set())
-    stopping.wait()
-    ray_serving.stop()
-    return 0
+    if ray_serving.watch(stopping, settings.host, settings.port, own=address is None):
+        ray_serving.stop()
+        return 0
+    print("sprung: Ray Serve does not answer any more; start this command again", file=sys.stderr, flush=True)
+    ray_serving.abandon()
+    os._exit(1)  # Ray's threads wait for a head that is gone
 
 
 def run_consume(options: dict[str, Any], address: str) -> int:

@@ -66,6 +66,7 @@ class FoundFile:
     vehicle: str = ""
     first_ns: int = 0  # of its samples
     problem: str = ""  # why it cannot be read
+    options: str = ""  # of an address, as in ?endpoint_override=...
 
     @property
     def id(self) -> str:
@@ -170,9 +171,10 @@ def list_files(place: str) -> list[FoundFile]:
     except (OSError, ValueError) as error:
         raise UserError(f"{place}: {str(error).splitlines()[0]}") from error
     prefix = place[: place.index("://") + 3]
+    options = "?" + place.partition("?")[2] if "?" in place else ""
     return sorted(
         (
-            FoundFile(f"{prefix}{info.path}", info.size, info.mtime_ns or 0)
+            FoundFile(f"{prefix}{info.path}", info.size, info.mtime_ns or 0, options=options)
             for info in infos
             if info.is_file and Path(info.path).suffix.lower() in KINDS
         ),
@@ -325,7 +327,7 @@ def local_copy(file: FoundFile) -> Iterator[Path]:
         return
     from pyarrow import fs
 
-    files, inner = fs.FileSystem.from_uri(file.path)
+    files, inner = fs.FileSystem.from_uri(file.path + file.options)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / Path(inner).name
         with files.open_input_stream(inner) as source, path.open("wb") as copy:

@@ -31,7 +31,7 @@ def diagnose_many(settings: Settings, place: str, out: Path, tasks: Tasks) -> It
     if not found:
         raise UserError(f"{place}: no recordings ({' '.join(KINDS)})")
     out.mkdir(parents=True, exist_ok=True)
-    root = place.rstrip("/")
+    root = place.partition("?")[0].rstrip("/")
     pending = [
         tasks.submit(diagnose_file, settings, file, out.absolute() / file.path.removeprefix(root).strip("/"))
         for file in found

@@ -7,6 +7,9 @@ replica that dies takes only requests with it that nobody was told were stored, 
 from __future__ import annotations
 
 import asyncio
+import http.client
+import socket
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -26,6 +29,10 @@ from sprung.service.store import open_store
 from sprung.service.threads import one_thread_each
 
 APPLICATION = "sprung"
+PROBE_SECONDS = 2.0
+PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
+SILENT_PROBES = 5
+ABANDON_SECONDS = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,6 +213,50 @@ def stop() -> None:
 
     serve.shutdown()
     ray.shutdown()
+
+
+def abandon() -> None:
+    """End what was started here though nobody answers any more; does not wait for Ray for long."""
+    import ray
+
+    leaving = threading.Thread(target=ray.shutdown, daemon=True)
+    leaving.start()
+    leaving.join(ABANDON_SECONDS)
+
+
+def watch(stopping: threading.Event, host: str, port: int, own: bool) -> bool:
+    """Wait until `stopping` is set: true; or until nobody takes requests any more, or the head of a Ray that was
+    started here is gone: false.  Whoever started the process then starts it anew."""
+    import ray
+
+    head_host, _, head_port = ray.get_runtime_context().gcs_address.rpartition(":")
+    silent = 0
+    while not stopping.wait(PROBE_SECONDS):
+        if own and not _listens(head_host, int(head_port)):
+            return False
+        silent = 0 if _answers(host, port) else silent + 1
+        if silent >= SILENT_PROBES:
+            return False
+    return True
+
+
+def _answers(host: str, port: int) -> bool:
+    connection = http.client.HTTPConnection("127.0.0.1" if host == "0.0.0.0" else host, port, timeout=PROBE_TIMEOUT)
+    try:
+        connection.request("GET", "/health/live")
+        return connection.getresponse().status < 500
+    except (OSError, http.client.HTTPException):
+        return False
+    finally:
+        connection.close()
+
+
+def _listens(host: str, port: int) -> bool:
+    try:
+        socket.create_connection((host, port), PROBE_TIMEOUT).close()
+    except OSError:
+        return False
+    return True
 
 
 def from_environment(arguments: dict[str, str]) -> Any:
