@@ -39,6 +39,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
     "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
     "real": ("sprung.benchmarks.real", "measured dampers, an axis and a beam, beside references (--data DIR)"),
+    "video": ("sprung.benchmarks.real_video", "real videos: the length of their pendulums (--data DIR)"),
     "length": ("sprung.benchmarks.length", "processor time and memory of a diagnosis over the recording's length"),
     "setups": (
         "sprung.benchmarks.setups",

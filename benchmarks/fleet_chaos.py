@@ -200,8 +200,8 @@ def _disturb(parts: list[KilledPart], store: Store, seconds: float, every: float
         part.kill(part.process)
         part.kills += 1
         time.sleep(1.0)
-        part.process = part.start() or part.process
         restarted, before = time.monotonic(), -1
+        part.process = part.start() or part.process
         while time.monotonic() - restarted < LONGEST_WAIT:
             now = _count(store, part.fed)
             if 0 <= before < now:
@@ -268,7 +268,7 @@ def _serving(port: int, url: str, folder: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "sprung", "fleet", "serve", "--store", url, "--port", str(port), "--cores", "0.5"]
     running = subprocess.Popen(
         [*command, "--workers", "2", "--replicas", "1"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        env=os.environ | {"SPRUNG_DATA_DIR": str(folder)},
+        env=os.environ | {"SPRUNG_DATA_DIR": str(folder)}, start_new_session=True,
     )  # fmt: skip
     _await(lambda: _listens(port) or running.poll() is not None, 240.0)
     return running

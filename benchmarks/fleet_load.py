@@ -94,7 +94,7 @@ def ingest(workers: int, seconds: float, minutes: float) -> Figures:
             "SPRUNG_LATE_SECONDS": "0",
             "SPRUNG_CLIENT_REQUESTS_PER_SECOND": "1e6",
         }
-        command = ["fleet", "serve", "--workers", str(workers), "--cores", "0.5", "--port"]
+        command = ["fleet", "serve", "--workers", str(workers), "--replicas", "1", "--cores", "0.5", "--port"]
         fleet = _served(stack, command, f"{folder}/fleet", more, "/health/ready")
         yield from _fleet_figures(fleet, body, rate_alone, seconds)
         if minutes:

@@ -17,7 +17,7 @@ from typing import Any, cast, get_args
 
 import torch
 
-from sprung.benchmarks import paper_analysis, paper_settings, paper_train, paper_visual
+from sprung.benchmarks import drifting, paper_analysis, paper_settings, paper_train, paper_visual
 from sprung.benchmarks.paper_settings import PaperSettings
 from sprung.model.alps.config import Budget
 from sprung.model.alps.fit import OutOfTime
@@ -30,6 +30,7 @@ TASKS: dict[str, tuple[Callable[[PaperSettings], Iterator[dict[str, Any]]], tupl
     "two_body": (paper_visual.rows, paper_visual.METHODS),
     "train": (paper_train.constant_rows, paper_train.CONSTANT_METHODS),
     "train_changing": (paper_train.changing_rows, paper_train.CHANGING_METHODS),
+    "train_drifting": (drifting.rows, drifting.METHODS),
     "kernels": (paper_analysis.kernel_rows, ()),
     "phase": (paper_analysis.phase_rows, ()),
     "features": (paper_analysis.feature_rows, ()),

@@ -19,10 +19,11 @@ from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.partitions import prepare
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows, latest_window
-from sprung.service.times import now_ns
+from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.views import vehicle_view
 
 LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
+FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after which they are asked again
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 
 OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
@@ -72,6 +73,15 @@ class HeldVehicle:
 
 
 @dataclass(frozen=True, slots=True)
+class _Newcomer:
+    """What a new vehicle was told last."""
+
+    vehicles: int  # there were then
+    at: int  # ns
+    state: TrackerState
+
+
+@dataclass(frozen=True, slots=True)
 class Folded:
     """Windows that are tracked and stored in a transaction which may not be committed yet."""
 
@@ -106,6 +116,7 @@ class Pipeline:
         self._on_alarms = on_alarms
         self._shown = staging is None
         self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
+        self._told: _Newcomer | None = None
         self._lock = threading.Lock()
         with store.write() as connection:
             self.model_id = fleet.ensure_model(
@@ -283,9 +294,18 @@ class Pipeline:
         return HeldVehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
 
     def _newcomer(self, connection: Connection) -> TrackerState:
-        """State of a vehicle never seen: what weather does to springs, others of its fleet have learned."""
-        rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
-        return self.engine.tracker.newcomer([self.engine.load_state(row.state) for row in rows])
+        """State of a vehicle never seen: what weather does to springs, others of its fleet have learned.
+
+        Reading what they have learned takes as long as folding ten windows, and changes over days: it is kept until
+        there are a tenth more of them, for an hour at the most.
+        """
+        count, now = fleet.count_trackers(connection, self.model_id), self._clock()
+        held = self._told
+        if held is None or count >= FRESH_GROWTH * held.vehicles or not 0 <= now - held.at < FRESH_NS:
+            rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
+            state = self.engine.tracker.newcomer([self.engine.load_state(row.state) for row in rows])
+            self._told = held = _Newcomer(count, now, state)
+        return held.state
 
     def relearn(self, vehicle: str, names: Sequence[str] | None, connection: Connection) -> Batch:
         """Forget baselines (all, or those of `names`) inside a transaction of the caller's, e.g. after a repair.

@@ -36,7 +36,6 @@ from sprung.service.store.staging import staging_digest, swap
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
 
-TOGETHER = 64  # windows that are identified, and folded, together
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
 AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk
 
@@ -79,7 +78,7 @@ class IdentifiedFile:
     """A file's estimates."""
 
     file: FoundFile
-    messages: tuple[bytes, ...]  # exact ones, of TOGETHER windows each
+    messages: tuple[bytes, ...]  # exact ones, of the windows that were identified together
     incomplete: bool = False
     problem: str = ""
 
@@ -221,7 +220,8 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
 
     try:
         with local_copy(file) as path, ExitStack() as stack:
-            request = ReadRequest(path, engine.system, engine.dbc, TOGETHER, start=file.modified_ns or None)
+            together = plan.settings.batch_windows  # as when it is replayed, so that estimates are the same bit by bit
+            request = ReadRequest(path, engine.system, engine.dbc, together, start=file.modified_ns or None)
             reading = Here(request)
             stack.callback(reading.close)
             for piece in reading.pieces(lambda: None):
@@ -290,9 +290,9 @@ def engine_of(settings: Settings) -> Engine:
 
 
 @contextmanager
-def opened_store(settings: Settings) -> Iterator[Store]:
-    """The store, for a while."""
-    store = open_store(settings.store_url)
+def opened_store(settings: Settings, migrated: bool = False) -> Iterator[Store]:
+    """The store, for a while; `migrated` as in `open_store`."""
+    store = open_store(settings.store_url, migrated)
     try:
         yield store
     finally:
@@ -303,7 +303,7 @@ def opened_store(settings: Settings) -> Iterator[Store]:
 def staging_pipeline(plan: BackfillPlan) -> Iterator[Pipeline]:
     """A pipeline whose model nobody sees yet."""
     engine = engine_of(plan.settings)
-    with opened_store(plan.settings) as store, ExitStack() as stack:
+    with opened_store(plan.settings, migrated=True) as store, ExitStack() as stack:
         compute = Compute(1)
         stack.callback(compute.close)
         yield Pipeline(engine, store, compute, staging=staging_digest(engine.digest, plan.name))

@@ -10,7 +10,8 @@ import asyncio
 import http.client
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ from sprung.service.store import open_store
 from sprung.service.threads import one_thread_each
 
 APPLICATION = "sprung"
+BUSY_BATCHES = 1.5  # of one replica, at work and waiting, beyond which another one is started
 PROBE_SECONDS = 2.0
 PROBE_TIMEOUT = 10.0  # s: a machine that is busy answers late
 SILENT_PROBES = 5
@@ -44,60 +46,34 @@ class ServingSizes:
     batch_windows: int = 32
     batch_messages: int = 64
     batch_wait_seconds: float = 0.02
-    queued: int = 256  # requests of one replica that wait; more are 429
+    queued: int = 256  # requests for each replica that wait; more are 429
 
 
 class IdentifyReplica:
     """Windows of any vehicles -> estimates."""
 
-    def __init__(self, settings: Settings, sizes: ServingSizes) -> None:
-        from ray import serve
-
+    def __init__(self, settings: Settings) -> None:
         one_thread_each()
         self._engine = load_engine(settings)
 
-        async def together(asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
-            return await asyncio.to_thread(self._identify, asked)
-
-        batched = serve.batch(max_batch_size=sizes.batch_windows, batch_wait_timeout_s=sizes.batch_wait_seconds)
-        self._together = batched(together)
-
-    async def identify(self, start: int, values: FloatArray) -> Estimate:
-        """The estimate of one window, values (T, C)."""
-        found: Estimate = await self._together((start, values))
-        return found
-
-    def _identify(self, asked: Sequence[tuple[int, FloatArray]]) -> list[Estimate]:
-        values = np.stack([values for _, values in asked])
-        return self._engine.identify(values, starts=[start for start, _ in asked])[0]
+    async def identify(self, starts: list[int], values: FloatArray) -> list[Estimate]:
+        """The estimates of windows, values (B, T, C)."""
+        return (await asyncio.to_thread(self._engine.identify, values, starts=starts))[0]
 
 
 class FoldReplica:
     """Messages of any vehicles -> trackers and store."""
 
-    def __init__(self, settings: Settings, sizes: ServingSizes) -> None:
-        from ray import serve
-
+    def __init__(self, settings: Settings) -> None:
         one_thread_each()
         store = open_store(settings.store_url)
         pipeline = Pipeline(load_engine(settings), store, Compute(1), vehicles_in_memory=settings.vehicles_in_memory)
         self._ingest = Ingest(pipeline, settings.late_seconds)
         self._ingest.start()
 
-        async def together(messages: list[Message]) -> list[Taken | UserError]:
-            return await asyncio.to_thread(self._fold, messages)
-
-        batched = serve.batch(max_batch_size=sizes.batch_messages, batch_wait_timeout_s=sizes.batch_wait_seconds)
-        self._together = batched(together)
-
-    async def fold(self, message: Message | bytes) -> Taken:
-        """What became of a message; it is stored."""
-        if isinstance(message, bytes):
-            message = (await asyncio.to_thread(read_messages, [message]))[0]
-        taken = await self._together(message)
-        if isinstance(taken, UserError):
-            raise taken
-        return taken
+    async def fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
+        """What became of each message; they are stored, but for those with an error."""
+        return await asyncio.to_thread(self._fold, messages)
 
     def _fold(self, messages: Sequence[Message]) -> list[Taken | UserError]:
         try:
@@ -107,34 +83,65 @@ class FoldReplica:
 
 
 class RayBehind:
-    """What the door sees of the two."""
+    """What the door sees of the two.  Requests are put together here: a call costs more than a window's identification,
+    so that one carries the windows, or the messages, of all that ask at a time."""
 
-    def __init__(self, identify: Any, fold: Any, digest: str) -> None:
+    def __init__(self, identify: Any, fold: Any, digest: str, sizes: ServingSizes) -> None:
+        from ray import serve
+
         self._identify = identify
         self._fold = fold
         self._digest = digest
+        self._waiting, self._most = 0, sizes.queued * sizes.replicas
+        # one more than there are replicas, so that none waits for the next; more, and batches stay small
+        wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
+        self._identified = serve.batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
+        self._folded = serve.batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
 
     async def fold(self, body: bytes) -> Taken:
         """Fold a message."""
-        taken: Taken = await _asked(self._fold.fold.remote(body))
-        return taken
+        with self._place():
+            return await self._fold_one((await asyncio.to_thread(read_messages, [body]))[0])
 
     async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
-        """Identify a window and fold it."""
-        estimate = await _asked(self._identify.identify.remote(start, values))
-        window = WindowEstimate(start, "used", None, 0, False, estimate)
-        taken: Taken = await _asked(self._fold.fold.remote(Message(vehicle, self._digest, (window,))))
+        """Identify a window, values (T, C), and fold it."""
+        with self._place():
+            estimate: Estimate = await self._identified((start, values))
+            window = WindowEstimate(start, "used", None, 0, False, estimate)
+            return await self._fold_one(Message(vehicle, self._digest, (window,)))
+
+    @contextmanager
+    def _place(self) -> Iterator[None]:
+        """One of those who wait.  Raises Busy when there are too many."""
+        if self._waiting >= self._most:
+            raise Busy("too many requests wait; try again in a second")
+        self._waiting += 1
+        try:
+            yield
+        finally:
+            self._waiting -= 1
+
+    async def _fold_one(self, message: Message) -> Taken:
+        taken: Taken | UserError = await self._folded(message)
+        if isinstance(taken, UserError):
+            raise taken
         return taken
+
+    async def _identify_together(self, asked: list[tuple[int, FloatArray]]) -> list[Estimate]:
+        starts, values = [start for start, _ in asked], np.stack([values for _, values in asked])
+        found: list[Estimate] = await _asked(self._identify.identify.remote(starts, values))
+        return found
+
+    async def _fold_together(self, messages: list[Message]) -> list[Taken | UserError]:
+        found: list[Taken | UserError] = await _asked(self._fold.fold.remote(messages))
+        return found
 
 
 async def _asked(pending: Any) -> Any:
     from ray.exceptions import RayTaskError
-    from ray.serve.exceptions import BackPressureError
 
     try:
         return await pending
-    except BackPressureError:
-        raise Busy("too many requests wait; try again in a second") from None
     except RayTaskError as error:
         raise error.cause from None
 
@@ -145,11 +152,10 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
 
     from sprung.service.api.live_ingest import ingest_app
 
-    scaling = {"min_replicas": 1, "max_replicas": sizes.replicas, "target_ongoing_requests": sizes.batch_windows}
+    scaling = {"min_replicas": 1, "max_replicas": sizes.replicas, "target_ongoing_requests": BUSY_BATCHES}
     shared: dict[str, Any] = {
         "autoscaling_config": scaling,
-        "max_ongoing_requests": 4 * sizes.batch_windows,
-        "max_queued_requests": sizes.queued,
+        "max_ongoing_requests": 1,  # batches: they compute
         "health_check_period_s": 5,
         "graceful_shutdown_timeout_s": settings.shutdown_seconds,
     }
@@ -164,6 +170,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
             serve.get_deployment_handle("identify", APPLICATION),
             serve.get_deployment_handle("fold", APPLICATION),
             engine.digest,
+            sizes,
         )
         return ingest_app(settings, engine, open_store(settings.store_url), behind)
 
@@ -180,7 +187,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
         ray_actor_options={"num_cpus": sizes.cores / 4},
         max_ongoing_requests=8 * sizes.queued,
     )
-    return door.bind(identify.bind(settings, sizes), fold.bind(settings, sizes))
+    return door.bind(identify.bind(settings), fold.bind(settings))
 
 
 def start(

@@ -142,6 +142,12 @@ def load_tracker(connection: Connection, vehicle: str, model_id: int) -> Tracker
     return None if row is None else TrackerRow(*row)
 
 
+def count_trackers(connection: Connection, model_id: int) -> int:
+    """Vehicles that have a tracker."""
+    query = select(func.count()).select_from(tracker_states).where(tracker_states.c.model_id == model_id)
+    return int(connection.execute(query).scalar_one())
+
+
 def latest_trackers(connection: Connection, model_id: int, most: int) -> list[TrackerRow]:
     """Stored trackers of the vehicles that ran last."""
     table = tracker_states

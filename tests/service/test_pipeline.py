@@ -184,3 +184,21 @@ def test_an_error_of_the_numerics_reaches_whoever_waits() -> None:
         compute.run(lambda: 1 / 0)
     assert compute.run(lambda: 2) == 2
     compute.close()
+
+
+def test_a_crowd_of_new_vehicles_asks_the_others_seldom(
+    pipeline: Pipeline, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What others have learned of the weather is read again when there are a tenth more of them."""
+    asked = 0
+    read = fleet.latest_trackers
+
+    def counted(*arguments: object) -> list[fleet.TrackerRow]:
+        nonlocal asked
+        asked += 1
+        return read(*arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(fleet, "latest_trackers", counted)
+    for number in range(45):
+        pipeline.process(f"v-{number}", [make_window(system, 0)])
+    assert 10 < asked < 30

@@ -1,0 +1,65 @@
+"""Between the door and Ray: requests of many travel together, each hears of its own, and too many are told so."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.service.errors import Busy, UserError
+from sprung.service.fleet.ingest import Taken
+from sprung.service.fleet.message import Message
+from sprung.service.fleet.ray_serving import RayBehind, ServingSizes
+
+pytest.importorskip("ray")
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
+
+
+class Remote:
+    """A deployment's handle, here: the method's answers, and how many each call carried."""
+
+    def __init__(self, name: str, answer: Any) -> None:
+        self.sizes: list[int] = []
+        self._answer = answer
+        setattr(self, name, self)
+
+    async def remote(self, first: list[Any], *rest: Any) -> list[Any]:
+        self.sizes.append(len(first))
+        await asyncio.sleep(0.05)
+        return [self._answer(one) for one in first]
+
+
+def taken(message: Message) -> Taken | UserError:
+    return UserError("not this one") if message.vehicle == "v-3" else Taken(message.vehicle, 1, 0, 0)
+
+
+def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
+    identify, fold = Remote("identify", lambda start: None), Remote("fold", taken)
+    return RayBehind(identify, fold, "digest", ServingSizes(**sizes)), identify, fold
+
+
+def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
+    async def asked() -> list[Any]:
+        ray, identify, fold = behind(replicas=1, batch_windows=8, batch_wait_seconds=0.05)
+        calls = [ray.identify_and_fold(f"v-{i}", i, np.zeros((2, 3))) for i in range(8)]
+        found = await asyncio.gather(*calls, return_exceptions=True)
+        assert identify.sizes == [8]
+        assert sum(fold.sizes) == 8 and len(fold.sizes) <= 2
+        return found
+
+    found = asyncio.run(asked())
+    assert [one.vehicle for i, one in enumerate(found) if i != 3] == [f"v-{i}" for i in range(8) if i != 3]
+    assert isinstance(found[3], UserError)
+
+
+def test_too_many_at_once_are_told_so_and_places_come_free() -> None:
+    async def asked() -> None:
+        ray, _, _ = behind(replicas=1, queued=2)
+        calls = [ray.identify_and_fold(f"v-{10 + i}", i, np.zeros((2, 3))) for i in range(3)]
+        found = await asyncio.gather(*calls, return_exceptions=True)
+        assert [isinstance(one, Busy) for one in found] == [False, False, True]
+        assert (await ray.identify_and_fold("v-1", 0, np.zeros((2, 3)))).folded == 1
+
+    asyncio.run(asked())
