@@ -38,7 +38,7 @@ from sprung.service.fleet.backfill import engine_of
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.nats_broker import NatsLink
-from sprung.service.fleet.sending import HttpLink, Link
+from sprung.service.fleet.sending import HttpLink
 from sprung.service.fleet.spool import SpoolEntry
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
@@ -48,6 +48,7 @@ from sprung.service.store.schema import windows
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
 VEHICLES = 4
+ClosedLink = HttpLink | NatsLink
 NAMES = tuple(f"chaos-{v}" for v in range(VEHICLES))
 PER_MESSAGE = 5  # windows
 MOST_WINDOWS = 240  # of a vehicle that are identified; the ride is repeated later in time
@@ -109,7 +110,7 @@ def chaos(minutes: float, every: float) -> Figures:
         rounds = max(1, round(60 * minutes * 2 / MOST_WINDOWS))
         messages = _messages(engine, rounds)
         told = ChaosTold()
-        links: list[tuple[Link, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
+        links: list[tuple[ClosedLink, Sequence[str]]] = [(NatsLink(address, "chaos"), published)]
         links += [(HttpLink(f"http://127.0.0.1:{port}", None, name), [name]) for name in posting]
         _ride(links, messages, parts, watched, (60 * minutes, every), told)
         expected = sum(len(m.windows) for m in messages)
@@ -137,7 +138,7 @@ def chaos(minutes: float, every: float) -> Figures:
 
 
 def _ride(
-    links: list[tuple[Link, Sequence[str]]],
+    links: list[tuple[ClosedLink, Sequence[str]]],
     messages: list[Message],
     parts: list[KilledPart],
     store: Store,
@@ -178,7 +179,7 @@ def _messages(engine: Any, rounds: int) -> list[Message]:
     return messages
 
 
-def _publish(link: Link, messages: list[Message], seconds: float, told: ChaosTold) -> None:
+def _publish(link: ClosedLink, messages: list[Message], seconds: float, told: ChaosTold) -> None:
     """As an edge does: each until it is taken, evenly over the time."""
     begun = time.monotonic()
     for i, message in enumerate(messages):

@@ -210,7 +210,9 @@ def main(folder: Path, document: Path) -> None:
         if not rows:
             return match.group(0)
         made = ", ".join(sorted({f"`{row['commit']}`" for row in rows}))
-        return f"<!-- rows {task} -->\n{table(task, rows)}\n\nMade at {made}.\n<!-- end -->"
+        seeds = sorted({int(row.get("seed", 0)) for row in rows})
+        told = f"seed{'s' if len(seeds) > 1 else ''} {', '.join(map(str, seeds))}"
+        return f"<!-- rows {task} -->\n{table(task, rows)}\n\nMade at {made}, {told}.\n<!-- end -->"
 
     def against(match: re.Match[str]) -> str:
         task = match.group(1)

@@ -10,7 +10,7 @@ import asyncio
 import http.client
 import socket
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -86,17 +86,16 @@ class RayBehind:
     """What the door sees of the two.  Requests are put together here: a call costs more than a window's identification,
     so that one carries the windows, or the messages, of all that ask at a time."""
 
-    def __init__(self, identify: Any, fold: Any, digest: str, sizes: ServingSizes) -> None:
-        from ray import serve
-
+    def __init__(self, identify: Any, fold: Any, digest: str, sizes: ServingSizes, batch: Callable[..., Any]) -> None:
+        """identify, fold: handles of the deployments; batch: `serve.batch`, which runs in a replica only."""
         self._identify = identify
         self._fold = fold
         self._digest = digest
         self._waiting, self._most = 0, sizes.queued * sizes.replicas
         # one more than there are replicas, so that none waits for the next; more, and batches stay small
         wait = {"batch_wait_timeout_s": sizes.batch_wait_seconds, "max_concurrent_batches": sizes.replicas + 1}
-        self._identified = serve.batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
-        self._folded = serve.batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
+        self._identified = batch(max_batch_size=sizes.batch_windows, **wait)(self._identify_together)
+        self._folded = batch(max_batch_size=sizes.batch_messages, **wait)(self._fold_together)
 
     async def fold(self, body: bytes) -> Taken:
         """Fold a message."""
@@ -171,6 +170,7 @@ def application(settings: Settings, sizes: ServingSizes) -> Any:
             serve.get_deployment_handle("fold", APPLICATION),
             engine.digest,
             sizes,
+            serve.batch,
         )
         return ingest_app(settings, engine, open_store(settings.store_url), behind)
 

@@ -31,13 +31,38 @@ class Remote:
         return [self._answer(one) for one in first]
 
 
+def batch(max_batch_size: int, batch_wait_timeout_s: float, **_: Any) -> Any:
+    """As `serve.batch`: arguments that come within a while go to one call."""
+
+    def decorate(together: Any) -> Any:
+        waiting: list[tuple[Any, asyncio.Future[Any]]] = []
+
+        async def flush() -> None:
+            await asyncio.sleep(batch_wait_timeout_s)
+            taken_now = [waiting.pop(0) for _ in waiting[:max_batch_size]]
+            for (_, told), answer in zip(taken_now, await together([one for one, _ in taken_now]), strict=True):
+                told.set_result(answer)
+
+        async def one(argument: Any) -> Any:
+            told = asyncio.get_running_loop().create_future()
+            waiting.append((argument, told))
+            if len(waiting) == 1:
+                flushing.append(asyncio.create_task(flush()))
+            return await told
+
+        flushing: list[asyncio.Task[None]] = []
+        return one
+
+    return decorate
+
+
 def taken(message: Message) -> Taken | UserError:
     return UserError("not this one") if message.vehicle == "v-3" else Taken(message.vehicle, 1, 0, 0)
 
 
 def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
     identify, fold = Remote("identify", lambda start: None), Remote("fold", taken)
-    return RayBehind(identify, fold, "digest", ServingSizes(**sizes)), identify, fold
+    return RayBehind(identify, fold, "digest", ServingSizes(**sizes), batch), identify, fold
 
 
 def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
