@@ -66,3 +66,13 @@ def test_the_application_that_ray_imports_is_there() -> None:
     module, _, name = served["import_path"].partition(":")
     imported = __import__(module, fromlist=[name])
     assert callable(getattr(imported, name))
+
+
+@pytest.mark.filterwarnings("ignore")  # Ray's own, when it is imported
+def test_ray_takes_the_configuration_of_its_application() -> None:
+    schema = pytest.importorskip("ray.serve.schema")
+    document = next(
+        d for d in yaml.safe_load_all((FOLDER / "kubernetes.yaml").read_text()) if d["kind"] == "RayService"
+    )
+    config = schema.ServeDeploySchema.model_validate(yaml.safe_load(document["spec"]["serveConfigV2"]))
+    assert config.applications[0].args == {"replicas": 32, "cores": 1}
