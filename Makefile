@@ -10,6 +10,8 @@ SOURCES := sprung noxfile.py docs/imports.py model replay service benchmarks tes
 DEMO := .demo/day.blf
 PORT ?= 8000
 PYTEST ?=
+# processes that the tests are shared among
+JOBS ?= auto
 
 .DELETE_ON_ERROR:
 .PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
@@ -60,7 +62,7 @@ demo: install $(DEMO)
 	$(BIN)/sprung serve --replay $(DEMO) --port $(PORT) --data-dir .demo
 
 test: install-dev
-	$(BIN)/python -m pytest $(PYTEST)
+	$(BIN)/python -m pytest -n $(JOBS) --maxprocesses 4 --dist worksteal $(PYTEST)
 
 test-slow: install-dev
 	$(BIN)/python -m pytest -m slow

@@ -18,4 +18,4 @@ def tests(session: nox.Session) -> None:
     session.install(*[line for line in locked("requirements.lock") if line.startswith("torch==")])
     session.install("-r", "requirements.lock", "-r", "requirements-dev.lock")
     session.install("--no-deps", "--editable", ".")
-    session.run("python", "-m", "pytest", *session.posargs)
+    session.run("python", "-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "worksteal", *session.posargs)

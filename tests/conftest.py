@@ -3,6 +3,12 @@
 from __future__ import annotations
 
 import os
+
+# Before NumPy and torch are there: tests share the cores as processes (`-n auto`), and the operations here are too
+# small to split: threads of a linear algebra library would only wait for each other.
+for _library in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_library, "1")
+
 from collections.abc import Iterator
 from pathlib import Path
 
