@@ -48,7 +48,8 @@ def time_domain_bound(
     J, basis = np.linalg.solve(factor, J), np.linalg.solve(factor, free)
     q, _ = np.linalg.qr(basis / np.linalg.norm(basis, axis=0))
     J = J - q @ (q.T @ J)
-    return np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    found: FloatArray = np.sqrt(np.diag(np.linalg.inv(J.T @ J)))
+    return found
 
 
 def _input_covariance(system: System, simulator: LinearSimulator, x: torch.Tensor, T: int, fused: bool) -> FloatArray:
@@ -103,4 +104,5 @@ def shared_bound(
         information = information + J.T @ J
     size = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(size, size), rcond=1e-14, hermitian=True)
-    return (np.sqrt(np.diag(covariance)) / size)[:P]
+    found: FloatArray = (np.sqrt(np.diag(covariance)) / size)[:P]
+    return found

@@ -50,7 +50,8 @@ def explained(report: Verdict) -> float | None:
     floor = report["noise_floor"]["nrmse"]
     if floor is None or not math.isfinite(sum(mean_squares)) or mean_squares[1] <= 1.02 * floor**2:
         return None
-    return 1 - (mean_squares[0] - floor**2) / (mean_squares[1] - floor**2)
+    found: float | None = 1 - (mean_squares[0] - floor**2) / (mean_squares[1] - floor**2)
+    return found
 
 
 def _matches(said: Mapping[str, Any], true: Mapping[str, Any], named_laws: Iterable[str]) -> bool:

@@ -62,7 +62,8 @@ class ScipyPeer:
         A, B, C, D = self._matrices(ratio)
         t = np.arange(samples) / self.system.sample_rate
         solution = solve_ivp(lambda s, x: A @ x + B @ u(s), (0, t[-1]), x0, t_eval=t, rtol=1e-6, atol=1e-9)
-        return solution.y.T @ C.T + np.array([u(s) for s in t]) @ D.T
+        found: FloatArray = solution.y.T @ C.T + np.array([u(s) for s in t]) @ D.T
+        return found
 
     def _joint(self, window: FloatArray, u: Drive, P: int, deadline: float) -> tuple[FloatArray, bool]:
         measured = window[:, self.inputs :]
@@ -123,11 +124,13 @@ def ukf_peer(system: System, window: FloatArray, truth: FloatArray) -> tuple[flo
         A, B, *_ = matrices(z)
         step = scipy.linalg.expm(np.block([[A * dt, B * dt], [np.zeros((16, 34))]]))
         x = step[:18, :18] @ (z[:18] * scale[:18]) + step[:18, 18:] @ (u0 + u1) / 2
-        return np.r_[x / scale[:18], z[18:]]
+        found: FloatArray = np.r_[x / scale[:18], z[18:]]
+        return found
 
     def see(z: FloatArray, u: FloatArray) -> FloatArray:
         _, _, C, D = matrices(z)
-        return C @ (z[:18] * scale[:18]) + D @ u
+        found: FloatArray = C @ (z[:18] * scale[:18]) + D @ u
+        return found
 
     points = MerweScaledSigmaPoints(18 + P, alpha=0.1, beta=2.0, kappa=0.0)
     ukf = UnscentedKalmanFilter(18 + P, 12, dt, see, move, points)

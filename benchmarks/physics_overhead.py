@@ -180,7 +180,8 @@ def _stepped(simulator: LinearSimulator, log_ratio: Tensor, knots: Tensor, start
 
     def rate(time: Tensor, x: Tensor) -> Tensor:
         value, slope = drive(time)
-        return (a @ x[:, :, None] + by_value @ value[:, :, None] + by_rate @ slope[:, :, None]).squeeze(2)
+        found: Tensor = (a @ x[:, :, None] + by_value @ value[:, :, None] + by_rate @ slope[:, :, None]).squeeze(2)
+        return found
 
     times = torch.arange(knots.shape[1], dtype=start.dtype) * simulator.dt
     return solve(rate, start, times, method=method, rtol=1e-6, atol=1e-9).transpose(0, 1)

@@ -13,7 +13,8 @@ STARTS = ((0.003, 0.05), (0.03, 0.3), (0.3, 0.3))  # yield displacement over tra
 def linear(displacement: Array, rate: Array, force: Array, split: int) -> Array:
     """Preload, spring and damper by least squares on the first `split` samples; the force over all."""
     columns = np.column_stack([np.ones(len(force)), displacement, rate])
-    return columns @ np.linalg.lstsq(columns[:split], force[:split], rcond=None)[0]
+    found: Array = columns @ np.linalg.lstsq(columns[:split], force[:split], rcond=None)[0]
+    return found
 
 
 def bouc_wen(displacement: Array, rate: Array, force: Array, split: int) -> Array:

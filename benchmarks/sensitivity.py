@@ -35,6 +35,7 @@ from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import System
 
+ALONE = ("component", "ambient")  # stages of recordings of their own
 LAST = ("verdict", "report")  # stages that read finished investigations
 LATE = ("evidence", "selection", "plausible", "acceptance", "noise")  # stages that go on from begun ones
 FIRST = ("input_faults", "input_rounds", "input_rival", "input_rivals", "input_done")  # of acceptance, but decide early
@@ -70,7 +71,8 @@ class Subject:
     record: Falsified
     options: Options
     said: Said
-    state: Investigation | None = None  # begun; None for a component test
+    reads: str = ""  # stage that alone decides: of component tests, of structures without inputs
+    state: Investigation | None = None  # begun; None for those
     outcome: Outcome | None = None
 
     def again(self, stage: str, name: str, rules: Rules) -> Said:
@@ -162,7 +164,7 @@ def _keep(file: Path | None, settings: list[Any], told: dict[str, Any]) -> None:
 
 def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | None:
     """Set a number to both ends of its range on a recording; what changes.  None: its stage does not read it."""
-    if (stage == "component") != (subject.state is None):
+    if (stage in ALONE or subject.reads) and stage != subject.reads:
         return None
     changed, decades = [], 0.0
     for end in number.metadata["range"]:
@@ -207,11 +209,12 @@ def _difference(before: Said, after: Said) -> dict[str, Any]:
 def _known(name: str, system: System, record: Falsified) -> Subject:
     """A recording diagnosed under the usual rules, with the steps on the way."""
     options = Options(file=name, catalogue=CATALOGUE, memory=FitMemory())
-    if is_component_test(system, record.values):
-        return Subject(name, system, record, options, Said.of(diagnose(system, record, options)))
+    if is_component_test(system, record.values) or not system.file.inputs:
+        reads = "component" if system.file.inputs else "ambient"
+        return Subject(name, system, record, options, Said.of(diagnose(system, record, options)), reads)
     state = begun(system, record, options, _silent)
     outcome = concluded(with_findings(state, _silent), _silent)
-    return Subject(name, system, record, options, Said.of(narrate(outcome, record)), state, outcome)
+    return Subject(name, system, record, options, Said.of(narrate(outcome, record)), "", state, outcome)
 
 
 def _silent(share: float, text: str) -> None:

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import yaml
+from scipy.linalg import expm
+from scipy.signal import decimate
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.benchmarks.setups import Falsified, falsified, in_order
@@ -50,6 +52,18 @@ sensors:
   car_b: {kind: acceleration, body: car, noise: 0.004, csv: b}
   bogie_a: {kind: acceleration, body: bogie, noise: 0.03, csv: e}
   bogie_b: {kind: acceleration, body: bogie, noise: 0.03, csv: f}
+"""
+TOWER = """
+name: tower
+sample_rate: 50
+window: 3000
+bodies: {one: {mass: 1000}, two: {mass: 800}}
+elements:
+  lower: {upper: one, lower: ground, stiffness: 4.0e+5, damping: 400}
+  upper: {upper: two, lower: one, stiffness: 3.0e+5, damping: 300}
+sensors:
+  a1: {kind: acceleration, body: one, noise: 0.001}
+  a2: {kind: acceleration, body: two, noise: 0.001}
 """
 WHEEL, VELOCITY, CAR_A, CAR_B, BOGIE_A = range(5)  # columns of its recordings
 
@@ -122,6 +136,8 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     made = _vehicles if budget == "full" else quarter_cars
     for number, (what, system, record) in enumerate(made(count - rigs, seconds, seed)):
         yield f"{number}-{what}", system, record
+    if budget != "quick":
+        yield "tower", parse_system(TOWER), tower(np.random.default_rng(seed + 1))
     for number in range(rigs):
         yield f"rig-{number}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2 + number))
 
@@ -175,3 +191,26 @@ def rig(seconds: float, random: np.random.Generator) -> Falsified:
     force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * np.tanh(v / 1e-3)
     noise = random.standard_normal((2, len(t)))
     return Falsified("", frozenset(), np.column_stack([d + 1e-6 * noise[0], force + 2.0 * noise[1]]))
+
+
+def tower(random: np.random.Generator, seconds: float = 360.0) -> Falsified:
+    """A tower under forces that nobody measured, one of whose springs is a tenth softer in the second half."""
+    mass, fine = np.array([1000.0, 800.0]), 8
+    H, damping = np.array([[1.0, 0.0], [-1.0, 1.0]]), np.array([500.0, 260.0])
+    steps, step = round(seconds * 50) * fine, 1 / (50 * fine)
+    push = random.normal(0, 50 * np.sqrt(fine), (steps, 2)) / mass
+    x, acceleration = np.zeros(4), np.empty((steps, 2))
+    for half, stiffness in enumerate((np.array([4.6e5, 2.7e5]), np.array([4.6e5, 2.43e5]))):
+        A = np.block(
+            [
+                [np.zeros((2, 2)), np.eye(2)],
+                [-(H.T * stiffness) @ H / mass[:, None], -(H.T * damping) @ H / mass[:, None]],
+            ]
+        )
+        ahead = expm(A * step)
+        given = np.linalg.solve(A, ahead - np.eye(4))[:, 2:]
+        for i in range(half * steps // 2, (half + 1) * steps // 2):
+            acceleration[i] = A[2:] @ x + push[i]
+            x = ahead @ x + given @ push[i]
+    shown = decimate(acceleration, fine, ftype="fir", axis=0, n=20 * fine)
+    return Falsified("", frozenset(), shown + random.normal(0, 0.001, shown.shape), sample_rate=50.0)

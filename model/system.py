@@ -376,12 +376,23 @@ def load_system(path: str | Path = MANCHESTER, catalogue: tuple[Law, ...] = CATA
 
     Errors: `SystemFileError`, one line that names file, line and key, also when the sensors cannot observe the
     system whose parameters are to be estimated.
+
+    >>> import sprung
+    >>> system = sprung.load_system()
+    >>> system.parameters[0].name, system.parameters[0].nominal, len(system.sensors)
+    ('primary_11l.stiffness', 1220000.0, 12)
     """
     return checked(System(read_system_file(path), catalogue), str(path))
 
 
 def parse_system(text: str, source: str = "system file", catalogue: tuple[Law, ...] = CATALOGUE) -> System:
-    """The same from text."""
+    """The same from text.
+
+    >>> import pathlib, sprung
+    >>> system = sprung.parse_system(pathlib.Path("rig.yaml").read_text())
+    >>> [(p.name, p.nominal, p.unit) for p in system.parameters]
+    [('damper.stiffness', 40000.0, 'N/m'), ('damper.damping', 1500.0, 'N s/m')]
+    """
     return checked(System(parse_system_file(text, source), catalogue), source)
 
 

@@ -216,7 +216,8 @@ class CanDecoder:
 def _take_rows(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
     """`array[rows]`; rows of eight bytes are taken as words, which is quicker."""
     if array.dtype == np.uint8 and array.shape[1] == 8 and array.flags.c_contiguous:
-        return array.view(np.uint64)[rows, 0].view(np.uint8).reshape(-1, 8)
+        found: NDArray[Any] = array.view(np.uint64)[rows, 0].view(np.uint8).reshape(-1, 8)
+        return found
     return np.take(array, rows, axis=0)
 
 

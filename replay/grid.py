@@ -242,7 +242,8 @@ def _search(offset: FloatArray, typical: float) -> float:
 
 
 def _coherence(offset: FloatArray, period: FloatArray) -> FloatArray:
-    return np.abs(np.exp(2j * np.pi * (offset - offset[0])[:, None] / period).mean(axis=0))
+    found: FloatArray = np.abs(np.exp(2j * np.pi * (offset - offset[0])[:, None] / period).mean(axis=0))
+    return found
 
 
 def _lattice(offset: FloatArray, value: FloatArray, period: float) -> tuple[FloatArray, float]:
@@ -270,7 +271,8 @@ def _sinc(even: FloatArray, position: FloatArray, cutoff: float) -> FloatArray:
     margin = min(2 * half, len(even) - 1)
     padded = np.pad(even, margin, mode="reflect", reflect_type="odd")
     index = np.clip(centre[:, None] + taps + margin, 0, len(padded) - 1)
-    return np.einsum("ij,ij->i", weight, padded[index])
+    found: FloatArray = np.einsum("ij,ij->i", weight, padded[index])
+    return found
 
 
 def fill(grid: FloatArray, longest: int) -> FloatArray:
@@ -310,4 +312,5 @@ def _run_length(valid: BoolArray) -> IntArray:
     """Length of the run of missing samples around the centre of each row of `valid` (m, 2 REACH + 1)."""
     before = np.argmax(np.c_[valid[:, REACH::-1], np.ones(len(valid), dtype=bool)], axis=1)
     after = np.argmax(np.c_[valid[:, REACH:], np.ones(len(valid), dtype=bool)], axis=1)
-    return before + after - 1
+    found: IntArray = before + after - 1
+    return found

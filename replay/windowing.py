@@ -203,7 +203,8 @@ class _Batch:
 
     def _per_window(self, mask: BoolArray) -> IntArray:
         total = np.concatenate([np.zeros((1, mask.shape[1]), dtype=np.int64), np.cumsum(mask, axis=0)])
-        return total[self.ends] - total[self.starts]
+        found: IntArray = total[self.ends] - total[self.starts]
+        return found
 
     def _phases(self) -> tuple[FloatArray, FloatArray]:
         """Circular mean of the samples' offsets from their rows, in periods, and its resultant length: (W,) each."""

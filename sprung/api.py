@@ -49,7 +49,15 @@ AT_ONCE = 128  # windows that are identified together
 
 @dataclass(frozen=True, slots=True)
 class ParameterValue:
-    """One identified parameter."""
+    """One identified parameter.
+
+    >>> import sprung
+    >>> system = sprung.load_system()
+    >>> record = sprung.load_record("ride.mcap", system)
+    >>> spring = sprung.identify(system, record.values[:100])["primary_11l.stiffness"]
+    >>> spring.unit, spring.nominal, spring.std < 0.1 * spring.value
+    ('N/m', 1220000.0, True)
+    """
 
     name: str  # "secondary_2l.damping"
     value: float  # `unit`
@@ -61,7 +69,14 @@ class ParameterValue:
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedWindow:
-    """What one window told."""
+    """What one window told.
+
+    >>> import sprung
+    >>> system = sprung.load_system()
+    >>> window = sprung.identify(system, sprung.load_record("ride.mcap", system).values[:100])
+    >>> len(window.parameters), window.estimate.adequate
+    (24, True)
+    """
 
     parameters: tuple[ParameterValue, ...]
     estimate: Estimate  # the same as log-ratios with their covariance, and how well the window fits
@@ -76,7 +91,14 @@ class IdentifiedWindow:
 
 @dataclass(frozen=True, slots=True)
 class Tracked:
-    """What a recording came to."""
+    """What a recording came to.
+
+    >>> import sprung
+    >>> system = sprung.load_system()
+    >>> tracked = sprung.track(system, sprung.open_recording("ride.mcap", system))
+    >>> tracked.windows, tracked.alarms, tracked.health
+    (39, (), 'ok')
+    """
 
     parameters: tuple[ParameterReport, ...]  # posterior, baseline and drift of every parameter
     alarms: tuple[Alarm, ...]
@@ -93,12 +115,23 @@ def open_recording(
     start: ns since 1970, when it began if its times count from 0; the file's own time otherwise.  The unit of a time
     column and where it stands are as the system file's `time` says.
     Errors: `UnreadableRecording`, one line, now or while reading.
+
+    >>> import sprung
+    >>> ride = sprung.open_recording("ride.mcap", sprung.load_system())
+    >>> sum(len(block.time) for block in ride.blocks())
+    56000
     """
     return open_stream(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
 
 
 def load_record(path: str | Path, system: System, dbc: str | Path | None = None, start: int | None = None) -> Record:
-    """A whole recording on one even grid, as `diagnose` wants it; arguments and errors as of `open_recording`."""
+    """A whole recording on one even grid, as `diagnose` wants it; arguments and errors as of `open_recording`.
+
+    >>> import sprung
+    >>> record = sprung.load_record("ride.mcap", sprung.load_system())
+    >>> record.values.shape, record.sample_rate, record.lost
+    ((2000, 28), 100.0, 0)
+    """
     return open_record(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
 
 
@@ -157,10 +190,10 @@ def track(system: System, recording: Recording, model: Identifies | None = None)
 
     >>> import sprung
     >>> system = sprung.load_system()
-    >>> ride = sprung.open_recording("tests/data/drift-600s.blf", system)
-    >>> tracked = sprung.track(system, ride)
-    >>> [alarm.parameter for alarm in tracked.alarms]
-    ['secondary_2l.damping', 'primary_12r.stiffness']
+    >>> tracked = sprung.track(system, sprung.open_recording("ride.mcap", system))
+    >>> spring = tracked.parameters[0]
+    >>> spring.name, spring.identifiable, abs(spring.ratio - 1) < 0.05
+    ('primary_11l.stiffness', True, True)
     """
     engine = Engine(system, model or load_identifier(system), make_tracker(system))
     followed, count = Followed(engine.tracker.initial_state()), 0

@@ -1,10 +1,4 @@
-"""A typed client of the HTTP API, with nothing but the standard library under it.
-
->>> from sprung.client import Client
->>> client = Client("http://localhost:8000")            # doctest: +SKIP
->>> for line in client.vehicles(sort="urgency"):        # doctest: +SKIP
-...     print(line.vehicle, line.health, line.drift)
-"""
+"""A typed client of the HTTP API, with nothing but the standard library under it."""
 
 from __future__ import annotations
 
@@ -40,6 +34,12 @@ class Client:
     """One service.
 
     token: of `sprung token`, where the service asks for one; timeout: seconds for one answer.
+
+    >>> import sprung
+    >>> client = sprung.Client(url)  # "http://localhost:8000" of `sprung serve`
+    >>> for line in client.vehicles(sort="urgency"):
+    ...     print(line.vehicle, line.health, client.vehicle(line.vehicle).windows.used)
+    m1 ok 3
     """
 
     def __init__(self, base: str = "http://127.0.0.1:8000", token: str | None = None, timeout: float = 30.0) -> None:

@@ -6,32 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise, transform
 from sprung.model.system import System, parse_system
 
-SYSTEM = """
-name: quarter-car
-sample_rate: 100
-window: 100
-bodies:
-  car: {mass: 8000}
-  bogie: {mass: 1300}
-inputs:
-  wheel:
-    kind: displacement
-    displacement: {csv: d, noise: 1.0e-5}
-    velocity: {csv: v, noise: 5.0e-4}
-elements:
-  primary: {upper: bogie, lower: wheel, stiffness: 2.4e+6, damping: 1.0e+4}
-  secondary: {upper: car, lower: bogie, stiffness: 4.3e+5, damping: 2.0e+4}
-sensors:
-  car_a: {kind: acceleration, body: car, noise: 0.004, csv: a}
-  car_b: {kind: acceleration, body: car, noise: 0.004, csv: b}
-  bogie_a: {kind: acceleration, body: bogie, noise: 0.03, csv: e}
-  bogie_b: {kind: acceleration, body: bogie, noise: 0.03, csv: f}
-"""
 STIFFNESS = {"primary": 2.2e6, "secondary": 4.6e5}
 DAMPING = {"primary": 1.1e4, "secondary": 1.8e4}
 FINE = 10  # steps per sample

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -93,3 +94,12 @@ def diagnose(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     request.out.mkdir(parents=True)
     (request.out / "report.html").write_text("<p>the page</p>")
     return DiagnosisResult("missing_physics", REPORT)
+
+
+def eventually(check: Callable[[], Any], seconds: float = 30.0) -> Any:
+    """The first true value of `check`; fails after a while."""
+    deadline = time.monotonic() + seconds
+    while not (found := check()):
+        assert time.monotonic() < deadline, "nothing happened"
+        time.sleep(0.02)
+    return found

@@ -30,31 +30,38 @@ class Law:
 
 
 def cubic(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * d * d * d
+    found: Array = p[0] * d * d * d
+    return found
 
 
 def bump(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[1] * (d - np.minimum(np.maximum(d, -p[0]), p[0]))
+    found: Array = p[1] * (d - np.minimum(np.maximum(d, -p[0]), p[0]))
+    return found
 
 
 def clearance(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return -k * np.minimum(np.maximum(d, -p[0]), p[0])
+    found: Array = -k * np.minimum(np.maximum(d, -p[0]), p[0])
+    return found
 
 
 def coulomb(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * np.tanh(v / p[1])
+    found: Array = p[0] * np.tanh(v / p[1])
+    return found
 
 
 def blowoff(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return (p[1] - 1) * c * (v - np.minimum(np.maximum(v, -p[0]), p[0]))
+    found: Array = (p[1] - 1) * c * (v - np.minimum(np.maximum(v, -p[0]), p[0]))
+    return found
 
 
 def asymmetry(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * c * np.abs(v)
+    found: Array = p[0] * c * np.abs(v)
+    return found
 
 
 def quadratic_damping(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * v * np.abs(v)
+    found: Array = p[0] * v * np.abs(v)
+    return found
 
 
 def series(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> tuple[Array, Array]:
@@ -69,39 +76,47 @@ def bouc_wen(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Arra
 
 
 def varying_stiffness(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return k * d * p[0] * (1 - np.exp(-t / p[1]))
+    found: Array = k * d * p[0] * (1 - np.exp(-t / p[1]))
+    return found
 
 
 def varying_damping(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return c * v * p[0] * (1 - np.exp(-t / p[1]))
+    found: Array = c * v * p[0] * (1 - np.exp(-t / p[1]))
+    return found
 
 
 def quadratic_stiffness(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * d * d
+    found: Array = p[0] * d * d
+    return found
 
 
 def position_damping(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
-    return p[0] * d * d * v
+    found: Array = p[0] * d * d * v
+    return found
 
 
 def ripple(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
     """A toothed guide: the force waves with the deflection."""
-    return p[0] * np.sin(d / p[1])
+    found: Array = p[0] * np.sin(d / p[1])
+    return found
 
 
 def speed_stiffness(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
     """Rubber that stiffens with the rate: k_v |v| d."""
-    return p[0] * np.abs(v) * d
+    found: Array = p[0] * np.abs(v) * d
+    return found
 
 
 def one_sided_stop(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
     """A stop that is met in compression only."""
-    return p[1] * np.minimum(d + p[0], 0.0)
+    found: Array = p[1] * np.minimum(d + p[0], 0.0)
+    return found
 
 
 def saturating(d: Array, v: Array, p: Array, k: Array, c: Array, t: float, m: Array) -> Array:
     """A part of the spring slips once its travel is used up, without hysteresis."""
-    return p[1] * k * (p[0] * np.tanh(d / p[0]) - d)
+    found: Array = p[1] * k * (p[0] * np.tanh(d / p[0]) - d)
+    return found
 
 
 def _signed(rng: np.random.Generator, size: float) -> float:

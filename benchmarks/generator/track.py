@@ -33,7 +33,8 @@ def _rail_spectrum(rng: np.random.Generator, samples: int, speed: float, level: 
     band = edge * (wavenumber <= SHORTEST) * (frequency < TOP_FREQUENCY)
     amplitude = np.sqrt(density * band * RATE * samples / 2)
     phase = rng.normal(size=frequency.size) + 1j * rng.normal(size=frequency.size)
-    return amplitude * phase / np.sqrt(2)
+    found: NDArray[np.complex128] = amplitude * phase / np.sqrt(2)
+    return found
 
 
 def _joints(rng: np.random.Generator, samples: int, speed: float, spacing: float) -> NDArray[np.complex128]:
@@ -43,7 +44,8 @@ def _joints(rng: np.random.Generator, samples: int, speed: float, spacing: float
     gap = (place - offset + spacing / 2) % spacing - spacing / 2
     dip = np.fft.rfft(-depth * np.exp(-np.abs(gap) / width))
     frequency = np.fft.rfftfreq(samples, 1 / RATE)
-    return dip / np.sqrt(1 + (frequency / 25.0) ** 12) * (frequency < 49.0)
+    found: NDArray[np.complex128] = dip / np.sqrt(1 + (frequency / 25.0) ** 12) * (frequency < 49.0)
+    return found
 
 
 def wheel_spectra(

@@ -67,4 +67,5 @@ def foreseen(system: System) -> FloatArray:
     precision = np.concatenate([window.prior_std, assumed.prior(z).std]) ** -2.0
     scale = np.sqrt(np.diag(at.information) + precision)
     inverse = np.linalg.inv((at.information + np.diag(precision)) / np.outer(scale, scale))
-    return np.minimum(np.sqrt(np.diag(inverse))[:P] / scale[:P], PRIOR_STD)
+    found: FloatArray = np.minimum(np.sqrt(np.diag(inverse))[:P] / scale[:P], PRIOR_STD)
+    return found

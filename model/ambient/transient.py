@@ -232,7 +232,8 @@ class TransientWindow:
         inertia = self.system.mechanics.mass
         expected = np.sum(np.abs(A) ** 2 * inertia**2)
         measured = max(float(np.sum(np.abs(signals) ** 2) - signals.size), 0.05 * float(np.sum(np.abs(signals) ** 2)))
-        return np.log(measured / expected) + 2 * np.log(inertia)
+        found: FloatArray = np.log(measured / expected) + 2 * np.log(inertia)
+        return found
 
 
 def _judged(fitted: Fitted, frequency: FloatArray, whole: FloatArray, sensed: Sensing) -> TransientFit:

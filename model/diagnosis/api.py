@@ -51,6 +51,12 @@ def diagnose(
     """Diagnose a recording whose columns are in the order of `system.channels`, then of `system.signals`.
 
     Errors: `DiagnosisError` when the recording cannot be used at all.
+
+    >>> import sprung
+    >>> rig = sprung.load_system("rig.yaml")
+    >>> report = sprung.diagnose(rig, sprung.load_record("rig.csv", rig))
+    >>> report.verdict, report.findings[0].location, report.findings[0].effect
+    ('missing_physics', 'damper', 'coulomb_friction')
     """
     tell, options = progress or (lambda share, text: None), options or Options()
     channels = record.values[:, : len(system.channels)]

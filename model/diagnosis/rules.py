@@ -182,6 +182,19 @@ class ComponentRules:
 
 
 @dataclass(frozen=True)
+class AmbientRules:
+    """Deciding constants of a diagnosis without any measured input."""
+
+    alpha: float = rule(1e-4, "chance of windows that only scatter being told apart; chosen", 1e-5, 1e-3)
+    varies: float = rule(0.02, "of a parameter's logarithm; derived: a hundredth of a frequency", 0.01, 0.04)
+    spread: float = rule(4.0, "deviations of single windows by which most of them must differ; chosen", 2.0, 8.0)
+    sure: float = rule(0.03, "deviation of a window that stands for the lowest or highest value; chosen", 0.015, 0.06)
+    told: float = rule(0.3, "deviation of a log-ratio above which a window tells nothing of it; chosen", 0.15, 0.5)
+    coarse: float = rule(0.15, "of the power that chance puts elsewhere: little is told; chosen", 0.08, 0.3)
+    strange: float = rule(0.35, "of the power at other frequencies: another structure; chosen", 0.2, 0.6)
+
+
+@dataclass(frozen=True)
 class Rules:
     """The rules of every stage, in the order in which they decide."""
 
@@ -196,6 +209,7 @@ class Rules:
     verdict: VerdictRules = VerdictRules()
     report: ReportRules = ReportRules()
     component: ComponentRules = ComponentRules()
+    ambient: AmbientRules = AmbientRules()
 
     def constants(self) -> Iterator[tuple[str, Field[Any]]]:
         """Every number as the stage's name and its field."""

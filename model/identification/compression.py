@@ -54,7 +54,8 @@ class Compression:
         derivative an acceleration shows as a constant: the mean, which is left out anyway.
         """
         shown = np.where(kind == ACCELERATION, 2, np.where(kind == VELOCITY, 1, 0))
-        return np.maximum(self.integrated - shown, 0)
+        found: IntArray = np.maximum(self.integrated - shown, 0)
+        return found
 
     def trends(self, present: BoolArray) -> Tensor:
         """What the compressed signals may show of the motion that integration leaves open, (T, R, X)."""

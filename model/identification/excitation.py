@@ -95,7 +95,8 @@ def _drive_spectra(
     B, F = len(speeds), len(omega)
 
     def phases(count: int) -> np.ndarray:
-        return np.exp(2j * np.pi * rng.random((B, F, count)))
+        found: np.ndarray = np.exp(2j * np.pi * rng.random((B, F, count)))
+        return found
 
     wave = omega[None, :] / speeds[:, None]
     amplitude = np.sqrt(2 * track_spectrum(wave, 1.0) * level[:, None] / speeds[:, None] * step)

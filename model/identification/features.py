@@ -31,7 +31,8 @@ def magnitudes(signals: Tensor) -> Tensor:
 
     The upper half of the DFT of real signals repeats the lower and is left out.
     """
-    return torch.fft.rfft(signals, dim=1).abs().flatten(1)
+    found: Tensor = torch.fft.rfft(signals, dim=1).abs().flatten(1)
+    return found
 
 
 class ForceBalance:
@@ -136,4 +137,5 @@ def _spectrum_operator(samples: int, bins: IntArray) -> FloatArray:
     projection = np.eye(samples) - line @ np.linalg.pinv(line)
     hann = np.sin(np.pi * (np.arange(samples) + 0.5) / samples) ** 2
     phase = 2 * np.pi * np.outer(bins, np.arange(samples)) / samples
-    return np.concatenate([np.cos(phase), -np.sin(phase)]) * hann @ projection
+    found: FloatArray = np.concatenate([np.cos(phase), -np.sin(phase)]) * hann @ projection
+    return found

@@ -69,7 +69,8 @@ class FrequencyModel:
         output = self.sensing(values) @ torch.linalg.solve(self.stiffness(values), load)
         if self.element_sensors and len(s.supports):
             output[..., s.supports // 2] += self.element_response(values, s.G)
-        return output
+        found: Tensor = output
+        return found
 
     def drive_noise(self, *, usual: bool = False) -> FloatArray:
         """Noise of each drive per sample as its value's standard deviation over frequency, shape (F, W/2).

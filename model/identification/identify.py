@@ -213,7 +213,8 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     runs = simulate_runs(system, truth, system.window, np.random.default_rng(seed))
     refined = Refiner(system).refine(runs.values, truth)
     std = np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
-    return np.minimum(np.median(std, axis=0), PRIOR_STD)
+    found: FloatArray = np.minimum(np.median(std, axis=0), PRIOR_STD)
+    return found
 
 
 def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArray | None) -> Deviating | None:

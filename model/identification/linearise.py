@@ -220,7 +220,8 @@ class WindowModel:
         """Bins within the band of signals (B, T, ...), (B, F, ...)."""
         if signals.numel() == 0:  # no redundant sensor: a transform of nothing is an error
             return signals.new_zeros((len(signals), self.bins, *signals.shape[2:]), dtype=self.frequency.jw.dtype)
-        return torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
+        found: Tensor = torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
+        return found
 
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression.matrix(data.present).mT
@@ -262,7 +263,8 @@ class WindowModel:
         covariance = torch.eye(R, dtype=carried.dtype) + carried @ carried.mH
         factor = torch.linalg.cholesky(covariance)
         unit = torch.diag_embed(self.weight[:, None].expand(-1, R)).to(carried.dtype).expand_as(factor)
-        return torch.linalg.solve_triangular(factor, unit, upper=False)
+        found: Tensor = torch.linalg.solve_triangular(factor, unit, upper=False)
+        return found
 
     def _sensitivities(
         self,
@@ -323,7 +325,8 @@ def _inverse(stiffness: Tensor) -> Tensor:
     found, failed = torch.linalg.inv_ex(stiffness)
     if bool(failed.any()):
         found = torch.where((failed != 0)[..., None, None], torch.linalg.pinv(stiffness), found)
-    return found
+    result: Tensor = found
+    return result
 
 
 def as_rows(spectra: Tensor) -> Tensor:

@@ -124,6 +124,7 @@ class Parametrised:
     prior_cost: float = 0.0  # evidence by which the law must beat commoner ones
     named: bool = True  # whether it is physics with a name
     fault: bool = False  # whether it is one of the measurement, not of the system
+    nuisance: bool = False  # reported, and no reason for any verdict
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -190,8 +191,6 @@ class ElementLaw(Parametrised):
     memory_decay: Callable[[Values, SpringDamper], Any] | None = None
     # Deflection over which a memory turns, m: a simulation takes no longer steps; None: as the element's modes need
     turns_over: Callable[[Values], Any] | None = None
-    passive: bool = True  # k d + c v with the law creates no energy over a closed cycle
-    odd: bool = True  # force(-d, -v) = -force(d, v)
     # A law that is a linear element with memory: parameters and the element's damping -> its branch
     branch: Callable[[Values, float], Maxwell] | None = None
     # Force along a whole motion (T,), evenly sampled, quicker than step by step; None: as the memory's rate says
@@ -201,6 +200,7 @@ class ElementLaw(Parametrised):
     alike: Callable[[Values], tuple[tuple[float, ...], ...]] | None = None
     prior_cost: float = 0.0
     named: bool = True
+    nuisance: bool = False
     screened: bool = True  # sought in systems of bodies; else only where the force of its element is measured
     at: tuple[str, ...] = ()  # elements that it may act at; empty: all
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s

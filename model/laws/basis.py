@@ -84,8 +84,6 @@ def static_law(basis: _Basis, seen: Observed) -> StaticLaw:
         looks_like="a residual force that is a function of deflection and rate, of no named kind",
         confused_with=(),
         sentence="a force that no law of the catalogue explains",
-        passive=False,
-        odd=False,
         prior_cost=RARE + 2 * float(np.log(len(SMALL) + _OTHERS)),
         named=False,
         basis=basis,

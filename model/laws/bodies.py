@@ -21,7 +21,8 @@ def _beam(x: FloatArray, half_length: float) -> FloatArray:
     """First free bending mode of a uniform beam at x from its middle, 1 at the ends."""
     s = _BETA / 2 * np.asarray(x) / half_length
     b = _BETA / 2
-    return 0.5 * (np.cosh(s) / np.cosh(b) + np.cos(s) / np.cos(b))
+    found: FloatArray = 0.5 * (np.cosh(s) / np.cosh(b) + np.cos(s) / np.cos(b))
+    return found
 
 
 def _columns(mechanics: Mechanics, body: int) -> dict[str, int]:
@@ -49,9 +50,11 @@ def _mode_shape(mechanics: Mechanics, rows: FloatArray, body: int, variant: str)
         half = _OVERHANG * span_x
         return sign * _beam(x, half) / _beam(np.array(span_x), half)
     if variant == "second_bending":
-        return sign * x / span_x
+        found: FloatArray = sign * x / span_x
+        return found
     if variant == "torsion":
-        return sign * x * y / (span_x * span_y)
+        found: FloatArray = sign * x * y / (span_x * span_y)
+        return found
     return sign  # "local": all attachments of the body move together against it
 
 
@@ -140,7 +143,8 @@ def _driven(mechanics: Mechanics, body: int, p: Values, variant: str) -> Mechani
 
 def _sine(time: FloatArray, p: Values) -> FloatArray:
     amplitude, frequency, phase = p
-    return amplitude * np.sin(2 * np.pi * frequency * np.asarray(time) + phase)
+    found: FloatArray = amplitude * np.sin(2 * np.pi * frequency * np.asarray(time) + phase)
+    return found
 
 
 EXTERNAL_FORCE = BodyLaw(

@@ -56,4 +56,5 @@ def _filtered(signal: FloatArray, sample_rate: float, lag: float, delay: float, 
     s = 2j * np.pi * np.fft.rfftfreq(size, 1 / sample_rate)
     response = (np.exp(-s * delay) / (1 + s * lag)) ** power
     shifted = np.fft.irfft(np.fft.rfft(padded - trend, axis=-1) * response, size, axis=-1)
-    return (shifted + trend - power * slope * (delay + lag))[..., pad : pad + n]
+    found: FloatArray = (shifted + trend - power * slope * (delay + lag))[..., pad : pad + n]
+    return found

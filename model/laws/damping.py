@@ -12,7 +12,8 @@ from sprung.model.signals import FloatArray
 
 def _coulomb(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, smoothing = p
-    return force * np.tanh(motion.rate / smoothing)
+    found: FloatArray = force * np.tanh(motion.rate / smoothing)
+    return found
 
 
 def _coulomb_shapes(seen: Observed) -> FloatArray:
@@ -52,14 +53,16 @@ COULOMB_FRICTION = ElementLaw(
 def _blowoff(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     knee, ratio = p
     v = motion.rate
-    return (ratio - 1) * element.damping * (v - np.minimum(np.maximum(v, -knee), knee))
+    found: FloatArray = (ratio - 1) * element.damping * (v - np.minimum(np.maximum(v, -knee), knee))
+    return found
 
 
 def _two_knees(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     knee, ratio, knee_compression, ratio_compression = p
     v = motion.rate
     extension, compression = np.maximum(v - knee, 0.0), np.minimum(v + knee_compression, 0.0)
-    return element.damping * ((ratio - 1) * extension + (ratio_compression - 1) * compression)
+    found: FloatArray = element.damping * ((ratio - 1) * extension + (ratio_compression - 1) * compression)
+    return found
 
 
 def _knees(seen: Observed) -> FloatArray:
@@ -111,7 +114,6 @@ DAMPER_BLOWOFF = replace(
         ),
         strength=None,
         knees=(0, 2),
-        odd=False,
         prior_cost=RARE,
         screened=False,
     ),
@@ -134,7 +136,6 @@ DAMPER_ASYMMETRY = ElementLaw(
     looks_like="even harmonics and a shift of the mean deflection that grows with the rate",
     confused_with=("sensor_bias",),
     sentence="the damper is harder in one direction, a = {a} (positive: extension)",
-    odd=False,
 )
 
 

@@ -27,12 +27,14 @@ def _progress(time: FloatArray, tau: FloatArray) -> FloatArray:
 
 def _stiffness(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     change, tau = p
-    return element.stiffness * change * _progress(motion.time, tau) * motion.deflection
+    found: FloatArray = element.stiffness * change * _progress(motion.time, tau) * motion.deflection
+    return found
 
 
 def _damping(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     change, tau = p
-    return element.damping * change * _progress(motion.time, tau) * motion.rate
+    found: FloatArray = element.damping * change * _progress(motion.time, tau) * motion.rate
+    return found
 
 
 def _shapes(seen: Observed) -> FloatArray:
@@ -51,7 +53,6 @@ TIME_VARYING_STIFFNESS = ElementLaw(
     looks_like="a residual in phase with the deflection that changes sign once over the recording",
     confused_with=("time_varying_damping", "air_spring"),
     sentence="the stiffness changes by {p} (share of its first value) with a time constant of {tau}",
-    passive=False,
 )
 
 TIME_VARYING_DAMPING = ElementLaw(

@@ -61,7 +61,8 @@ def following_law(quantity: str, signal: Covariate, elements: tuple[str, ...] = 
     def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
         (slope,) = p
         along = motion.deflection if quantity == "stiffness" else motion.rate
-        return getattr(element, quantity) * slope * signal.above(motion.time) * along
+        found: FloatArray = getattr(element, quantity) * slope * signal.above(motion.time) * along
+        return found
 
     def typical(seen: Observed) -> float:
         return 0.1 / signal.size
@@ -77,6 +78,5 @@ def following_law(quantity: str, signal: Covariate, elements: tuple[str, ...] = 
         confused_with=(),
         sentence=f"its {quantity} changes by {{slope}} of itself with {signal.name}, from its value at "
         f"{signal.reference:.4g} {signal.unit}",
-        passive=False,
         at=elements,
     )

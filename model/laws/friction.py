@@ -38,7 +38,8 @@ _STIFFNESS = ParameterSpec(
 def _stribeck(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, static, fall, smoothing = p
     v = motion.rate
-    return np.tanh(v / smoothing) * (force + (static - force) * np.exp(-((v / fall) ** 2)))
+    found: FloatArray = np.tanh(v / smoothing) * (force + (static - force) * np.exp(-((v / fall) ** 2)))
+    return found
 
 
 STRIBECK = ElementLaw(
@@ -76,18 +77,21 @@ STRIBECK = ElementLaw(
 
 def _presliding_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (z,) = motion.memory
-    return p[-1] * z  # the stiffness comes last
+    found: FloatArray = p[-1] * z  # the stiffness comes last
+    return found
 
 
 def _dahl_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, stiffness = p
     (z,) = motion.memory
-    return (motion.rate - stiffness * np.abs(motion.rate) * z / force)[None]
+    found: FloatArray = (motion.rate - stiffness * np.abs(motion.rate) * z / force)[None]
+    return found
 
 
 def _dahl_path(motion: Motion, p: Values) -> FloatArray:
     force, stiffness = p
-    return force * presliding_path(motion.deflection, force / stiffness)
+    found: FloatArray = force * presliding_path(motion.deflection, force / stiffness)
+    return found
 
 
 DAHL = ElementLaw(
@@ -116,18 +120,21 @@ DAHL = ElementLaw(
 def _sliding(v: FloatArray, p: Values) -> FloatArray:
     """Friction of steady sliding at a rate, N."""
     force, static, fall, _ = p
-    return force + (static - force) * np.exp(-((v / fall) ** 2))
+    found: FloatArray = force + (static - force) * np.exp(-((v / fall) ** 2))
+    return found
 
 
 def _lugre_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (z,) = motion.memory
     v = motion.rate
-    return (v - p[3] * np.abs(v) * z / _sliding(v, p))[None]
+    found: FloatArray = (v - p[3] * np.abs(v) * z / _sliding(v, p))[None]
+    return found
 
 
 def _lugre_path(motion: Motion, p: Values) -> FloatArray:
     force, stiffness = p[0], p[3]
-    return force * presliding_path(motion.deflection, force / stiffness, _sliding(motion.rate, p) / force)
+    found: FloatArray = force * presliding_path(motion.deflection, force / stiffness, _sliding(motion.rate, p) / force)
+    return found
 
 
 LUGRE = ElementLaw(

@@ -16,7 +16,8 @@ def _size(seen: Observed) -> float:
 
 def _preload(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (force,) = p
-    return force + 0.0 * np.asarray(motion.deflection)
+    found: FloatArray = force + 0.0 * np.asarray(motion.deflection)
+    return found
 
 
 PRELOAD = ElementLaw(
@@ -30,7 +31,7 @@ PRELOAD = ElementLaw(
     looks_like="a constant force: gas, weight, or the setting of a rig; no fault",
     confused_with=("sensor_bias",),
     sentence="a static preload of {force}",
-    odd=False,
+    nuisance=True,
     screened=False,
 )
 
@@ -38,7 +39,8 @@ PRELOAD = ElementLaw(
 def _gas(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, length, exponent = p
     column = np.maximum(1 + motion.deflection / length, _SHORTEST)
-    return force * (1 - column**-exponent)
+    found: FloatArray = force * (1 - column**-exponent)
+    return found
 
 
 GAS_SPRING = ElementLaw(
@@ -64,7 +66,6 @@ GAS_SPRING = ElementLaw(
     looks_like="stiffer in compression than in extension, without a knee or a loop",
     confused_with=("cubic_stiffness", "bump_stop"),
     sentence="a gas spring of {force} at rest on a column of {length}",
-    odd=False,
     prior_cost=RARE,
     screened=False,
 )

@@ -30,13 +30,15 @@ _CORNERS = np.array([0.5, 1.2, 3.0, 6.0, 10.0, 16.0, 25.0, 40.0, 70.0])
 
 def _series_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (branch,) = motion.memory  # N, force of spring and damper in series
-    return branch - element.damping * motion.rate
+    found: FloatArray = branch - element.damping * motion.rate
+    return found
 
 
 def _series_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (ks,) = p
     (branch,) = motion.memory
-    return (ks * (motion.rate - branch / element.damping))[None]
+    found: FloatArray = (ks * (motion.rate - branch / element.damping))[None]
+    return found
 
 
 def _series_decay(p: Values, element: SpringDamper) -> FloatArray:
@@ -99,18 +101,21 @@ SERIES_STIFFNESS = ElementLaw(
 
 def _air_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (branch,) = motion.memory
-    return branch
+    found: FloatArray = branch
+    return found
 
 
 def _air_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     stiffness, tau = p
     (branch,) = motion.memory
-    return (stiffness * motion.rate - branch / tau)[None]
+    found: FloatArray = (stiffness * motion.rate - branch / tau)[None]
+    return found
 
 
 def _air_path(motion: Motion, p: Values) -> FloatArray:
     stiffness, tau = p
-    return stiffness * maxwell_path(motion.deflection, tau, float(motion.time[1] - motion.time[0]))
+    found: FloatArray = stiffness * maxwell_path(motion.deflection, tau, float(motion.time[1] - motion.time[0]))
+    return found
 
 
 def _air_decay(p: Values, element: SpringDamper) -> FloatArray:
@@ -147,7 +152,8 @@ AIR_SPRING = ElementLaw(
 def _bouc_wen_force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     alpha = p[0]
     (z,) = motion.memory
-    return alpha * z
+    found: FloatArray = alpha * z
+    return found
 
 
 def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
@@ -156,12 +162,14 @@ def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     (z,) = motion.memory
     v, size = motion.rate, np.abs(z)
     level = beta * size**n
-    return (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
+    found: FloatArray = (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
+    return found
 
 
 def _bouc_wen_path(motion: Motion, p: Values) -> FloatArray:
     alpha, beta, exponent, *gamma = p
-    return alpha * bouc_wen_memory(motion.deflection, beta, exponent, *gamma)
+    found: FloatArray = alpha * bouc_wen_memory(motion.deflection, beta, exponent, *gamma)
+    return found
 
 
 def _bouc_wen_shapes(seen: Observed) -> FloatArray:

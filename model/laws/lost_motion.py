@@ -35,7 +35,8 @@ def _backlash(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     _, gap, stiffness, *further = p
     inner = further[0] if further else 0.0
     (u,) = motion.memory
-    return inner * u + (stiffness - inner) * np.sign(u) * np.maximum(np.abs(u) - 0.5 * gap, 0.0)
+    found: FloatArray = inner * u + (stiffness - inner) * np.sign(u) * np.maximum(np.abs(u) - 0.5 * gap, 0.0)
+    return found
 
 
 def _backlash_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
@@ -43,7 +44,8 @@ def _backlash_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     v = motion.rate
     most, corner = _limits(p)
     slipping = np.minimum(np.maximum((np.abs(u) - most + corner) / corner, 0.0), 1.0)
-    return (v - slipping * 0.5 * (v + np.abs(v) * np.sign(u)))[None]
+    found: FloatArray = (v - slipping * 0.5 * (v + np.abs(v) * np.sign(u)))[None]
+    return found
 
 
 def _backlash_path(motion: Motion, p: Values) -> FloatArray:
@@ -105,13 +107,15 @@ FRICTION_BACKLASH = replace(
 def _pinched(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     force, reach, pinching, width = p
     (z,) = motion.memory
-    return force * z / reach * (1 - pinching * np.exp(-((motion.deflection / width) ** 2)))
+    found: FloatArray = force * z / reach * (1 - pinching * np.exp(-((motion.deflection / width) ** 2)))
+    return found
 
 
 def _pinched_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (z,) = motion.memory
     v = motion.rate
-    return (v - (np.abs(v) * z + GAMMA * v * np.abs(z)) / ((1 + GAMMA) * p[1]))[None]
+    found: FloatArray = (v - (np.abs(v) * z + GAMMA * v * np.abs(z)) / ((1 + GAMMA) * p[1]))[None]
+    return found
 
 
 def _pinched_path(motion: Motion, p: Values) -> FloatArray:

@@ -61,13 +61,16 @@ class _Side:
         self._way, self._back, self._along = _functions(exponent, a > 0)
 
     def way(self, u: float) -> float:
-        return self.unit * self._way(u / self.unit)
+        found: float = self.unit * self._way(u / self.unit)
+        return found
 
     def back(self, x: float) -> float:
-        return self.unit * self._back(x / self.unit)
+        found: float = self.unit * self._back(x / self.unit)
+        return found
 
     def along(self, x: FloatArray) -> FloatArray:
-        return self.unit * self._along(np.maximum(x, 0) / self.unit)
+        found: FloatArray = self.unit * self._along(np.maximum(x, 0) / self.unit)
+        return found
 
 
 @lru_cache(maxsize=64)

@@ -66,7 +66,8 @@ RAIL_JOINTS = _dip_law(
 
 def _bar(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (stiffness,) = p
-    return stiffness * motion.deflection
+    found: FloatArray = stiffness * motion.deflection
+    return found
 
 
 ANTI_ROLL_BAR = ElementLaw(

@@ -93,7 +93,8 @@ class Surface:
     def value(self, coefficients: FloatArray, d: FloatArray, v: FloatArray) -> FloatArray:
         """The surface at points of any shape."""
         table = coefficients.reshape(self.deflection.count, self.rate.count)
-        return np.sum((self.deflection.basis(d) @ table) * self.rate.basis(v), axis=-1)
+        found: FloatArray = np.sum((self.deflection.basis(d) @ table) * self.rate.basis(v), axis=-1)
+        return found
 
     @cached_property
     def free(self) -> FloatArray:
@@ -101,7 +102,8 @@ class Surface:
         d, v = self.motion
         step = max(1, len(d) // 20_000)
         rows = np.stack([np.ones(len(d[::step])), d[::step] / self.deflection.reach, v[::step] / self.rate.reach])
-        return scipy.linalg.null_space(rows @ self.forces(d[::step], v[::step]), rcond=1e-12)
+        found: FloatArray = scipy.linalg.null_space(rows @ self.forces(d[::step], v[::step]), rcond=1e-12)
+        return found
 
     @cached_property
     def roughness(self) -> tuple[FloatArray, FloatArray]:
@@ -129,7 +131,6 @@ class LatentForce:
     coefficients: FloatArray  # (count,)
     covariance: FloatArray  # (count, count)
     log_evidence: float  # against no force at all; above 0: the force is worth its freedom
-    smoothness: tuple[float, float, float]  # l_d, l_v, l_0, 1/N^2
     noise: float  # s, 1 when the whitening was right
 
     def force(self, d: FloatArray, v: FloatArray) -> FloatArray:
@@ -159,8 +160,6 @@ class LatentForce:
             looks_like="a residual that is a function of the element's deflection and rate, of no named kind",
             confused_with=(),
             sentence="a force that no law of the catalogue explains; its map is reported",
-            passive=False,
-            odd=False,
             named=False,
         )
 
@@ -217,7 +216,6 @@ def estimate_force(
         coefficients=surface.free @ mean,
         covariance=surface.free @ covariance @ surface.free.T,
         log_evidence=problem.log_evidence(weights, s),
-        smoothness=weights,
         noise=s,
     )
 

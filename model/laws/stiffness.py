@@ -14,7 +14,8 @@ def _typical_cubic(seen: Observed) -> float:
 
 def _cubic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (k3,) = p
-    return k3 * motion.deflection**3
+    found: FloatArray = k3 * motion.deflection**3
+    return found
 
 
 CUBIC_STIFFNESS = ElementLaw(
@@ -28,7 +29,6 @@ CUBIC_STIFFNESS = ElementLaw(
     looks_like="stiffness grows smoothly with amplitude; odd harmonics; no hysteresis",
     confused_with=("bump_stop", "clearance"),
     sentence="the spring stiffens with the cube of its deflection, k3 = {k3}",
-    passive=True,
 )
 
 

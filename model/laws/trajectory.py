@@ -107,7 +107,8 @@ class MemoryStep:
         self.f3 = h * (4 * three - two)
 
     def source(self, d: FloatArray, v: FloatArray, t: float | FloatArray, z: FloatArray) -> FloatArray:
-        return self.law.memory_rate(Motion(d, v, t, z), self.p, self.element) + self.decay * z
+        found: FloatArray = self.law.memory_rate(Motion(d, v, t, z), self.p, self.element) + self.decay * z
+        return found
 
 
 def _column(value: Any) -> Any:

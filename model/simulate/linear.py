@@ -281,4 +281,5 @@ def _scatter(system: System, quantity: str, index: dict[str, int], size: int, co
     for row, parameter in enumerate(system.parameters):
         if parameter.quantity == quantity:
             matrix[row, index[parameter.element]] = 1.0
-    return constant(matrix)
+    found: Tensor = constant(matrix)
+    return found

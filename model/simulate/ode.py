@@ -36,8 +36,10 @@ def solve(
     if adjoint:
         if not isinstance(rate, torch.nn.Module):
             raise TypeError("adjoint gradients need a torch module that owns the parameters")
-        return odeint_adjoint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
-    return odeint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
+        found: Tensor = odeint_adjoint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
+        return found
+    found: Tensor = odeint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
+    return found
 
 
 class HermiteDrive(torch.nn.Module):
@@ -71,4 +73,5 @@ class LinearRate(torch.nn.Module):
     def forward(self, time: Tensor, x: Tensor) -> Tensor:
         A, b_value, b_rate = self.simulator.continuous(self.simulator.element_values(self.log_ratio))
         value, rate = self.drive(time)
-        return (A @ x[:, :, None] + b_value @ value[:, :, None] + b_rate @ rate[:, :, None]).squeeze(2)
+        found: Tensor = (A @ x[:, :, None] + b_value @ value[:, :, None] + b_rate @ rate[:, :, None]).squeeze(2)
+        return found

@@ -212,7 +212,8 @@ def _unpack_all(packed: Mapping[str, str]) -> dict[str, Any]:
 
 def _pack(array: Any) -> str:
     kind = array.dtype.newbyteorder("<").str
-    return kind + ":" + base64.b64encode(array.astype(kind).tobytes()).decode("ascii")
+    found: str = kind + ":" + base64.b64encode(array.astype(kind).tobytes()).decode("ascii")
+    return found
 
 
 def _unpack(text: str) -> Any:

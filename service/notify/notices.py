@@ -109,7 +109,8 @@ class Notices:
             log.log(logging.ERROR if dead else logging.INFO, "%s to %s: %s", row.kind, row.target, line)
         with self._store.write() as connection:
             outbox.settle(connection, row.id, now, attempts=row.attempts + 1, **values)
-        return values["state"] == "delivered"
+        found: bool = values["state"] == "delivered"
+        return found
 
     def _accept(self, connection: Connection, event: dict[str, Any]) -> None:
         now = now_ns()

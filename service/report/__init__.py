@@ -41,7 +41,15 @@ def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Pat
 
 
 def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
-    """Writes report.html, report.json and the pictures into `folder`, which is made if absent."""
+    """Writes report.html, report.json and the pictures into `folder`, which is made if absent.
+
+    >>> import pathlib, sprung
+    >>> rig = sprung.load_system("rig.yaml")
+    >>> report = sprung.diagnose(rig, sprung.load_record("rig.csv", rig))
+    >>> files = sprung.write_report(report, rig, pathlib.Path("report"))
+    >>> files.page.name, "fit" in files.pictures
+    ('report.html', True)
+    """
     folder.mkdir(parents=True, exist_ok=True)
     pictures = draw_pictures(report, system, folder)
     page, data = folder / "report.html", folder / "report.json"

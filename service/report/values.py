@@ -34,7 +34,8 @@ class Row:
         """The two readings differ by more than three of their standard deviations."""
         if self.after is None or self.after_std is None:
             return False
-        return abs(self.before - self.after) > 3 * np.hypot(self.before_std, self.after_std)
+        found: bool = abs(self.before - self.after) > 3 * np.hypot(self.before_std, self.after_std)
+        return found
 
 
 def rows(report: Report) -> list[Row]:
@@ -55,8 +56,8 @@ def largest_bias(report: Report) -> Row | None:
 
 
 def parameter_figure(report: Report) -> Figure | None:
-    """Ratio to nominal of every parameter, before and after, one panel per quantity."""
-    every = rows(report)
+    """Ratio to nominal of every parameter that has one, before and after, one panel per quantity."""
+    every = [row for row in rows(report) if row.nominal]
     if not every:
         return None
     quantities = list(dict.fromkeys(r.name.rpartition(".")[2] for r in every))

@@ -21,6 +21,7 @@ class Obedient:
     """A subject whose verdict follows one number."""
 
     name = "made"
+    reads = ""
     said = RUBBING
     state = object()
 

@@ -5,78 +5,28 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicHermiteSpline
 
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.law_point import WindowPoint
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
-from sprung.model.system import System, parse_system
+from tests.strut import RATE, recorded, road, strut
 
-RATE = 200.0
-NOISE = [1e-5, 5e-4, 0.03, 0.01, 2.0]
-TEXT = """
-name: quarter-car
-sample_rate: 200
-window: 200
-bodies:
-  wheel: {{mass: 45}}
-  car: {{mass: 400}}
-inputs:
-  road:
-    kind: displacement
-    displacement: {{csv: road, noise: 1.0e-5}}
-    velocity: {{csv: rate, noise: 5.0e-4}}
-elements:
-  tyre: {{upper: wheel, lower: road, stiffness: 200000, damping: {{value: 50, fixed: true}}}}
-  strut: {{upper: car, lower: wheel, stiffness: 20000, damping: 1500, laws: [{law}]}}
-sensors:
-  wheel_a: {{kind: acceleration, body: wheel, csv: a, noise: 0.03}}
-  car_a: {{kind: acceleration, body: car, csv: b, noise: 0.01}}
-  strut_f: {{kind: force, element: strut, csv: f, noise: 2.0}}
-"""
 BOUC_WEN = "{bouc_wen: {alpha: 14000, beta: {value: 150, fixed: true}, n: {value: 1, fixed: true}}}"
 SERIES = "{series_stiffness: {ks: 60000}}"
 STOP = "{bump_stop: {gap: 0.004, stiffness: 30000}}"
 
 
-def system(law: str) -> System:
-    return parse_system(TEXT.format(law=law))
-
-
-def road(seconds: float, seed: int) -> tuple[np.ndarray, CubicHermiteSpline]:
-    rng = np.random.default_rng(seed)
-    t = np.arange(round(seconds * RATE) + 1) / RATE
-    f, phase = rng.uniform(0.4, 25, 120), rng.uniform(0, 6.3, 120)
-    height = (8e-3 / f / 4 * np.sin(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
-    speed = (8e-3 / 2 * np.pi * np.cos(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)
-    return t, CubicHermiteSpline(t, height, speed)
-
-
 @pytest.fixture(scope="module")
 def hysteretic() -> np.ndarray:
-    """Windows of a strut with 22 kN/m, 1.4 kN s/m and a Bouc-Wen part of 12 kN/m, beta 150, n 1, with noise."""
-    t, u = road(11.0, 5)
-    rate = u.derivative()
-
-    def slope(time: float, x: np.ndarray) -> list[float]:
-        v = x[3] - x[2]
-        pull = 22e3 * (x[1] - x[0]) + 1400 * v + 12e3 * x[4]
-        tyre = 2e5 * (x[0] - u(time)) + 50 * (x[2] - rate(time))
-        return [x[2], x[3], (pull - tyre) / 45, -pull / 400, v - 150 * (abs(v) * x[4] + 0.5 * v * abs(x[4]))]
-
-    x = solve_ivp(slope, (0, t[-1]), np.zeros(5), t_eval=t, rtol=1e-7, atol=1e-10, max_step=1 / RATE).y
-    pull = 22e3 * (x[1] - x[0]) + 1400 * (x[3] - x[2]) + 12e3 * x[4]
-    tyre = 2e5 * (x[0] - u(t)) + 50 * (x[2] - rate(t))
-    clean = np.stack([u(t), rate(t), (pull - tyre) / 45, -pull / 400, pull], axis=1)
-    noisy = clean + np.random.default_rng(6).normal(0, NOISE, clean.shape)
-    return np.stack([noisy[i : i + 200] for i in range(200, 2001, 150)])
+    """Windows of a strut with a Bouc-Wen part of 12 kN/m, beta 150, n 1, with noise."""
+    values = recorded(11.0, 5, lambda v, z: 12e3 * z, lambda v, z: v - 150 * (abs(v) * z + 0.5 * v * abs(z)))
+    return np.stack([values[i : i + 200] for i in range(200, 1951, 150)])
 
 
 def test_a_hysteretic_part_and_its_element_are_found_with_honest_deviations(hysteretic: np.ndarray) -> None:
-    vehicle = system(BOUC_WEN)
+    vehicle = strut(BOUC_WEN)
     truth = np.log([1.0, 22 / 20, 14 / 15, 12 / 14])
     estimates = load_identifier(vehicle).identify(hysteretic)
     assert [p.name for p in vehicle.tracked][-1] == "strut.bouc_wen.alpha"
@@ -91,7 +41,7 @@ def test_a_hysteretic_part_and_its_element_are_found_with_honest_deviations(hyst
 
 @pytest.mark.parametrize("law", [BOUC_WEN, SERIES, STOP])
 def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
-    vehicle = system(law)
+    vehicle = strut(law)
     bare, acting = without_laws(vehicle), acting_laws(vehicle)
     model = LawWindows(bare, acting, WindowModel(bare, 200))
     _, u = road(2.0, 8)

@@ -20,6 +20,8 @@ SPRING = SpringDamper(4.3e5, 2.0e4)
 RATE = 1000.0
 LAWS = tuple(law for law in CATALOGUE if isinstance(law, ElementLaw))
 ids = [law.name for law in LAWS]
+ONE_SIDED = {"damper_asymmetry", "gas_spring", "preload"}  # whose force backwards is not the opposite
+FEEDING = {"time_varying_stiffness"}  # a spring that stiffens while it is compressed gives more than it took
 
 
 def cycle(amplitude=0.004, frequency=1.25, seconds=8.0, rate=RATE):
@@ -88,12 +90,12 @@ def test_symmetry_is_as_declared(law):
     p = tuple(trial(law))
     there = along(law, p, d, v, sample_rate=RATE, element=SPRING)
     back = along(law, p, -d, -v, sample_rate=RATE, element=SPRING)
-    assert np.allclose(back, -there, rtol=1e-9, atol=1e-6) == law.odd
+    assert np.allclose(back, -there, rtol=1e-9, atol=1e-6) == (law.name not in ONE_SIDED)
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
 def test_a_passive_element_creates_no_energy_over_a_cycle(law):
-    if not law.passive:
+    if law.name in FEEDING:
         pytest.skip("feeds energy by nature")
     for amplitude in (0.0005, 0.004, 0.02):
         d, v, _ = cycle(amplitude, seconds=2.4)

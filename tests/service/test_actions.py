@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,32 +13,10 @@ from mcap.reader import make_reader
 from sqlalchemy import select
 
 from sprung.model.system import System, parse_system
-from sprung.service.api.app import create_app
-from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
+from sprung.service.core import Core
 from sprung.service.pages.drawing import Mark, plan_view, side_view
-from sprung.service.settings import Settings
 from sprung.service.store.schema import audit, metadata
 from tests.service_fakes import make_window
-
-
-@pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path), engine)
-
-
-@pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
-
-
-@pytest.fixture
-def broken(client: TestClient, core: Core, system: System) -> str:
-    """A vehicle whose parameters have all grown by a third."""
-    core.pipeline.process("a", [make_window(system, i) for i in range(80)])
-    core.pipeline.process("a", [make_window(system, 80 + i, 0.3) for i in range(60)])
-    return "a"
 
 
 def deeds(core: Core) -> list[str]:

@@ -28,12 +28,6 @@ def core(engine: Engine, tmp_path: Path) -> Core:
 
 
 @pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
-
-
-@pytest.fixture
 def body(system: System) -> dict[str, Any]:
     channels = {channel.name: [0.01] * system.window for channel in system.channels}
     return {"vehicle": "demo-0001", "sample_rate": 100.0, "channels": channels}

@@ -6,57 +6,30 @@ import hashlib
 import json
 import shutil
 import subprocess
-import threading
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-import uvicorn
 from fastapi.testclient import TestClient
 
 from sprung.client import ApiError, Client
 from sprung.model.system import System
-from sprung.service.api.app import create_app
-from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
+from sprung.service.core import Core
 from sprung.service.pages.render import STATIC
-from sprung.service.settings import Settings
-from tests.service_fakes import make_window
+from tests.served import served, worsen
 
 NO_JSON = {"/metrics", "/events", "/vehicles/{id}/bundle", "/reports/{id}/page", "/reports/{id}/system"}
 EMPTY = {("/vehicles/{id}", "delete")}
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path), engine)
-
-
-@pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
-
-
-@pytest.fixture
-def served(core: Core, system: System) -> Iterator[str]:
-    """The address of a running service with one alarmed vehicle."""
-    server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        thread.join(0.05)
-    feed(core, system)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    server.should_exit = True
-    thread.join(20)
-
-
-def feed(core: Core, system: System) -> None:
-    core.pipeline.process("a", [make_window(system, i) for i in range(80)])
-    core.pipeline.process("a", [make_window(system, 80 + i, 0.3) for i in range(60)])
+def address(core: Core, system: System) -> Iterator[str]:
+    """That of a running service with one alarmed vehicle."""
+    with served(core) as port:
+        worsen(core, system)
+        yield f"http://127.0.0.1:{port}"
 
 
 def test_every_answer_has_a_model_and_every_error_is_a_problem(client: TestClient) -> None:
@@ -96,7 +69,7 @@ def test_every_answer_has_a_model_and_every_error_is_a_problem(client: TestClien
     ],
 )
 def test_real_answers_fit_their_models(client: TestClient, core: Core, system: System, path: str) -> None:
-    feed(core, system)
+    worsen(core, system)
     answer = client.get(path)
     assert answer.status_code == 200, answer.text
     route, _ = path.split("?", maxsplit=1)[0], None
@@ -125,8 +98,8 @@ def core_routes(client: TestClient) -> list[Any]:
     return found
 
 
-def test_the_typed_client_reads_and_acts(served: str, system: System) -> None:
-    client = Client(served)
+def test_the_typed_client_reads_and_acts(address: str, system: System) -> None:
+    client = Client(address)
     assert [line.vehicle for line in client.vehicles(sort="urgency", silent=False)] == ["a"]
     vehicle = client.vehicle("a")
     assert vehicle.health == "out_of_specification" and len(vehicle.parameters) == len(system.parameters)
@@ -142,18 +115,18 @@ def test_the_typed_client_reads_and_acts(served: str, system: System) -> None:
     assert refused.value.status == 404 and "nobody" in refused.value.problem.detail
 
 
-def test_the_typed_client_uploads(served: str, tmp_path: Path) -> None:
-    client = Client(served)
+def test_the_typed_client_uploads(address: str, tmp_path: Path) -> None:
+    client = Client(address)
     (tmp_path / "ride.csv").write_text("time,a\n0,1\n0.01,2\n")
     job = client.upload(tmp_path / "ride.csv", vehicle="b")
     assert client.wait(job.id, 60).state in ("done", "failed")
 
 
 @pytest.mark.skipif(shutil.which("openapi-python-client") is None, reason="needs openapi-python-client")
-def test_a_generated_client_reads_a_vehicle(served: str, tmp_path: Path) -> None:
+def test_a_generated_client_reads_a_vehicle(address: str, tmp_path: Path) -> None:
     tool = shutil.which("openapi-python-client")
     assert tool is not None
-    with urllib.request.urlopen(f"{served}/openapi.json") as answer:
+    with urllib.request.urlopen(f"{address}/openapi.json") as answer:
         (tmp_path / "openapi.json").write_bytes(answer.read())
     command = [tool, "generate", "--path", "openapi.json", "--meta", "none", "--output-path", "made"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -161,7 +134,7 @@ def test_a_generated_client_reads_a_vehicle(served: str, tmp_path: Path) -> None
     script = (
         "from made import Client; from made.models import Vehicle; import importlib, pkgutil, made.api.vehicles as v\n"
         "name = next(m.name for m in pkgutil.iter_modules(v.__path__) if m.name.startswith('vehicle_vehicles_id'))\n"
-        f"got = importlib.import_module(f'made.api.vehicles.{{name}}').sync('a', client=Client('{served}'))\n"
+        f"got = importlib.import_module(f'made.api.vehicles.{{name}}').sync('a', client=Client('{address}'))\n"
         "assert isinstance(got, Vehicle), got\n"
         "print(got.health, len(got.parameters))"
     )

@@ -5,44 +5,32 @@ from __future__ import annotations
 import csv
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import can
 import cantools
-import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, parse_system
+from sprung.model.system import MANCHESTER, MANCHESTER_DBC, parse_system
 from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
 from sprung.service.compute import Compute
 from sprung.service.core import Core, build_core
-from sprung.service.diagnosing import load_excerpt, save_excerpt
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
 from sprung.service.feed import feed_file, prefetched, vehicle_of
 from sprung.service.live import LiveFeed
 from sprung.service.main import Feeds, live_feed
 from sprung.service.pipeline import Pipeline
-from sprung.service.ring import Excerpt, Ring, Rings
 from sprung.service.settings import Settings
 from sprung.service.store import open_store, work
 from sprung.service.store.work import JobRow
-from tests.service_fakes import HOP, START, FakeIdentifier, diagnose, make_window
+from tests.service_fakes import START, FakeIdentifier, diagnose, eventually, make_window
 
 SECONDS = 5
-
-
-def eventually(check: Callable[[], Any], seconds: float = 20.0) -> Any:
-    """The first true value of `check`; fails after a while."""
-    deadline = time.monotonic() + seconds
-    while not (found := check()):
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.02)
-    return found
 
 
 @pytest.fixture
@@ -274,49 +262,6 @@ def test_the_vehicle_is_as_the_user_says_else_as_recorded_else_the_file(
     named: str | None, recorded: str | None, file: str, vehicle: str
 ) -> None:
     assert vehicle_of(named, recorded, file) == vehicle
-
-
-def test_a_ring_holds_the_last_samples_in_order(system: System) -> None:
-    ring = Ring(300, len(system.channels), 100.0)
-    assert ring.excerpt() is None
-    for number in range(20):
-        ring.add(make_window(system, number, level=float(number)))
-    excerpt = ring.excerpt()
-    assert excerpt is not None
-    assert excerpt.values.shape == (300, len(system.channels))
-    assert excerpt.start == START + 19 * HOP + 10**9 - 3 * 10**9
-    np.testing.assert_array_equal(np.unique(excerpt.values), [15, 16, 17, 18, 19])
-    assert (np.diff(excerpt.values[:, 0]) >= 0).all()
-
-
-def test_a_ring_does_not_pass_off_old_samples_as_new(system: System) -> None:
-    ring = Ring(400, len(system.channels), 100.0)
-    ring.add(make_window(system, 0, level=1.0))
-    ring.add(make_window(system, 5, level=2.0))  # 1.5 s are missing between them
-    excerpt = ring.excerpt()
-    assert excerpt is not None
-    assert len(excerpt.values) == 350
-    assert np.isnan(excerpt.values[100:250]).all()
-    ring.add(make_window(system, 500, level=3.0))
-    after = ring.excerpt()
-    assert after is not None and len(after.values) == 100 and (after.values == 3.0).all()
-
-
-def test_rings_forget_the_vehicle_heard_from_longest_ago(system: System) -> None:
-    rings = Rings(2, 1.0, len(system.channels), 100.0)
-    for vehicle in ("a", "b", "a", "c"):
-        rings.add(vehicle, [make_window(system, 0)])
-    assert rings.excerpt("b") is None
-    assert rings.excerpt("a") is not None and rings.excerpt("c") is not None
-
-
-def test_an_excerpt_comes_back_as_it_was_saved(tmp_path: Path) -> None:
-    values = np.random.default_rng(1).normal(size=(50, 3))
-    values[10:12, 1] = np.nan
-    save_excerpt(tmp_path / "new" / "x.npz", Excerpt(START, 100.0, values))
-    record = load_excerpt(tmp_path / "new" / "x.npz")
-    np.testing.assert_array_equal(record.values, values)
-    assert (record.start, record.sample_rate, record.lost) == (START, 100.0, 2)
 
 
 def test_an_upload_is_diagnosed_and_the_report_kept(client: TestClient, recording: Path) -> None:

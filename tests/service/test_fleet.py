@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -28,12 +27,6 @@ from tests.service_fakes import FakeIdentifier, make_window
 @pytest.fixture
 def core(engine: Engine, tmp_path: Path) -> Core:
     return build_core(Settings(data_dir=tmp_path, vehicles_in_memory=3), engine)
-
-
-@pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
 
 
 def feed(core: Core, system: System, vehicle: str, windows: int, level: float = 0.0, first: int = 0) -> None:

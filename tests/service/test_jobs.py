@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +20,7 @@ from sprung.service.jobs import Jobs, Kind, Progress
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
 from sprung.service.store.work import JobRow
-from tests.service_fakes import diagnose
-
-
-def eventually(check: Callable[[], Any], seconds: float = 30.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (found := check()):
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.02)
-    return found
+from tests.service_fakes import diagnose, eventually
 
 
 def stored(store: Store, job_id: str) -> JobRow:

@@ -26,15 +26,7 @@ from sprung.service.engine import Engine
 from sprung.service.live import LiveFeed
 from sprung.service.main import live_feed
 from sprung.service.settings import Settings
-from tests.service_fakes import START, FakeIdentifier
-
-
-def eventually(check: Callable[[], Any], seconds: float = 20.0) -> Any:
-    deadline = time.monotonic() + seconds
-    while not (found := check()):
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.02)
-    return found
+from tests.service_fakes import START, FakeIdentifier, eventually
 
 
 class RowSource:

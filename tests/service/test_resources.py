@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import sqlite3
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
-from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
@@ -24,12 +22,6 @@ def core(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cor
     monkeypatch.setattr("sprung.service.condition.FRESH_SECONDS", 0.0)
     monkeypatch.setattr("sprung.service.store.engine.PROBE_SECONDS", 0.2)
     return build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
-
-
-@pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
 
 
 def test_a_store_that_another_process_locks_is_not_ready_and_comes_back(client: TestClient, tmp_path: Path) -> None:

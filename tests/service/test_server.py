@@ -9,7 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +17,12 @@ import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.system import System
-from sprung.service.api.app import create_app
 from sprung.service.api.bodies import read_window
 from sprung.service.api.problems import ApiProblem
-from sprung.service.api.server import make_server
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
-
-
-@contextmanager
-def served(core: Core) -> Iterator[int]:
-    """The port of a real server."""
-    server = make_server(create_app(core), core.settings, core.stopping.set)
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]}, daemon=True)
-        thread.start()
-        deadline = time.monotonic() + 30
-        while not server.started:
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-        yield listening.getsockname()[1]
-        server.should_exit = True
-        thread.join(20)
+from tests.served import served
 
 
 def ask(port: int, path: str = "/health/live", seconds: float = 10.0) -> bytes:
@@ -202,12 +185,6 @@ def test_numbers_beyond_those_of_the_store_are_wrong_and_no_fault_of_ours(client
 @pytest.fixture
 def core(engine: Engine, tmp_path: Path) -> Core:
     return build_core(settings(tmp_path, max_uploads_bytes=50_000), engine)
-
-
-@pytest.fixture
-def client(core: Core) -> Iterator[TestClient]:
-    with TestClient(create_app(core), raise_server_exceptions=False) as running:
-        yield running
 
 
 @pytest.fixture

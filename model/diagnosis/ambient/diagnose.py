@@ -32,18 +32,12 @@ from sprung.model.diagnosis.report.report import (
     TrackPoint,
     Unexplained,
 )
+from sprung.model.diagnosis.rules import RULES, AmbientRules
 from sprung.model.identifier import PRIOR_STD
+from sprung.model.laws.basis import UNKNOWN
 from sprung.model.mechanics import Mode
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
-
-ALPHA = 1e-4  # chance of windows that only scatter being told apart
-VARIES = 0.02  # change of a parameter's logarithm (a hundredth of a frequency) from which it is worth a word
-SPREAD = 4.0  # deviations of single windows by which most of them must differ
-SURE = 0.03  # deviation below which a window may stand for the lowest or highest value
-TOLD = 0.3  # deviation of a log-ratio above which a window tells nothing of it
-COARSE = 0.15  # share of power that chance alone puts elsewhere, above which little is told
-STRANGE = 0.35  # share of power at other frequencies from which the structure is another one
 
 
 @dataclass(frozen=True)
@@ -72,7 +66,7 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
     tell(0.6, "what all windows say together")
     split = signals.start + options.train_share * signals.samples / signals.sample_rate
     first = [w for w in windows if w.end <= split] or windows
-    pooled = pool(first if len(first) > 2 else windows)
+    pooled = pool(first if len(first) > 2 else windows, options.rules.ambient)
     held = [w for w in windows if w.begin >= split - 1e-9]
     notes = [note] if note else []
     if not held:
@@ -88,7 +82,7 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
     return replace(report, advice=(*prepared.notes, *notes, *report.advice))
 
 
-def pool(windows: list[WindowResult]) -> Pooled:
+def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Pooled:
     """Weighted means over windows, and which parameters differ between them."""
     theta = np.array([w.log_ratio for w in windows])
     sigma = np.sqrt(np.array([np.diag(w.covariance) for w in windows]))
@@ -97,7 +91,7 @@ def pool(windows: list[WindowResult]) -> Pooled:
     varying, chance = np.zeros(P, dtype=bool), np.ones(P)
     apart = independent(windows)
     for p in range(P):
-        tells = sigma[:, p] < TOLD
+        tells = sigma[:, p] < rules.told
         if not tells.any():
             continue
         value, std = theta[tells, p], sigma[tells, p]
@@ -108,7 +102,7 @@ def pool(windows: list[WindowResult]) -> Pooled:
             scatter = float(np.sum(((own - centre) / own_std) ** 2))
             chance[p] = float(chi2.sf(scatter, one.sum() - 1))
             wide = np.subtract(*np.quantile(own, [0.85, 0.15]))
-            varying[p] = chance[p] < ALPHA and wide > max(VARIES, SPREAD * float(np.median(own_std)))
+            varying[p] = chance[p] < rules.alpha and wide > max(rules.varies, rules.spread * float(np.median(own_std)))
         mean[p] = float(np.median(value)) if varying[p] else float(np.sum(value / std**2) / np.sum(1 / std**2))
         number = max(1, int(one.sum()))
         inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows tell the same thing twice
@@ -135,11 +129,12 @@ def _report(
     band: tuple[float, float],
 ) -> Report:
     names = prepared.signals.sensor_names
-    findings = _findings(system, prepared, windows, pooled)
-    verdict = verdict_of([f.effect for f in findings], errors)
-    left = errors.unexplained()
+    rules = options.rules.ambient
+    findings = _findings(system, prepared, windows, pooled, rules)
+    verdict = verdict_of([f.effect for f in findings], errors, options.rules.verdict)
+    left = errors.unexplained(options.rules.verdict)
     adequate = float(np.mean([w.adequate for w in windows]))
-    strange = verdict == "unknown_physics" and float(np.mean(errors.after**2)) > STRANGE
+    strange = verdict == "unknown_physics" and float(np.mean(errors.after**2)) > rules.strange
     where = ""
     if np.any(left > 0):
         worst = int(np.argmax(left))
@@ -149,11 +144,9 @@ def _report(
         )
     if verdict == "unknown_physics":
         place = names[int(np.argmax(errors.after))]
-        findings.insert(
-            0, Finding(place, "unknown", (), None, None, sentence=f"a misfit that no law explains: {where}")
-        )
+        findings.insert(0, Finding(place, UNKNOWN, (), None, None, sentence=f"a misfit that no law explains: {where}"))
     track = tuple(_point(system, window) for window in windows)
-    share = errors.explained() if any(f.effect != "unknown" for f in findings) else None
+    share = errors.explained() if any(f.effect != UNKNOWN for f in findings) else None
     values = tuple(
         ReportedParameter(p.name, value, value * float(s), p.nominal, p.unit)
         for p, value, s in zip(
@@ -179,21 +172,23 @@ def _report(
         explained=share,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
         summary=_summary(system, verdict, findings, track, where),
-        advice=tuple(_advice(system, pooled, errors, adequate, strange)),
+        advice=tuple(_advice(system, pooled, errors, adequate, strange, rules)),
         track=track,
         evidence=_arrays(track),
     )
 
 
-def _findings(system: System, prepared: Prepared, windows: list[WindowResult], pooled: Pooled) -> list[Finding]:
+def _findings(
+    system: System, prepared: Prepared, windows: list[WindowResult], pooled: Pooled, rules: AmbientRules
+) -> list[Finding]:
     found = [
         Finding(name, "sensor_stuck", (), None, None, sentence=f"{name}: repeats one value from {at:.2f} s on")
         for name, at in prepared.stuck
     ]
     for p in np.flatnonzero(pooled.varying):
         parameter = system.parameters[int(p)]
-        sure = [w for w in windows if w.covariance[p, p] < TOLD**2]
-        sure = [w for w in sure if w.adequate and w.covariance[p, p] < SURE**2] or sure
+        sure = [w for w in windows if w.covariance[p, p] < rules.told**2]
+        sure = [w for w in sure if w.adequate and w.covariance[p, p] < rules.sure**2] or sure
         ends = [min(sure, key=lambda w: w.log_ratio[p]), max(sure, key=lambda w: w.log_ratio[p])]
         low, high = (
             LawParameter(
@@ -250,7 +245,9 @@ def _summary(system: System, verdict: str, findings: list[Finding], track: tuple
     return f"{text}; {lowest}."
 
 
-def _advice(system: System, pooled: Pooled, errors: HeldOutErrors, adequate: float, strange: bool) -> list[str]:
+def _advice(
+    system: System, pooled: Pooled, errors: HeldOutErrors, adequate: float, strange: bool, rules: AmbientRules
+) -> list[str]:
     words = []
     if strange:
         words.append(
@@ -260,9 +257,9 @@ def _advice(system: System, pooled: Pooled, errors: HeldOutErrors, adequate: flo
         )
     if adequate < 0.5:
         words.append(f"only {100 * adequate:.0f} % of the windows are explained down to chance")
-    if float(np.mean(errors.floor**2)) > COARSE:
+    if float(np.mean(errors.floor**2)) > rules.coarse:
         words.append("so few windows would hardly show a wrong structure: record longer")
-    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > TOLD]
+    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.told]
     if loose:
         words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows tell more")
     return words

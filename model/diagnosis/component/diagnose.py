@@ -113,7 +113,8 @@ def _turned(task: ComponentTask) -> bool:
     force = task.force[: task.split]
     solved = np.linalg.lstsq(columns, force, rcond=None)[0]
     with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
-    return sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(*with_sign, 0.0)
+    found: bool = sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(*with_sign, 0.0)
+    return found
 
 
 def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:

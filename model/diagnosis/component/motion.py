@@ -143,4 +143,5 @@ def _wiener(spectrum: ComplexArray, noise: float) -> FloatArray:
     passed = np.clip(1 - level / np.maximum(smooth, 1e-300), 0.0, 1.0)
     out = np.flatnonzero(smooth > _STANDS_OUT * level)
     passed[(out[-1] + 1 if len(out) else 1) :] = 0.0
-    return passed
+    found: FloatArray = passed
+    return found

@@ -8,20 +8,24 @@ The strengths and k, c, preload follow by linear least squares for any shapes (v
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
+from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
+from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.following import Covariate
 from sprung.model.laws.paths import stop_path
 from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
 Shape = Sequence[float]
+Kind = Literal["static", "friction", "hysteresis", "linear"]
 
 _UNIT = SpringDamper(1.0, 1.0)
 
@@ -50,7 +54,21 @@ class Seen:
         return reversal_step(motion.rate)
 
 
+@dataclass(frozen=True)
+class FittedPiece:
+    """What a piece came to in a fit, for the question whether it can be so."""
+
+    values: Mapping[str, float]  # of the law's parameters
+    strengths: FloatArray
+    shape: Shape
+    element: SpringDamper
+    deflection: FloatArray  # m, (T,)
+    corner: float  # the rate that one sample passes at a reversal, m/s: a knee below it is not resolved
+    rules: ComponentRules
+
+
 Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
+Believed = Callable[[FittedPiece], bool]
 Named = Callable[[FloatArray, Shape, SpringDamper], Values]
 
 
@@ -66,12 +84,16 @@ class Piece:
     parameters: Parameters  # the law's, of strengths, shapes and the element; its force is linear in the strengths
     shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # shapes of the law's parameters
     quoted: Named = lambda a, s, e: {}
-    kind: str = (
-        "static"  # "static", "friction", "hysteresis" or "linear": look-alikes within a kind are told apart last
-    )
+    kind: Kind = "static"  # look-alikes within a kind are told apart last
     plain: int = 0  # prior cost: how many commoner laws it contains
     acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
     acting_parameters: Parameters | None = None
+    believed: Believed = lambda fitted: True  # whether the record can have shown these values
+
+    @property
+    def dissipates(self) -> bool:
+        """Whether its force over deflection is a loop whatever the rate."""
+        return self.kind in ("friction", "hysteresis")
 
     @property
     def effect(self) -> str:
@@ -128,8 +150,16 @@ class Following:
         return f"{self.piece.key} {self.signal.name}"
 
     @property
-    def kind(self) -> str:
+    def kind(self) -> Kind:
         return self.piece.kind
+
+    @property
+    def dissipates(self) -> bool:
+        return self.piece.dissipates
+
+    @property
+    def believed(self) -> Believed:
+        return self.piece.believed
 
     @property
     def plain(self) -> int:
@@ -179,10 +209,12 @@ class Following:
 class SliderSurface:
     """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
 
-    effect: str = "unknown"
+    effect: str = UNKNOWN
     title: str = "a force that no law explains"
-    key: str = "unknown"
-    kind: str = "static"
+    key: str = UNKNOWN
+    kind: Kind = "static"
+    dissipates: bool = False
+    believed: Believed = lambda fitted: True
     plain: int = 0
     shapes: tuple[str, ...] = ()
 

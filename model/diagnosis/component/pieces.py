@@ -9,9 +9,19 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece, Seen, Shape, Values, rates_at
+from sprung.model.diagnosis.component.piece import (
+    FittedPiece,
+    Following,
+    LawPiece,
+    Piece,
+    Seen,
+    Shape,
+    Values,
+    rates_at,
+)
 from sprung.model.laws import ElementLaw, SpringDamper, find_law, grid
 from sprung.model.laws.following import Covariate, following_law
+from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA
 from sprung.model.signals import FloatArray
 
@@ -34,6 +44,30 @@ def _none(seen: Seen) -> FloatArray:
 
 def _damping(element: SpringDamper) -> float:
     return max(float(element.damping), 1e-300)
+
+
+def _opens_late_enough(fitted: FittedPiece) -> bool:
+    """A valve: less force beyond the knee, and knees that the sampling resolves."""
+    ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
+    knees = [fitted.values[name] for name in ("knee", "knee_compression") if name in fitted.values]
+    return all(-0.02 <= r < 0.98 for r in ratios) and all(k > fitted.corner for k in knees)
+
+
+def _slips(fitted: FittedPiece) -> bool:
+    """What never slips is a spring with a gap."""
+    gap, reach = fitted.shape
+    u = np.abs(stop_path(fitted.deflection, 0.5 * gap + reach))
+    return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > fitted.rules.slips)
+
+
+def _loose_within(fitted: FittedPiece) -> bool:
+    """No force in the gap."""
+    return bool(abs(fitted.strengths[0] / max(fitted.element.stiffness, 1e-300) - 1) < fitted.rules.lost)
+
+
+def _held_within(fitted: FittedPiece) -> bool:
+    """With no force before it, a stop is the spring, and has a clearance."""
+    return bool(fitted.element.stiffness > fitted.rules.lost * fitted.strengths[0])
 
 
 def _wider(name: str) -> ElementLaw:
@@ -168,6 +202,7 @@ _BACKLASH = Piece(
     lambda p: (p[1], (p[0] - 0.5 * p[1] * (p[3] if len(p) > 3 else 0.0)) / p[2]),
     lambda a, s, e: {"slip_force": (a[0] + a[1], "N"), "lost_motion": (s[0], "m")},
     kind="hysteresis",
+    believed=_slips,
 )
 
 # --- dampers ----------------------------------------------------------------------------------------------------
@@ -182,6 +217,7 @@ _BLOWOFF = Piece(
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e)),
     lambda p: (p[0],),
     lambda a, s, e: {"force_at_knee": (float(e.damping) * s[0], "N")},
+    believed=_opens_late_enough,
 )
 _TWO_KNEES = Piece(
     _wider("damper_blowoff"),
@@ -192,9 +228,17 @@ _TWO_KNEES = Piece(
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),
     lambda p: (p[0], p[2]),
     plain=1,
+    believed=_opens_late_enough,
 )
 _ASYMMETRY = Piece(
-    _law("damper_asymmetry"), (), _none, lambda seen: [], (0,), lambda a, s, e: (a[0] / _damping(e),), lambda p: ()
+    _law("damper_asymmetry"),
+    (),
+    _none,
+    lambda seen: [],
+    (0,),
+    lambda a, s, e: (a[0] / _damping(e),),
+    lambda p: (),
+    believed=lambda fitted: abs(fitted.values["a"]) <= 1.0,
 )
 _SERIES = Piece(
     _law("series_stiffness"),
@@ -221,6 +265,7 @@ _BUMP_STOP = Piece(
     (1,),
     lambda a, s, e: (s[0], a[0]),
     lambda p: (p[0],),
+    believed=_held_within,
 )
 _CLEARANCE = Piece(
     _law("clearance"),
@@ -230,6 +275,7 @@ _CLEARANCE = Piece(
     (1,),
     lambda a, s, e: (s[0],),
     lambda p: (p[0],),
+    believed=_loose_within,
 )
 _GAS_SPRING = Piece(
     _law("gas_spring"),

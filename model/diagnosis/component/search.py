@@ -23,11 +23,10 @@ from sprung.model.diagnosis.component.fit import (
     refined,
     spread,
 )
-from sprung.model.diagnosis.component.piece import LawPiece, Part
+from sprung.model.diagnosis.component.piece import FittedPiece, LawPiece, Part
 from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
-from sprung.model.laws.paths import stop_path
 
 Progress = Callable[[str], None]
 
@@ -172,25 +171,18 @@ def plausible(fit: ComponentFit) -> bool:
     piece, strengths = fit.model.pieces[index], fit.strengths_of(index)
     if not np.any(np.abs(strengths) > 0):
         return False
-    values = {name: value for name, (value, _) in fit.values(index).items()}
-    corner = fit.task.seen.slowest_corner(fit.task.motion)
-    if piece.effect == "damper_blowoff":
-        ratios = [values[name] for name in ("ratio", "ratio_compression") if name in values]
-        knees = [values[name] for name in ("knee", "knee_compression") if name in values]
-        return all(-0.02 <= r < 0.98 for r in ratios) and all(k > corner for k in knees)
-    if piece.effect == "damper_asymmetry":
-        return abs(values["a"]) <= 1.0
-    if piece.effect == "friction_backlash":  # what never slips is a spring with a gap
-        gap, reach = fit.model.shapes[index]
-        u = np.abs(stop_path(fit.task.motion.deflection, 0.5 * gap + reach))
-        return bool(np.mean(u > 0.999 * (0.5 * gap + reach)) > fit.task.rules.slips)
-    if piece.effect == "clearance":
-        return bool(
-            np.abs(strengths[0] / max(fit.element.stiffness, 1e-300) - 1) < fit.task.rules.lost
-        )  # no force in the gap
-    if piece.effect == "bump_stop":  # and with none, the stop is the spring, and has a clearance
-        return bool(fit.element.stiffness > fit.task.rules.lost * strengths[0])
-    return True
+    task = fit.task
+    return piece.believed(
+        FittedPiece(
+            values={name: value for name, (value, _) in fit.values(index).items()},
+            strengths=strengths,
+            shape=fit.model.shapes[index],
+            element=fit.element,
+            deflection=task.motion.deflection,
+            corner=task.seen.slowest_corner(task.motion),
+            rules=task.rules,
+        )
+    )
 
 
 def _determined(fit: ComponentFit) -> bool:

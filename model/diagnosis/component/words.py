@@ -26,7 +26,7 @@ def finding_of(
     """The finding of one law."""
     piece = fit.model.pieces[index]
     values, quoted = _parameters(fit.values(index), sigma[0]), _parameters(fit.quoted(index), sigma[1])
-    if piece.kind in ("hysteresis", "friction"):
+    if piece.dissipates:
         quoted += (_loop_area(fit),)
     quoted += _forces_at_rates(fit)
     family = _family(step)

@@ -104,7 +104,8 @@ class Fit:
     @property
     def reduced(self) -> float:
         """Chi-square per degree of freedom."""
-        return self.chi_square / max(1, self.count - self.jacobian.shape[1])
+        found: float = self.chi_square / max(1, self.count - self.jacobian.shape[1])
+        return found
 
 
 @dataclass(frozen=True)

@@ -105,7 +105,8 @@ class Problem:
         scalar = np.where(near, grid.samples, (1 - last) / np.where(near, 1.0, 1 - turn[:, None] * step))
         rows = forward.free_rows_at_start() @ vectors
         modal = rows[None] * (scalar / np.sqrt(grid.samples))[:, None, :]
-        return modal @ np.linalg.inv(vectors)
+        found: ComplexArray = modal @ np.linalg.inv(vectors)
+        return found
 
 
 def law_forces(forward: Forward, point: Point, inputs: SmoothedInputs | None = None) -> LawForces | None:

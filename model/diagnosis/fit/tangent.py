@@ -108,7 +108,8 @@ def _floating(forward: Forward, sources: FloatArray, ports: FloatArray, force: C
     polynomial = np.einsum("skpn,mn,ksc->pmc", lines, ports @ H, line)
     steady = np.stack([polynomial, plant.derivative(polynomial)])
     swinging = np.stack([grid.inverse(answer), grid.inverse(1j * grid.omega[:, None, None] * answer)])
-    return swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
+    found: FloatArray = swinging + np.einsum("tp,kpmc->ktmc", grid.monomials, steady)
+    return found
 
 
 def tangent(
@@ -138,7 +139,8 @@ def tangent(
             d, v = _floating(forward, ports, ports, spectrum)
             if correction is not None:
                 d, v = (d, v) - correction.motion(correction.seen @ spectrum[grid.band])
-            return force - along_d * d - along_v * v
+            found: FloatArray = force - along_d * d - along_v * v
+            return found
         moved = compliance @ grid.forward(force)
         return force - along_d * grid.inverse(moved) - along_v * grid.inverse(jw * moved)
 

@@ -51,7 +51,8 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     variance = state.problem.noise.support_variance(grid.omega[upper])
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)
     power = np.mean(np.abs(state.fit.spectrum[upper]) ** 2, axis=0)
-    return np.sqrt(np.maximum(power - through, 0.0)) / declared
+    found: np.ndarray = np.sqrt(np.maximum(power - through, 0.0)) / declared
+    return found
 
 
 def _outliers(

@@ -78,7 +78,8 @@ class ModelResponse:
     @property
     def shown(self) -> ComplexArray:
         """(F, S)."""
-        return self.of_support.sum(axis=2) + self.of_force.sum(axis=2)
+        found: ComplexArray = self.of_support.sum(axis=2) + self.of_force.sum(axis=2)
+        return found
 
     def left(self, shown: ComplexArray) -> float:
         """Misfit of all sensors if this is what they show."""
@@ -97,7 +98,8 @@ class ModelResponse:
         shown = self.shown - driven + driven / turn
         at = list(group.sensors)
         shown[:, at] *= turn
-        return shown
+        found: ComplexArray = shown
+        return found
 
     def scaled(self, group: Group, ratio: float) -> ComplexArray:
         """Shown if a group is too large by a ratio."""

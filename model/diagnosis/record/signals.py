@@ -159,7 +159,8 @@ def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
     mechanics = system.mechanics
     stiffness = (mechanics.H.T * mechanics.stiffness) @ mechanics.H
     seen = np.any(np.abs(mechanics.S[sensors] @ rigid_body_modes(stiffness)) > _SEEN, axis=1)
-    return seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
+    found: np.ndarray = seen & (mechanics.sensor_kind[sensors] == DISPLACEMENT)
+    return found
 
 
 def rate_of(position: FloatArray, grid: Grid) -> FloatArray:

@@ -83,20 +83,26 @@ class Grid:
 
     def forward(self, series: FloatArray) -> ComplexArray:
         """Transform along the first axis: (N, ...) -> (F, ...)."""
-        return scipy.fft.rfft(series, axis=0, norm="ortho")
+        found: ComplexArray = scipy.fft.rfft(series, axis=0, norm="ortho")
+        return found
 
     def inverse(self, spectrum: ComplexArray) -> FloatArray:
         """(F, ...) -> (N, ...)."""
-        return scipy.fft.irfft(spectrum, self.samples, axis=0, norm="ortho")
+        found: FloatArray = scipy.fft.irfft(spectrum, self.samples, axis=0, norm="ortho")
+        return found
 
     def fine(self, spectrum: ComplexArray) -> FloatArray:
         """Band-limited series on the oversampled axis: (F, ...) -> (OVERSAMPLING N, ...)."""
-        return scipy.fft.irfft(spectrum, OVERSAMPLING * self.samples, axis=0) * (OVERSAMPLING * np.sqrt(self.samples))
+        found: FloatArray = scipy.fft.irfft(spectrum, OVERSAMPLING * self.samples, axis=0) * (
+            OVERSAMPLING * np.sqrt(self.samples)
+        )
+        return found
 
     def coarse_spectrum(self, fine_series: FloatArray) -> ComplexArray:
         """Transform of an oversampled series, kept up to the record's Nyquist frequency."""
         full = scipy.fft.rfft(fine_series, axis=0)
-        return full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
+        found: ComplexArray = full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
+        return found
 
     def pack(self, spectrum: ComplexArray) -> FloatArray:
         """Compared bins of whitened spectra (F, S, ...) as real vectors (2 F S, ...) of unit-variance noise."""

@@ -81,4 +81,5 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
     width = term.parameters[corner]
     x = min(np.pi**2 * width / passing, 300.0)
     along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
-    return covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
+    found: FloatArray = covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
+    return found

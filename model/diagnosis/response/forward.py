@@ -153,7 +153,8 @@ class Forward:
         gain, slope = self.force_faults[0][i], law.slope()
         change = -slope.gain * (self.force + self.part.grid.monomial_spectra @ self.force_polynomial)[:, i] / gain
         change[0] -= slope.offset * np.sqrt(self.part.grid.samples) / gain
-        return change[:, None] * self.plant.structure.F[:, i]
+        found: ComplexArray = change[:, None] * self.plant.structure.F[:, i]
+        return found
 
     @property
     def of_inputs(self) -> ComplexArray:
@@ -166,7 +167,8 @@ class Forward:
         plant, s = self.plant, self.plant.structure
         moved = plant.receptance @ plant.load_of_inputs
         inertia = (self.part.grid.omega**2)[:, None, None] * (s.mass * dofs)[:, None]
-        return plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
+        found: ComplexArray = plant.sensor_of_load @ (inertia * moved) * self.sensor_factor[:, :, None]
+        return found
 
     @property
     def force(self) -> ComplexArray:
@@ -211,7 +213,8 @@ class Forward:
         """Shown over true signal of every sensor, (F, S)."""
         gain, lag, delay, _ = self.faults
         s = 1j * self.part.grid.omega[:, None]
-        return gain * np.exp(-s * delay) / (1 + s * lag)
+        found: ComplexArray = gain * np.exp(-s * delay) / (1 + s * lag)
+        return found
 
     def of_body_loads(self) -> ComplexArray | float:
         """Sensor signals of the forces on bodies that nobody measured, (F, S)."""
@@ -229,7 +232,8 @@ class Forward:
     def linear_motion(self) -> ComplexArray:
         """Periodic part of the degrees of freedom without laws' forces and free motion, (F, n)."""
         load = self.plant.load(self.support, self.force)
-        return np.einsum("fnm,fm->fn", self.plant.receptance, load)
+        found: ComplexArray = np.einsum("fnm,fm->fn", self.plant.receptance, load)
+        return found
 
     @cached_property
     def linear_deflection(self) -> ComplexArray:

@@ -136,7 +136,8 @@ class Plant:
         result = np.einsum("fsn,fn->fs", self.sensor_of_load, self.load(support, force))
         if np.any(s.L):
             result += np.einsum("fse,fe->fs", self._of_deflection, support @ s.G.T)
-        return result
+        found: ComplexArray = result
+        return found
 
     @property
     def load_of_support(self) -> ComplexArray:

@@ -130,7 +130,8 @@ def _line(projector: Projector, law: BodyLaw, index: int, name: str) -> tuple[Ca
 
 
 def _local_median(scores: FloatArray, reach: int) -> FloatArray:
-    return median_filter(scores, size=2 * reach + 1, mode="nearest")
+    found: FloatArray = median_filter(scores, size=2 * reach + 1, mode="nearest")
+    return found
 
 
 def _refined_line(

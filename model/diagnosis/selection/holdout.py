@@ -55,7 +55,8 @@ class HeldOutComparison:
 
         Were it true, its gain would scatter about apart^2 by 2 apart: the error of the first is then apart and noise.
         """
-        return self.gain < min(0.0, self.apart**2 - self.chance * 2 * self.apart * np.sqrt(self.scatter))
+        found: bool = self.gain < min(0.0, self.apart**2 - self.chance * 2 * self.apart * np.sqrt(self.scatter))
+        return found
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,8 @@ class HeldOut:
         variance = noise.support_variance(self.whole.grid.omega)
         power = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support) ** 2, variance)
         power = power + np.abs(plant.sensor_of_measured_force) ** 2 @ noise.force**2
-        return np.sqrt(power.mean(axis=0) + noise.sensors**2)
+        found: FloatArray = np.sqrt(power.mean(axis=0) + noise.sensors**2)
+        return found
 
 
 def _normal(free: FloatArray, target: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
