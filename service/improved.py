@@ -12,9 +12,9 @@ from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report
 from sprung.model.laws import ElementLaw
+from sprung.model.laws.sensor_faults import SENSOR_NOISE
 from sprung.model.system import System, parse_system
 
-_NOISE = "sensor_noise"  # written as the channel's noise, not as a law
 _DIGITS = 6
 QUANTITIES = ("stiffness", "damping", "mass")
 
@@ -40,7 +40,7 @@ def improved_text(text: str, system: System, report: Report) -> str:
     for law in report.laws:
         _place(file, system, law)
     for finding in report.findings:
-        if finding.effect == _NOISE and finding.parameters:
+        if finding.effect == SENSOR_NOISE.name and finding.parameters:
             for name in finding.location.split("|"):
                 channel = _channel(file, name)
                 if channel is not None and channel.get("noise"):

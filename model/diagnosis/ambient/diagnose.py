@@ -35,6 +35,7 @@ from sprung.model.diagnosis.report.report import (
 from sprung.model.diagnosis.rules import RULES, AmbientRules
 from sprung.model.identifier import PRIOR_STD
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.sensor_faults import SENSOR_STUCK
 from sprung.model.mechanics import Mode
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
@@ -182,7 +183,7 @@ def _findings(
     system: System, prepared: Prepared, windows: list[WindowResult], pooled: Pooled, rules: AmbientRules
 ) -> list[Finding]:
     found = [
-        Finding(name, "sensor_stuck", (), None, None, sentence=f"{name}: repeats one value from {at:.2f} s on")
+        Finding(name, SENSOR_STUCK.name, (), None, None, sentence=f"{name}: repeats one value from {at:.2f} s on")
         for name, at in prepared.stuck
     ]
     for p in np.flatnonzero(pooled.varying):

@@ -14,6 +14,7 @@ from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
@@ -41,7 +42,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
         deciding = replace(errors, before=np.maximum(errors.before, worst))
     effects = [fault.effect for fault in state.setup_faults]
     effects += [fault.term.law.name for fault in state.input_faults]
-    effects += ["sensor_stuck"] * len(state.prepared.stuck) + ["sensor_noise"] * len(noisy)
+    effects += [SENSOR_STUCK.name] * len(state.prepared.stuck) + [SENSOR_NOISE.name] * len(noisy)
     effects += [found.trial.term.law.name for found in state.found]
     verdict = verdict_of(effects, deciding, rules)
     strange = float(np.sqrt(np.mean(deciding.after**2)))

@@ -12,10 +12,11 @@ from sprung.model.diagnosis.investigation.setup_response import Group, Hypothesi
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.rules import SetupRules
+from sprung.model.laws.sensor_faults import SENSOR_GAIN, SENSOR_LAG
 from sprung.model.schema import MotionSensor
 from sprung.model.system import System
 
-ORDINARY = ("sensor_gain", "sensor_lag")  # that screening seeks; they only have to be beaten
+ORDINARY = (SENSOR_GAIN.name, SENSOR_LAG.name)  # that screening seeks; they only have to be beaten
 _ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
 _ALIKE = 1e-6  # m, of positions that mirror each other
 
@@ -222,6 +223,6 @@ def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterat
         ratio, late = one.ratio(group), one.delay(group, rules.latest)
         if ratio > 0:
             undo = changes.scale([i], (), (), ratio)
-            yield Hypothesis("sensor_gain", name, ratio, one.left(one.scaled(group, ratio)), undo, group)
+            yield Hypothesis(SENSOR_GAIN.name, name, ratio, one.left(one.scaled(group, ratio)), undo, group)
         undo = changes.advance([i], (), late)
-        yield Hypothesis("sensor_lag", name, late, one.left(one.late(group, late)), undo, group)
+        yield Hypothesis(SENSOR_LAG.name, name, late, one.left(one.late(group, late)), undo, group)

@@ -15,6 +15,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
@@ -164,7 +165,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
 def _noise_finding(fault: NoiseFault) -> Finding:
     return Finding(
         location=fault.location,
-        effect="sensor_noise",
+        effect=SENSOR_NOISE.name,
         parameters=(LawParameter("ratio", fault.ratio, fault.std, "1"),),
         p_value=fault.p_value,
         delta_bic=None,
@@ -175,7 +176,7 @@ def _noise_finding(fault: NoiseFault) -> Finding:
 def _stuck_finding(name: str, at: float) -> Finding:
     return Finding(
         location=name,
-        effect="sensor_stuck",
+        effect=SENSOR_STUCK.name,
         parameters=(),
         p_value=None,
         delta_bic=None,
