@@ -31,7 +31,7 @@ from sprung.model.diagnosis.investigation.course import Investigation, Outcome
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded, under, with_findings
 from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.report.narrate import narrate
-from sprung.model.diagnosis.rules import RULES, Rules
+from sprung.model.diagnosis.rules import RULES, Rules, reason
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import System
 
@@ -103,6 +103,7 @@ def run(
     seconds: float = 0.0,
     folder: Path | None = None,
     part: str = "1/1",
+    write: Path | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, one per number, and the totals.
 
@@ -111,6 +112,7 @@ def run(
     stage: of the rules, if only one is asked for.
     folder: where recordings that are done are kept; those of the same rules are not done again.
     part: "2/3": only every third recording, the second first, for processes beside each other with one folder.
+    write: file for what was found, which the reasons of the rules quote.
     """
     count = count or {"quick": 8, "cases": 28, "full": 40}[budget]
     seconds = seconds or (60.0 if budget == "full" else 15.0)
@@ -134,6 +136,8 @@ def run(
         yield {key: told[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
     lines = [figure(key, one, done) for key, one in keys]
     yield from lines
+    if write is not None:
+        write.write_text(quoted(lines, done, budget), encoding="utf-8")
     yield {
         "numbers": len(lines),
         "that_change_something": sum(bool(line["changed"]) for line in lines),
@@ -193,8 +197,38 @@ def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[s
         "recordings": len(found),
         "changed": [change for one in found for change in one["changed"]],
         "p_value_decades": round(max((one["decades"] for one in found), default=0.0), 2),
-        "reason": number.metadata["reason"],
+        "reason": reason(stage, number),
     }
+
+
+def quoted(lines: list[dict[str, Any]], done: list[dict[str, Any]], budget: str) -> str:
+    """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end."""
+    numbers = {
+        f"{line['stage']}.{line['number']}": {
+            "varied": [line["value"], *line["range"]],
+            "recordings": line["recordings"],
+            "changes": [_words(change) for change in line["changed"]],
+        }
+        for line in lines
+        if line["recordings"]
+    }
+    head = {"set": f"{len(done)} recordings ({budget})", "recordings": [one["recording"] for one in done]}
+    rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())
+    return f'{json.dumps(head)[:-1]},\n "numbers": {{\n{rows}\n}}}}\n'
+
+
+def _words(change: dict[str, Any]) -> str:
+    """ "at 9.2 the name in 1-weak friction: a or b -> a"."""
+    where = f"in {change['recording']}"
+    if "error" in change:
+        return f"at {change['at']:g} {where}: {change['error']}"
+    what = "verdict" if "verdict" in change else "findings"
+    before, after = (_named(side) if what == "findings" else side for side in change[what])
+    return f"at {change['at']:g} the {what} {where}: {before} -> {after}"
+
+
+def _named(findings: list[tuple[str, str]]) -> str:
+    return " + ".join(f"{place} {effect}" for place, effect in findings) or "none"
 
 
 def _difference(before: Said, after: Said) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def diagnose(
     if system.on_track or not system.file.inputs:
         whole = replace(options.rules.record, longest=len(record.values))
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
-        decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise)
+        decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise, options.rules.ambient)
         if decay is None:
             return diagnose_unforced(system, prepared, record, options, tell)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)

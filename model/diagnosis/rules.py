@@ -3,19 +3,44 @@
 A number is here when another value could change a verdict, a place or a name.  Tolerances of the numerics, which only
 have to be small, stay beside the code that iterates.  A reason begins with "derived" where the number follows from
 statistics or the sampling, and with "chosen" where it was found on simulated vehicles; `sprung bench sensitivity`
-varies every one over its range and prints what changes.
+varies every one over its range and prints what changes.  What it found last stands in `varied.json` beside this file,
+and `reason` says both.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, field, fields, replace
+from functools import cache
+from pathlib import Path
 from typing import Any
+
+VARIED = Path(__file__).with_name("varied.json")  # made by `sprung bench sensitivity --write`
 
 
 def rule(value: Any, reason: str, low: Any, high: Any) -> Any:
     """A deciding number with its reason, and the range over which `sprung bench sensitivity` varies it."""
     return field(default=value, metadata={"reason": reason, "range": (low, high)})
+
+
+def reason(stage: str, number: Field[Any]) -> str:
+    """Why a number is what it is, and what the sensitivity bench found where it is another."""
+    found = _varied()["numbers"].get(f"{stage}.{number.name}")
+    low, high = number.metadata["range"]
+    if found is None or found["varied"] != [number.default, low, high]:
+        told = "not varied as it is now"
+    elif found["changes"]:
+        told = f"on {_varied()['set']} changes {'; '.join(found['changes'])}"
+    else:
+        told = f"on {_varied()['set']} insensitive from {low:g} to {high:g}"
+    return f"{number.metadata['reason']}; {told}"
+
+
+@cache
+def _varied() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(VARIED.read_text(encoding="utf-8"))
+    return found
 
 
 @dataclass(frozen=True)
@@ -192,6 +217,13 @@ class AmbientRules:
     told: float = rule(0.3, "deviation of a log-ratio above which a window tells nothing of it; chosen", 0.15, 0.5)
     coarse: float = rule(0.15, "of the power that chance puts elsewhere: little is told; chosen", 0.08, 0.3)
     strange: float = rule(0.35, "of the power at other frequencies: another structure; chosen", 0.2, 0.6)
+    blocks: int = rule(12, "of a recording, whose levels tell a free decay; chosen", 8, 20)
+    rise: float = rule(1.15, "of a level over the one before, up to which it still falls; chosen", 1.05, 1.3)
+    fallen: float = rule(0.5, "of the first level that the last may have; chosen", 0.3, 0.7)
+    least: float = rule(0.6, "of the recording that a decay must cover; chosen", 0.4, 0.8)
+    spans: int = rule(100, "of a recording, in which the end of the motion is looked for; chosen", 50, 200)
+    loud: float = rule(3.0, "level over the noise's, down to which a decay is followed; chosen", 2.0, 5.0)
+    beyond: float = rule(1.2, "of the decay's length that is kept; chosen", 1.0, 1.5)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -9,7 +10,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from sprung.benchmarks.sensitivity import Said, Subject, figure, run, vary
+from sprung.benchmarks.sensitivity import Said, Subject, figure, quoted, run, vary
 from sprung.benchmarks.sensitivity_cases import recordings, rig
 from sprung.model.diagnosis.rules import RULES, Rules
 
@@ -75,3 +76,13 @@ def test_a_recording_that_is_done_is_not_done_again(tmp_path: Path) -> None:
     assert again[1:-1] == first[1:-1]
     other = list(run(stage="verdict", count=2, seconds=3.0, part="2/2", folder=tmp_path))
     assert other[0]["verdict"] == "missing_physics"  # of other settings: made anew
+
+
+def test_what_is_quoted_of_a_run_is_json_of_every_number_that_was_varied() -> None:
+    told = varied("verdict", "clear")
+    done = [{"recording": "made", "varied": {"verdict.clear": told}}]
+    lines = [figure(stage, field, done) for stage, field in RULES.constants()]
+    found = json.loads(quoted(lines, done, "quick"))
+    assert list(found["numbers"]) == ["verdict.clear"]
+    (change,) = found["numbers"]["verdict.clear"]["changes"]
+    assert change == "at 2 the verdict in made: missing_physics -> consistent"

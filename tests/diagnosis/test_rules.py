@@ -6,7 +6,7 @@ from dataclasses import fields
 
 import pytest
 
-from sprung.model.diagnosis.rules import RULES
+from sprung.model.diagnosis.rules import RULES, reason
 
 
 @pytest.mark.parametrize(("stage", "name"), [(stage, one.name) for stage, one in RULES.constants()])
@@ -15,6 +15,17 @@ def test_a_number_says_why_it_is_what_it_is(stage: str, name: str) -> None:
     low, high = one.metadata["range"]
     assert low <= one.default <= high and low < high
     assert ("derived" in one.metadata["reason"]) != ("chosen" in one.metadata["reason"])
+    assert (
+        "insensitive from" in reason(stage, one)
+        or "changes at" in reason(stage, one)
+        or "not varied" in reason(stage, one)
+    )
     varied = RULES.varied(stage, name, high)
     assert getattr(getattr(varied, stage), name) == high
     assert varied.varied(stage, name, one.default) == RULES
+
+
+def test_what_was_varied_are_numbers_of_the_rules() -> None:
+    """A number that was changed since says so; hardly any may."""
+    reasons = [reason(stage, one) for stage, one in RULES.constants()]
+    assert sum("insensitive from" in one or "changes at" in one for one in reasons) > 0.7 * len(reasons)

@@ -8,44 +8,38 @@ import numpy as np
 
 from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES
 from sprung.model.diagnosis.record.signals import Signals, roughness
+from sprung.model.diagnosis.rules import RULES, AmbientRules
 from sprung.model.signals import FloatArray
 
-BLOCKS = 12  # of a recording, whose levels are compared
-RISE = 1.15  # of a level over the one before, up to which it still falls
-FALLEN = 0.5  # of the first level that the last may have
-LEAST = 0.6  # of the recording that a decay must cover
-SPANS = 100  # of a recording, in which the end of the motion is looked for
-LOUD = 3.0  # level over that of the noise, down to which a decay is followed
-BEYOND = 1.2  # of the decay's length that is kept
 
-
-def decay_stretch(signals: Signals, noise: FloatArray) -> slice | None:
+def decay_stretch(signals: Signals, noise: FloatArray, rules: AmbientRules = RULES.ambient) -> slice | None:
     """The samples in which the sensors only decay, with noise (S,) of one sample; None where they do not.
 
     What stands still afterwards is left out: it tells nothing, and a held-out part of it could not judge anything.
     """
-    begin = _begin(signals, noise)
+    begin = _begin(signals, noise, rules)
     if begin is None:
         return None
     level = np.maximum(noise, roughness(signals.sensors))
-    moved = (signals.sensors[begin:] - np.median(signals.sensors[-len(signals.sensors) // SPANS :], axis=0)) / level
-    edges = np.linspace(0, len(moved), SPANS + 1).astype(int)
-    loud = [np.sqrt(np.mean(moved[a:b] ** 2, axis=0)).max() > LOUD for a, b in pairwise(edges) if b > a]
+    rest = np.median(signals.sensors[-signals.samples // rules.spans :], axis=0)
+    moved = (signals.sensors[begin:] - rest) / level
+    edges = np.linspace(0, len(moved), rules.spans + 1).astype(int)
+    loud = [np.sqrt(np.mean(moved[a:b] ** 2, axis=0)).max() > rules.loud for a, b in pairwise(edges) if b > a]
     last = int(edges[int(np.flatnonzero(loud)[-1]) + 1]) if any(loud) else len(moved)
-    end = begin + int(BEYOND * last)
+    end = begin + int(rules.beyond * last)
     return slice(begin, None if end - begin < MINIMUM_SAMPLES else min(end, signals.samples))
 
 
-def _begin(signals: Signals, noise: FloatArray) -> int | None:
-    edges = np.linspace(0, signals.samples, BLOCKS + 1).astype(int)
+def _begin(signals: Signals, noise: FloatArray, rules: AmbientRules) -> int | None:
+    edges = np.linspace(0, signals.samples, rules.blocks + 1).astype(int)
     moved = signals.sensors - np.median(signals.sensors, axis=0)
     blocks = [moved[a:b] for a, b in pairwise(edges)]
     level = np.array([np.sqrt(np.mean(np.mean((block / noise) ** 2, axis=0))) for block in blocks])
     first = int(np.argmax(level))
     falling = np.maximum(level[first:], 2.0)  # below twice the noise nothing is told
-    if edges[first] > (1 - LEAST) * signals.samples or falling[-1] > FALLEN * falling[0]:
+    if edges[first] > (1 - rules.least) * signals.samples or falling[-1] > rules.fallen * falling[0]:
         return None
-    if np.any(falling[1:] > RISE * falling[:-1]):
+    if np.any(falling[1:] > rules.rise * falling[:-1]):
         return None
     if first == 0:
         return 0

@@ -11,6 +11,7 @@ from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic
+from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
 
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
@@ -162,7 +163,7 @@ def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped:
         )
     return Finding(
         element,
-        "unknown",
+        UNKNOWN,
         (),
         step.p_value,
         bic(step.gain, len(step.chosen.last.signs) + len(step.chosen.last.shapes), int(step.chosen.count)),
