@@ -76,8 +76,12 @@ TARGETS = (
 )
 
 
-def targets(rows: list[dict[str, Any]]) -> str:
-    """Markdown table of the targets and what the rows reach, mean over seeds."""
+def targets(rows: list[dict[str, Any]], before: str = "") -> str:
+    """Markdown table of the targets and what the rows reach, mean over seeds.
+
+    before: the table as it was; a line for which there are no rows stays as it stands there.
+    """
+    kept = {tuple(line.split(" | ")[:2]): line for line in before.splitlines()}
     lines = ["| task | figure | paper | target | reached | |", "|---" * 6 + "|"]
     for target in TARGETS:
         same = [row for row in rows if (row["task"], row.get("method")) == (target.task, target.method)]
@@ -89,7 +93,8 @@ def targets(rows: list[dict[str, Any]]) -> str:
             met = "other units" if target.bound is None else "yes" if mean <= target.bound else "no"
         paper, bound = ("-" if value is None else f"{value:.4g}" for value in (target.paper, target.bound))
         what = f"{target.method} {target.column}"
-        lines.append(f"| {target.task} | {what} | {paper} | {bound} | {reached} | {met} |")
+        line = f"| {target.task} | {what} | {paper} | {bound} | {reached} | {met} |"
+        lines.append(line if same else kept.get((f"| {target.task}", what), line))
     return "\n".join(lines)
 
 
@@ -223,8 +228,11 @@ def main(folder: Path, document: Path) -> None:
     text = document.read_text()
     text = re.sub(r"<!-- rows (\w+) -->.*?<!-- end -->", fill, text, flags=re.DOTALL)
     text = re.sub(r"<!-- against (\w+) -->.*?<!-- end -->", against, text, flags=re.DOTALL)
-    reached = f"<!-- targets -->\n{targets(found)}\n<!-- end -->"
-    text = re.sub(r"<!-- targets -->.*?<!-- end -->", lambda _: reached, text, flags=re.DOTALL)
+
+    def reached(match: re.Match[str]) -> str:
+        return f"<!-- targets -->\n{targets(found, match.group(1))}\n<!-- end -->"
+
+    text = re.sub(r"<!-- targets -->(.*?)<!-- end -->", reached, text, flags=re.DOTALL)
     document.write_text(text)
     images = document.parent / "img" / "paper"
     images.mkdir(parents=True, exist_ok=True)
