@@ -17,6 +17,7 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
+from sprung.model.parameters import LoadState, Parameter, Tolerance
 from sprung.model.schema import (
     RUNNING,
     SI,
@@ -57,38 +58,6 @@ def _signal_channel(name: str, at: FollowedSignal) -> Channel:
     gain = at.sign * (1.0 if at.scale is None else at.scale)
     unit = at.unit or "1"
     return Channel(name, unit, at.noise, at.mcap, at.can, at.csv, at.column, gain, at.sign * at.offset, at.range)
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """One unknown: `primary_11l.stiffness`, `car.mass`."""
-
-    name: str
-    element: str  # the element, or the body of a mass
-    quantity: str  # stiffness | damping | mass
-    unit: str
-    nominal: float
-
-
-@dataclass(frozen=True, slots=True)
-class LoadState:
-    """A body whose mass varies; its inertias vary with it."""
-
-    name: str  # "car.load"
-    body: str
-    empty: float  # kg, the mass of the system file
-    declared: bool  # the system file says so
-    std: float  # of the logarithm of mass over `empty`, before any window
-    least: float | None = None  # kg that it may carry beside `empty`, by the system file
-    most: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Tolerance:
-    """Standard deviations that a data sheet leaves to one channel."""
-
-    gain: float  # relative
-    delay: float  # s
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,9 @@ import numpy as np
 
 from sprung.model.ambient.sensing import Sensing
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, FORCE, VELOCITY, Mechanics
+from sprung.model.parameters import Parameter
 from sprung.model.signals import FloatArray
-from sprung.model.system import Parameter, System
+from sprung.model.system import System
 
 
 @dataclass(frozen=True, slots=True)
