@@ -24,6 +24,7 @@ ORDER = [
     "signals",
     "chunks",
     "units",
+    "parameters",
     "address",
     "schema",
     "mechanics",
