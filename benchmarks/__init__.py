@@ -37,6 +37,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
+    "structure": (
+        "sprung.benchmarks.structure",
+        "parts that the file does not state: connections, hanging masses, lever arms; named, and none invented",
+    ),
     "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
     "real": ("sprung.benchmarks.real", "measured dampers, an axis and a beam, beside references (--data DIR)"),
     "video": ("sprung.benchmarks.real_video", "real videos: the length of their pendulums (--data DIR)"),

@@ -74,7 +74,8 @@ class Mechanics:
     """The constant matrices of a system; element values and masses multiply them."""
 
     dofs: tuple[str, ...]  # "car.z", "car.roll", ..., n of them
-    body_of_dof: IntArray  # index of the body, shape (n,)
+    body_of_dof: IntArray  # index of the body, shape (n,); -1: of none of the file's
+    centre: FloatArray  # x and y of each body's own position, m, shape (bodies, 2)
     mass: FloatArray  # nominal mass or inertia of each degree of freedom, shape (n,)
     stiffness: FloatArray  # nominal, N/m, shape (E,)
     damping: FloatArray  # nominal, N s/m, shape (E,)
@@ -219,6 +220,7 @@ def assemble(file: SystemFile) -> Mechanics:
     return Mechanics(
         dofs=tuple(dofs),
         body_of_dof=np.array(body_of_dof),
+        centre=np.array([body.position for body in file.bodies.values()], dtype=float).reshape(-1, 2),
         mass=np.array(mass),
         stiffness=np.array([e.stiffness.value for e in file.elements.values()]),
         damping=np.array([e.damping.value for e in file.elements.values()]),

@@ -34,6 +34,8 @@ class VehicleTransfer:
         dynamic = np.einsum("ei,fe,ej->fij", geometry, impedance, geometry) - np.einsum(
             "f,ij->fij", omega**2, np.diag(vehicle.inertia if inertia is None else inertia)
         )
+        idle = ~geometry.any(axis=0)  # what a body cannot do
+        dynamic[:, idle, idle] += 1.0
         self.compliance = np.linalg.inv(dynamic)  # displacement per generalised force, (F, D, D)
         drive = np.einsum("ei,fe,ew->fiw", geometry, impedance, stands)
         motion = self.compliance @ drive  # (F, D, wheels)

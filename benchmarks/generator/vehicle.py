@@ -41,12 +41,15 @@ class Vehicle:
         return slice(first, first + 3)
 
 
-def _lever(bodies: dict[str, Any], body: str, position: list[float]) -> Array:
+def _lever(bodies: dict[str, Any], body: str, position: list[float] | None) -> Array:
     """Vertical motion at a point: z + (y - y0) roll + (x - x0) pitch."""
     row = np.zeros(3 * len(bodies))
     first = 3 * list(bodies).index(body)
-    centre = bodies[body]["position"]
-    row[first : first + 3] = 1.0, position[1] - centre[1], position[0] - centre[0]
+    centre = bodies[body].get("position", (0.0, 0.0))
+    x, y = (0.0, 0.0) if position is None else (position[0] - centre[0], position[1] - centre[1])
+    row[first] = 1.0
+    row[first + 1] = y if "roll_inertia" in bodies[body] else 0.0
+    row[first + 2] = x if "pitch_inertia" in bodies[body] else 0.0
     return row
 
 
@@ -55,23 +58,29 @@ def _signal(entry: dict[str, Any]) -> dict[str, str]:
 
 
 def read_vehicle(path: str | Path) -> Vehicle:
-    """The vehicle of a system file whose bodies all roll and pitch and whose sensors are accelerometers."""
-    data = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
+    """The vehicle of a system file on supports, whose sensors are accelerometers."""
+    return vehicle_of(yaml.safe_load(Path(path).read_text(encoding="utf-8")))
+
+
+def vehicle_of(data: dict[str, Any]) -> Vehicle:
+    """The same of a file's content.  What a body cannot do, roll or pitch, has an inertia of 1 and no lever."""
     bodies, inputs, elements, sensors = data["bodies"], data["inputs"], data["elements"], data["sensors"]
     wheels = list(inputs)
-    geometry = np.array([_lever(bodies, e["upper"], e["position"]) for e in elements.values()])
+    geometry = np.array([_lever(bodies, e["upper"], e.get("position")) for e in elements.values()])
     support = []
-    where = {}
+    where: dict[str, Any] = {}
     for row, element in enumerate(elements.values()):
         lower = element["lower"]
         support.append(wheels.index(lower) if lower in inputs else -1)
         if lower in inputs:
-            where[lower] = element["position"]
-        else:
-            geometry[row] -= _lever(bodies, lower, element["position"])
+            where.setdefault(lower, element.get("position", (0.0, 0.0)))
+        elif lower != "ground":
+            geometry[row] -= _lever(bodies, lower, element.get("position"))
     return Vehicle(
         bodies=tuple(bodies),
-        inertia=np.array([[b["mass"], b["roll_inertia"], b["pitch_inertia"]] for b in bodies.values()], float).ravel(),
+        inertia=np.array(
+            [[b["mass"], b.get("roll_inertia", 1.0), b.get("pitch_inertia", 1.0)] for b in bodies.values()], float
+        ).ravel(),
         elements=tuple(elements),
         geometry=geometry,
         stiffness=np.array([e["stiffness"] for e in elements.values()], float),
@@ -79,12 +88,12 @@ def read_vehicle(path: str | Path) -> Vehicle:
         support=tuple(support),
         upper=tuple(e["upper"] for e in elements.values()),
         inputs=tuple(wheels),
-        input_position=np.array([where[w][0] for w in wheels], float),
-        input_side=np.sign([where[w][1] for w in wheels]).astype(float),
+        input_position=np.array([where[w][0] for w in wheels], np.float64),
+        input_side=np.sign(np.array([where[w][1] for w in wheels], float)),
         input_noise=np.array([[inputs[w][q]["noise"] for w in wheels] for q in ("displacement", "velocity")], float),
         sensors=tuple(sensors),
         sensor_body=tuple(s["body"] for s in sensors.values()),
-        pickup=np.array([_lever(bodies, s["body"], s["position"]) for s in sensors.values()]),
+        pickup=np.array([_lever(bodies, s["body"], s.get("position")) for s in sensors.values()]),
         sensor_noise=np.array([s["noise"] for s in sensors.values()], float),
         places=tuple(
             [_signal(inputs[w][q]) for q in ("displacement", "velocity") for w in wheels]

@@ -151,6 +151,8 @@ class SetupRules:
     tried: int = rule(5, "hypotheses that are fitted; chosen", 3, 8)
     beside: int = rule(2, "faults of single sensors that are fitted beside them; chosen", 1, 4)
     explains: float = rule(0.3, "of the misfit that one may leave once fitted; chosen", 0.15, 0.5)
+    parts: int = rule(2, "missing parts that are fitted beside an accepted one; chosen", 1, 4)
+    outdone: float = rule(0.5, "of what it leaves, that a missing part may leave instead; chosen", 0.3, 0.8)
     latest: float = rule(0.5, "s, of a node; derived: later, a node is another recording", 0.3, 1.0)
     scale: float = rule(1.3, "ratio from which a scale is wrong; derived: less is a sensor's gain", 1.2, 1.5)
     offset: float = rule(0.1, "m, from which a position is wrong; derived: less is a mounting tolerance", 0.05, 0.2)

@@ -12,6 +12,7 @@ from sprung.model.laws.base import (
     ParameterSpec,
     SensorLaw,
     SpringDamper,
+    StructureLaw,
     SupportLaw,
     grid,
     observe,
@@ -41,6 +42,7 @@ from sprung.model.laws.sensor_faults import (
     SENSOR_STUCK,
 )
 from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
+from sprung.model.laws.structure import MISSING_CONNECTION, SUSPENDED_MASS, WRONG_POSITION
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,
@@ -68,6 +70,9 @@ CATALOGUE: tuple[Law, ...] = (
     FLEXIBLE_MODE,
     EXTERNAL_FORCE,
     MASS_CHANGE,
+    MISSING_CONNECTION,
+    SUSPENDED_MASS,
+    WRONG_POSITION,
     SENSOR_GAIN,
     SENSOR_LAG,
     SENSOR_BIAS,
@@ -99,6 +104,7 @@ __all__ = [
     "SensorLaw",
     "SensorResponse",
     "SpringDamper",
+    "StructureLaw",
     "SupportLaw",
     "find_law",
     "grid",

@@ -22,7 +22,8 @@ from sprung.model.laws.channel import SensorResponse, passed, undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
-Where = Literal["element", "pair", "body", "sensor", "support", "axle"]  # "axle": both supports of one
+# "bodies": two bodies, or a body and a support; "axle": both supports of one
+Where = Literal["element", "pair", "body", "bodies", "sensor", "support", "axle"]
 Channels = Literal["sensor", "support", "force"]
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
@@ -249,6 +250,37 @@ class BodyLaw(Parametrised):
     prior_cost: float = 0.0
 
 
+class Site(NamedTuple):
+    """What a change of the structure takes hold of, by its index in the mechanics."""
+
+    kind: Literal["body", "support", "element"]
+    number: int
+
+
+@dataclass(frozen=True)
+class StructureLaw(Parametrised):
+    """A part that the structure has and its file does not state, or states elsewhere: it changes the mechanics.
+
+    Linear, so that nothing of it is found along the trajectory.
+    """
+
+    name: str
+    title: str
+    parameters: tuple[ParameterSpec, ...]
+    where: Where  # "body", "bodies" or "element"
+    # The mechanics with the law, of the sites that its location names; `variant` as in a term
+    modify: Callable[[Mechanics, tuple[Site, ...], Values, str], Mechanics]
+    absent: tuple[float, ...]
+    looks_like: str
+    confused_with: tuple[str, ...]
+    sentence: str
+    variants: tuple[str, ...] = ("",)  # discrete choices: an axis
+    axes: Mapping[int, str] = field(default_factory=dict)  # parameters that are a place along "x" or "y", m
+    adds_motion: bool = False  # whether it brings a degree of freedom of its own
+    prior_cost: float = 0.0
+    fault: bool = False
+
+
 @dataclass(frozen=True)
 class SupportLaw(Parametrised):
     """A movement of supports that repeats itself and that their measured motion does not show.
@@ -331,4 +363,4 @@ class SensorLaw(Parametrised):
         return SensorResponse(*(b - a for a, b in zip(here, there, strict=True)))
 
 
-Law = ElementLaw | BodyLaw | SupportLaw | SensorLaw
+Law = ElementLaw | BodyLaw | StructureLaw | SupportLaw | SensorLaw

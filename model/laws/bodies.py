@@ -25,7 +25,7 @@ def _beam(x: FloatArray, half_length: float) -> FloatArray:
     return found
 
 
-def _columns(mechanics: Mechanics, body: int) -> dict[str, int]:
+def columns_of(mechanics: Mechanics, body: int) -> dict[str, int]:
     """Degrees of freedom of a body: {"z": 0, "roll": 1, "pitch": 2}, those it has."""
     return {mechanics.dofs[i].rsplit(".", 1)[1]: int(i) for i in np.flatnonzero(mechanics.body_of_dof == body)}
 
@@ -41,7 +41,7 @@ def _arms(rows: FloatArray, columns: dict[str, int]) -> tuple[FloatArray, FloatA
 
 def _mode_shape(mechanics: Mechanics, rows: FloatArray, body: int, variant: str) -> FloatArray:
     """The mode's motion at every row's point, sign included; 1 at the body's outermost attachments."""
-    columns = _columns(mechanics, body)
+    columns = columns_of(mechanics, body)
     sign, x, y = _arms(rows, columns)
     at, reach_x, reach_y = _arms(mechanics.H, columns)
     span_x = max(np.abs(reach_x[at != 0]).max(initial=0.0), 1e-9)
@@ -59,20 +59,26 @@ def _mode_shape(mechanics: Mechanics, rows: FloatArray, body: int, variant: str)
 
 
 def _mode_variants(mechanics: Mechanics, body: int) -> tuple[str, ...]:
-    columns = _columns(mechanics, body)
+    columns = columns_of(mechanics, body)
     if "pitch" not in columns:
         return ("local",)
     return ("bending", "second_bending", "torsion") if "roll" in columns else ("bending", "second_bending")
 
 
-def with_element(mechanics: Mechanics, row: FloatArray, stiffness: float, damping: float) -> Mechanics:
-    """The mechanics with one more spring-damper, after the others, of deflection row @ q; row (n,)."""
+def with_element(
+    mechanics: Mechanics, row: FloatArray, stiffness: float, damping: float, of_supports: FloatArray | None = None
+) -> Mechanics:
+    """The mechanics with one more spring-damper, after the others, of deflection row @ q + of_supports @ s.
+
+    row (n,), of_supports (supports,); zero if left out.
+    """
+    ground = np.zeros(mechanics.G.shape[1]) if of_supports is None else of_supports
     return replace(
         mechanics,
         stiffness=np.append(mechanics.stiffness, stiffness),
         damping=np.append(mechanics.damping, damping),
         H=np.vstack([mechanics.H, row]),
-        G=np.vstack([mechanics.G, np.zeros((1, mechanics.G.shape[1]))]),
+        G=np.vstack([mechanics.G, ground]),
         L=np.hstack([mechanics.L, np.zeros((len(mechanics.L), 1))]),
     )
 
@@ -83,7 +89,7 @@ def _flexible(mechanics: Mechanics, body: int, p: Values, variant: str) -> Mecha
     Its modal mass m is set to the body's mass and phi^2 = participation, which fixes the arbitrary scale of eta.
     """
     frequency, ratio, participation = (float(value) for value in p)
-    columns = _columns(mechanics, body)
+    columns = columns_of(mechanics, body)
     m = mechanics.mass[columns["z"]]
     omega = 2 * np.pi * frequency
     scale = np.sqrt(participation)
@@ -127,13 +133,13 @@ FLEXIBLE_MODE = BodyLaw(
 
 
 def _directions(mechanics: Mechanics, body: int) -> tuple[str, ...]:
-    return tuple(_columns(mechanics, body))
+    return tuple(columns_of(mechanics, body))
 
 
 def _driven(mechanics: Mechanics, body: int, p: Values, variant: str) -> Mechanics:
     """One more measured force, last in u, on one degree of freedom."""
     column = np.zeros((mechanics.n, 1))
-    column[_columns(mechanics, body)[variant]] = 1.0
+    column[columns_of(mechanics, body)[variant]] = 1.0
     return replace(
         mechanics,
         F=np.hstack([mechanics.F, column]),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from sprung.model.address import LawSetting, LawValue
 from sprung.model.laws import CATALOGUE
-from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, SupportLaw
+from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.expression import FormulaError
 from sprung.model.laws.formula import EFFECT, formula_law
 from sprung.model.schema import SupportInput, SystemFile
@@ -56,9 +56,9 @@ _Settings = list[tuple[str, LawSetting]]
 
 def _places(file: SystemFile) -> Iterator[tuple[str, str, _Settings, tuple[type, ...]]]:
     for name, element in file.elements.items():
-        yield f"elements.{name}", name, _listed(element.laws), (ElementLaw,)
+        yield f"elements.{name}", name, _listed(element.laws), (ElementLaw, StructureLaw)
     for name, body in file.bodies.items():
-        yield f"bodies.{name}", name, _listed(body.laws), (BodyLaw,)
+        yield f"bodies.{name}", name, _listed(body.laws), (BodyLaw, StructureLaw)
     for name, source in file.inputs.items():
         yield f"inputs.{name}", name, _listed(source.laws), (SupportLaw, SensorLaw)
         if isinstance(source, SupportInput):
@@ -84,6 +84,8 @@ def _placed(
     numbers = {name: value for name, value in setting.items() if not isinstance(value, str)}
     if isinstance(law, SensorLaw) and "variant" in setting:
         law = _form(law, str(setting["variant"]))
+    if isinstance(law, StructureLaw) and str(setting.get("variant", law.variants[0])) not in law.variants:
+        raise ValueError(f"variant: {law.name} has no {setting['variant']!r}; it has {', '.join(law.variants)}")
     given, wanted = set(numbers), set(law.names)
     if isinstance(law, ElementLaw) and law.wider is not None and given == set(law.wider.names):
         law, wanted = law.wider, given
@@ -124,7 +126,12 @@ def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: S
             return formula_law(texts["formula"], texts.get("memory", ""), names)
         except FormulaError as error:
             raise ValueError(str(error)) from None
-    fitting = [law for law in catalogue if isinstance(law, kinds)]
+    of_element = ElementLaw in kinds
+    fitting = [
+        law
+        for law in catalogue
+        if isinstance(law, kinds) and not (isinstance(law, StructureLaw) and (law.where == "element") != of_element)
+    ]
     for law in fitting:
         if law.name == effect:
             return law
@@ -147,14 +154,19 @@ def _form(law: SensorLaw, variant: str) -> SensorLaw:
 def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) -> str:
     """The place with its partner, for laws that act between two."""
     partner = setting.get("with")
-    if getattr(law, "where", "") not in ("pair", "axle"):
+    where = getattr(law, "where", "")
+    if where not in ("pair", "axle", "bodies"):
         if partner is not None:
             raise ValueError("with: this law acts at one place")
         return location
-    group = file.elements if isinstance(law, ElementLaw) else file.inputs
-    if not isinstance(partner, str) or partner not in group or partner == location:
+    known = {"pair": {*file.elements}, "axle": {*file.inputs}, "bodies": {*file.bodies, *_supports(file)}}[where]
+    if not isinstance(partner, str) or partner not in known or partner == location:
         raise ValueError(f"with: the name of the other one is expected, not {partner!r}")
     return f"{location}|{partner}"
+
+
+def _supports(file: SystemFile) -> list[str]:
+    return [name for name, source in file.inputs.items() if isinstance(source, SupportInput)]
 
 
 def _near(name: str, known: Sequence[str]) -> str:

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import scipy.linalg
 
-from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, SupportLaw
+from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.placed import PlacedLaw
+from sprung.model.laws.structure import sites_of
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
@@ -127,6 +128,10 @@ def _with_body_laws(
     system: System, mechanics: Mechanics, laws: tuple[PlacedLaw, ...], drives: FloatArray, time: FloatArray
 ) -> tuple[Mechanics, FloatArray]:
     for placed in laws:
+        if isinstance(placed.law, StructureLaw):
+            sites = sites_of(system.file, placed.location)
+            variant = placed.variant or placed.law.variants[0]
+            mechanics = placed.law.modify(mechanics, sites, placed.values, variant)
         if isinstance(placed.law, BodyLaw):
             body = system.bodies.index(placed.location)
             variants = placed.law.variants(mechanics, body)

@@ -103,11 +103,11 @@ def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:
 
 
 def scale_of(normal: FloatArray, states: int) -> FloatArray:
-    """What brings the diagonal of normal equations to one; zero for a state at the end of it that leaves no trace.
+    """What brings the diagonal of normal equations to one; zero for what leaves no trace, which then stays as it is.
 
-    Where a body floats, its starting position leaves none in rates and accelerations.
+    Where a body floats, its starting position, among the states at the end, leaves none in rates and accelerations.
     """
     size = np.diag(normal)
-    seen = np.ones(len(size), dtype=bool)
+    seen = size > 0
     seen[-states:] = size[-states:] > _UNSEEN * size[-states:].max()
     return np.where(seen, 1 / np.sqrt(np.maximum(size, 1e-300)), 0.0)

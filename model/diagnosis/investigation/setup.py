@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import baseline
-from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation import setup_changes as changes
 from sprung.model.diagnosis.investigation.setup_hypotheses import (
@@ -34,10 +34,15 @@ from sprung.model.diagnosis.investigation.setup_structure import (
 )
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.screening.score import Projector
+from sprung.model.diagnosis.screening.structures import structure_candidates
+from sprung.model.diagnosis.selection.compete import start_of
+from sprung.model.laws import StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 _FEW = 12  # hypotheses that are all fitted where spectra cannot rank them
+_PART_STEPS = 8  # of the fit of a part
 _SMALL = 0.05  # of a sample, or of a ratio, of differences
 
 
@@ -65,7 +70,7 @@ def without_setup_faults(
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.strange:
         best = _best(system, signals, declared, split, problem, fit, present)
-        if best is None:
+        if best is None or _left_beside_a_part(problem, fit) < rules.outdone * best[0].after:
             break
         fault, system, mended, problem, fit = best
         split, signals = fitted_samples(signals, mended, split), mended
@@ -74,6 +79,15 @@ def without_setup_faults(
         found.append(fault)
         present = misfit(fit)
     return system, signals, tuple(found)
+
+
+def _left_beside_a_part(problem: Problem, fit: Fit) -> float:
+    """Misfit of all sensors beside the best of the parts that a file may lack: then nothing of it is set up wrongly."""
+    laws = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
+    hits = [hit for hit, _ in structure_candidates(Projector(problem, fit), laws)]
+    best = sorted(hits, key=lambda hit: -hit.score)[: problem.rules.setup.parts]
+    fits = [try_optimise(problem, start_of(fit, hit), _PART_STEPS) for hit in best]
+    return min((float(np.sum(misfit(one))) for one in fits if one is not None), default=np.inf)
 
 
 def fitted_samples(whole: Signals, cut: Signals, split: int) -> int:

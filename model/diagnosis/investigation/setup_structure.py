@@ -18,6 +18,7 @@ from sprung.model.diagnosis.investigation.setup_response import Hypothesis
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.rules import SetupRules
+from sprung.model.diagnosis.screening.structures import turns
 from sprung.model.schema import SystemFileError
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -98,7 +99,7 @@ def structure_hypotheses(problem: Problem, fit: Fit, rules: SetupRules) -> Itera
 
 def _elsewhere(scores: SetupScores, system: System, name: str, rules: SetupRules) -> Iterator[Hypothesis]:
     for axis in (0, 1):
-        if not turns(system, name, axis):
+        if not turns(system, name, "xy"[axis]):
             continue
         found = scores.of_system(changes.moved_element(system, name, axis, NEAR))
         offset = found.amount * NEAR
@@ -120,13 +121,6 @@ def _attached(scores: SetupScores, system: System, name: str) -> Iterator[Hypoth
                 continue
             if found.amount > _LEAST:
                 yield Hypothesis("wrong_body", name, None, found.left, attaches(name, end, to), detail=f"{end} {to}")
-
-
-def turns(system: System, element: str, axis: int) -> bool:
-    """Whether an element's place along an axis matters: one of its ends is at a body that turns."""
-    dofs, turn = system.mechanics.dofs, ("pitch", "roll")[axis]
-    ends = system.file.elements[element]
-    return any(f"{end}.{turn}" in dofs for end in (ends.upper, ends.lower))
 
 
 def moves_element(name: str, axis: int, offset: float) -> changes.Undo:

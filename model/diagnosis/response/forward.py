@@ -18,19 +18,23 @@ from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
-from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, SupportLaw
+from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
+from sprung.model.laws.structure import sites_of
 from sprung.model.mechanics import VELOCITY
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
 def structure_of(system: System, sensors: np.ndarray, theta: FloatArray, terms: tuple[Term, ...] = ()) -> Structure:
-    """Structure for log-ratios `theta` (P,) of the system's parameters, with the laws of bodies in place."""
+    """Structure for log-ratios `theta` (P,) of the system's parameters, laws of bodies and structure in place."""
     mechanics = system.mechanics
     for term in terms:
         if isinstance(term.law, BodyLaw) and term.law.load is None:
             body = system.bodies.index(term.location)
             mechanics = term.law.modify(mechanics, body, term.parameters, term.variant)
+        elif isinstance(term.law, StructureLaw):
+            sites = sites_of(system.file, term.location)
+            mechanics = term.law.modify(mechanics, sites, term.parameters, term.variant)
     structure = Structure.nominal(mechanics, sensors)
     stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
     mass = structure.mass.copy()

@@ -18,6 +18,8 @@ class Motions:
 
     deflection: ComplexArray  # (F, elements)
     rate: ComplexArray  # (F, elements)
+    position: ComplexArray  # of the degrees of freedom, (F, n)
+    velocity: ComplexArray  # of the degrees of freedom, (F, n)
     acceleration: ComplexArray  # of the degrees of freedom, (F, n)
 
 
@@ -33,12 +35,18 @@ def motions_of(forward: Forward, forces: LawForces | None, state: FloatArray) ->
         q_poly, d_poly = q_poly + forces.motion, d_poly + forces.motion @ s.H.T
     A = s.state_matrix()
     free = propagate(A, np.eye(len(A)), state, grid.step, grid.samples)
-    d = periodic + grid.monomial_spectra @ d_poly + grid.forward(free[:, :n] @ s.H.T)
-    v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + grid.forward(free[:, n : 2 * n] @ s.H.T)
+    swinging = grid.forward(free)
+    d = periodic + grid.monomial_spectra @ d_poly + swinging[:, :n] @ s.H.T
+    v = jw * periodic + grid.monomial_spectra @ plant.derivative(d_poly) + swinging[:, n : 2 * n] @ s.H.T
     q = _periodic_motion(forward, forces)
-    bend = plant.derivative(plant.derivative(q_poly))
-    acceleration = jw**2 * q + grid.monomial_spectra @ bend + grid.forward(free @ A[n : 2 * n].T)
-    return Motions(d[:, : forward.elements], v[:, : forward.elements], acceleration)
+    slope = plant.derivative(q_poly)
+    return Motions(
+        deflection=d[:, : forward.elements],
+        rate=v[:, : forward.elements],
+        position=q + grid.monomial_spectra @ q_poly + swinging[:, :n],
+        velocity=jw * q + grid.monomial_spectra @ slope + swinging[:, n : 2 * n],
+        acceleration=jw**2 * q + grid.monomial_spectra @ plant.derivative(slope) + swinging @ A[n : 2 * n].T,
+    )
 
 
 def _periodic_motion(forward: Forward, forces: LawForces | None) -> ComplexArray:

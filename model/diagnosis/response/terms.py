@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.response.structure import Branch
-from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw
+from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -94,6 +94,8 @@ def given_terms(system: System) -> tuple[Term, ...]:
         variant = placed.variant
         if isinstance(law, BodyLaw) and not variant:
             variant = law.variants(system.mechanics, system.bodies.index(placed.location))[0]
+        elif isinstance(law, StructureLaw) and not variant:
+            variant = law.variants[0]
         elif isinstance(law, ElementLaw) and any(getattr(other, "wider", None) is law for other in system.catalogue):
             variant = WIDER
         found.append(Term(law, placed.location, placed.values, variant, scales=scales, fixed=placed.fixed))

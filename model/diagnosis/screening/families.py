@@ -22,7 +22,8 @@ HARMONIC = Family("comb", look_elsewhere=22.0)  # thousands of frequencies and p
 LINE = Family("line", freedom=2, look_elsewhere=22.0)  # alike
 MODE = Family("mode")
 MASS = Family("mass")
+STRUCTURE = Family("structure", freedom=None, look_elsewhere=9.0)  # places of a hundred: 2 log of their number
 SENSOR = Family("sensor")
 INPUT = Family("input", rank=0)  # channels of supports, compensated before anything else
 FORCE = Family("force", rank=0)  # measured forces, fitted as a law is
-FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, SENSOR, INPUT, FORCE)
+FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, STRUCTURE, SENSOR, INPUT, FORCE)

@@ -29,7 +29,7 @@ from sprung.model.diagnosis.selection.evidence import (
     profile_gain,
     unusual_cost,
 )
-from sprung.model.laws import BodyLaw, ElementLaw
+from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
 from sprung.model.laws.base import FittedElement, Restart
 
 
@@ -223,7 +223,7 @@ def start_of(base: Fit, hit: Candidate) -> Point:
     point = base.point
     state = point.state
     law = hit.term.law
-    if isinstance(law, BodyLaw) and law.adds_motion:  # one more degree of freedom, at the end of q and of q'
+    if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
         n = (len(state) - len(base.forward.plant.structure.branches)) // 2
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
     if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch

@@ -1,0 +1,267 @@
+"""Candidates of the structure: a connection, a mass that hangs on a body, an element at another place.
+
+What a part does at a point (x, y) of its bodies is a quadratic form in w = (1, x, y): its deflection is w . s and its
+force pushes along w . r, so that a column is sum_ij w_i w_j (r_i s_j).  The six distinct columns are taken through the
+system and projected once; then every place is scored in closed form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import combinations, combinations_with_replacement
+
+import numpy as np
+
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.rules import ScreeningRules
+from sprung.model.diagnosis.screening.families import STRUCTURE
+from sprung.model.diagnosis.screening.score import Candidate, Projector
+from sprung.model.laws import Law, StructureLaw
+from sprung.model.laws.structure import AXES, moved_row, point_rows, sites_of
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of 1, x, y
+_PLACES = {"x": 9, "y": 5}  # along an axis that turns
+_RATIOS = (0.05, 0.15)  # damping ratios of trial masses
+_SEEN = 1e-6  # of a column's square, left by the projection
+
+
+def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
+    """The best trial of every law of the structure at every place, and how many were tried."""
+    system = projector.problem.system
+    for law in laws:
+        if not isinstance(law, StructureLaw):
+            continue
+        if law.where == "bodies":
+            for one, other in unconnected(system):
+                yield _connection(projector, law, one, other)
+        elif law.where == "body":
+            for name in system.bodies:
+                yield _suspended(projector, law, name)
+        else:
+            for name in system.elements:
+                for axis in law.variants:
+                    if turns(system, name, axis):
+                        yield from _moved(projector, law, name, axis)
+
+
+def unconnected(system: System) -> Iterator[tuple[str, str]]:
+    """Pairs of bodies, and of a body and a support that no element joins yet: beside one, that is its own stiffness."""
+    yield from combinations(system.bodies, 2)
+    joined = {frozenset((element.upper, element.lower)) for element in system.file.elements.values()}
+    for body in system.bodies:
+        yield from ((body, name) for name in supports(system) if frozenset((body, name)) not in joined)
+
+
+def turns(system: System, element: str, axis: str) -> bool:
+    """Whether an element's place along an axis matters: one of its ends is at a body that turns."""
+    ends = system.file.elements[element]
+    return any(f"{end}.{AXES[axis]}" in system.mechanics.dofs for end in (ends.upper, ends.lower))
+
+
+def _places(system: System, names: tuple[str, ...]) -> tuple[FloatArray, tuple[bool, ...]]:
+    """Places (m, 2) at which bodies may be held, and whether x and y matter at all."""
+    of = [e.position or (0.0, 0.0) for e in system.file.elements.values() if {e.upper, e.lower} & {*names}]
+    bodies = [name for name in names if name in system.file.bodies]
+    of += [system.file.bodies[name].position for name in bodies]
+    known = np.array(of, dtype=float)
+    axes, free = [], []
+    for number, (axis, rotation) in enumerate(AXES.items()):
+        free.append(any(f"{name}.{rotation}" in system.mechanics.dofs for name in bodies))
+        along = known[:, number]
+        middle = np.linspace(along.min(), along.max(), _PLACES[axis])
+        centre = [system.file.bodies[bodies[0]].position[number]]
+        axes.append(np.unique(np.concatenate([along, middle]).round(6)) if free[-1] else np.array(centre))
+    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=-1), tuple(free)
+
+
+def _forms(places: FloatArray, free: tuple[bool, ...]) -> tuple[list[tuple[int, int]], FloatArray]:
+    """Pairs of (1, x, y) that matter, and their products at every place (m, pairs)."""
+    w = np.column_stack([np.ones(len(places)), places])
+    live = [0, *(number for number, matters in enumerate(free, 1) if matters)]
+    pairs = [pair for pair in _PAIRS if pair[0] in live and pair[1] in live]
+    return pairs, np.column_stack([w[:, i] * w[:, j] for i, j in pairs])
+
+
+def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -> tuple[Candidate, int]:
+    """The best place of a spring-damper between two bodies, or a body and a support."""
+    system, fit, band = projector.problem.system, projector.fit, projector.grid.band
+    location = f"{one}|{other}"
+    places, free = _places(system, (one, other))
+    rows, below = np.zeros((3, system.mechanics.n)), np.zeros((2, projector.of_load.shape[0]), dtype=complex)
+    for sign, site in zip((1.0, -1.0), sites_of(system.file, location), strict=True):
+        if site.kind == "body":
+            rows += sign * point_rows(system.mechanics, site.number)
+        else:
+            below = _support_motion(projector, site.number)
+            places = _held_at(system, one, other)
+    rows = np.pad(rows, ((0, 0), (0, fit.motions.position.shape[1] - system.mechanics.n)))
+    pairs, forms = _forms(places, free)
+    columns = []
+    for motion, under in zip((fit.motions.position, fit.motions.velocity), below, strict=True):
+        along = motion[band] @ rows.T
+        along[:, 0] -= under
+        columns += _columns(projector, rows, along, pairs)
+    score, amount = _nonnegative(projector, np.stack(columns, axis=1), forms)
+    best = int(np.argmax(score))
+    values = (*map(float, amount[best]), *map(float, places[best]))
+    fixed = (False, False, *(not matters for matters in free))
+    term = Term(law, location, values, scales=(*_sizes(system), 1.0, 1.0), fixed=fixed)
+    return Candidate(term, float(score[best]), STRUCTURE), len(places)
+
+
+def _held_at(system: System, body: str, support: str) -> FloatArray:
+    """Where a support is held already, (1, 2)."""
+    at = [e.position for e in system.file.elements.values() if support in (e.upper, e.lower) and e.position]
+    return np.array(at[:1] or [system.file.bodies[body].position], dtype=float)
+
+
+def _support_motion(projector: Projector, support: int) -> ComplexArray:
+    """Displacement and rate of a support over the compared bins, (2, F)."""
+    forward, grid = projector.fit.forward, projector.grid
+    line = forward.support_polynomial[:, support]
+    swinging = forward.support[:, support]
+    rate = forward.plant.derivative(line[:, None])[:, 0]
+    moved = [swinging + grid.monomial_spectra @ line, 1j * grid.omega * swinging + grid.monomial_spectra @ rate]
+    return np.stack(moved)[:, grid.band]
+
+
+def _sizes(system: System) -> tuple[float, float]:
+    """Stiffness and damping that matter in a system."""
+    mechanics = system.mechanics
+    sizes = [values[values > 0] for values in (mechanics.stiffness, mechanics.damping)]
+    return tuple(float(np.median(size)) if len(size) else 1.0 for size in sizes)  # type: ignore[return-value]
+
+
+def _columns(
+    projector: Projector, rows: FloatArray, along: ComplexArray, pairs: list[tuple[int, int]]
+) -> list[FloatArray]:
+    """Answers to the parts w_i w_j of a pull along rows (3, n) that grows with `along` (F, 3), each (2 F S,)."""
+    push = -(projector.of_load @ rows.T)  # (F, S, 3)
+    found = []
+    for i, j in pairs:
+        spectrum = push[:, :, i] * along[:, None, j]
+        found.append(projector.pack(spectrum if i == j else spectrum + push[:, :, j] * along[:, None, i]))
+    return found
+
+
+def _nonnegative(projector: Projector, columns: FloatArray, forms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Scores (m,) and amounts (m, 2) of stiffness and damping at every place, neither negative.
+
+    columns (R, 2 pairs): of both, pair by pair; forms (m, pairs).
+    """
+    inside = projector.q.T @ columns
+    whole = columns.T @ columns
+    left = whole - inside.T @ inside
+    product = columns.T @ projector.residual
+    count = forms.shape[1]
+
+    def of(matrix: FloatArray) -> FloatArray:
+        blocks = matrix.reshape(2, count, 2, count)
+        return np.einsum("mp,apbq,mq->mab", forms, blocks, forms)
+
+    gram, size = of(left), of(whole)
+    b = np.einsum("mp,ap->ma", forms, product.reshape(2, count))
+    own = np.einsum("maa->ma", gram)
+    seen = own > _SEEN * np.einsum("maa->ma", size)
+    own = np.where(seen, own, 1.0)
+    single = np.where(seen & (b > 0), b**2 / own, 0.0)
+    determinant = gram[:, 0, 0] * gram[:, 1, 1] - gram[:, 0, 1] ** 2
+    good = seen.all(axis=1) & (determinant > _SEEN * own[:, 0] * own[:, 1])
+    turned = np.stack(
+        [gram[:, 1, 1] * b[:, 0] - gram[:, 0, 1] * b[:, 1], gram[:, 0, 0] * b[:, 1] - gram[:, 0, 1] * b[:, 0]], axis=1
+    )
+    both = turned / np.where(good, determinant, 1.0)[:, None]
+    good &= np.all(both > 0, axis=1)
+    one = np.argmax(single, axis=1)
+    alone = np.where(np.arange(2) == one[:, None], np.where(single > 0, b / own, 0.0), 0.0)
+    score = np.where(good, np.sum(both * b, axis=1), single.max(axis=1))
+    return score, np.where(good[:, None], both, alone)
+
+
+def _suspended(projector: Projector, law: StructureLaw, name: str) -> tuple[Candidate, int]:
+    """The best place, frequency and damping of a mass that hangs on a body: first order in the mass.
+
+    It pulls its point by m T(w) times that point's acceleration, T = (w0^2 + 2 j z w0 w) / (w0^2 - w^2 + 2 j z w0 w).
+    """
+    system, fit, grid = projector.problem.system, projector.fit, projector.grid
+    (site,) = sites_of(system.file, name)
+    places, free = _places(system, (name,))
+    rows = point_rows(system.mechanics, site.number)
+    rows = np.pad(rows, ((0, 0), (0, fit.motions.position.shape[1] - system.mechanics.n)))
+    pairs, forms = _forms(places, free)
+    along = fit.motions.acceleration[grid.band] @ rows.T
+    columns = np.stack(_columns(projector, rows, along, pairs), axis=1)
+    responses = projector.unpack(columns).transpose(2, 0, 1)  # (pairs, F, S)
+    trials = _trials(1 / grid.step, projector.problem.rules.screening)
+    transfer = _transfer(trials, grid.omega[grid.band])
+    gram, product = _forms_of_trials(projector, responses, transfer)
+    size = np.einsum("mp,tpq,mq->tm", forms, gram, forms, optimize=True)
+    amount = product @ forms.T
+    good = (size > 0) & (amount > 0)
+    score = np.where(good, amount**2 / np.where(good, size, 1.0), 0.0)
+    trial, place = np.unravel_index(int(np.argmax(score)), score.shape)
+    body = system.mechanics.mass[system.mechanics.body_of_dof == site.number][0]
+    mass = float(amount[trial, place] / size[trial, place]) if score[trial, place] > 0 else 0.01 * body
+    mass = float(np.clip(mass, 1e-4 * body, body))
+    values = (mass, *map(float, trials[trial]), *map(float, places[place]))
+    fixed = (False, False, False, *(not matters for matters in free))
+    term = Term(law, name, values, scales=(mass, 1.0, 1.0, 1.0, 1.0), fixed=fixed)
+    return Candidate(term, float(score[trial, place]), STRUCTURE), score.size
+
+
+def _trials(sample_rate: float, rules: ScreeningRules) -> FloatArray:
+    """Frequencies and damping ratios of trial masses, (trials, 2)."""
+    highest, found = rules.highest_mode * sample_rate, []
+    for ratio in _RATIOS:
+        count = max(2, int(np.log(highest / rules.lowest_mode) / ratio))
+        found += [(frequency, ratio) for frequency in np.geomspace(rules.lowest_mode, highest, count)]
+    return np.array(found)
+
+
+def _transfer(trials: FloatArray, omega: FloatArray) -> ComplexArray:
+    """Motion of the hanging mass over its point's, (trials, F)."""
+    w0, ratio = 2 * np.pi * trials[:, :1], trials[:, 1:]
+    carried = w0**2 + 2j * ratio * w0 * omega
+    return np.asarray(carried / (carried - omega**2))
+
+
+def _forms_of_trials(
+    projector: Projector, responses: ComplexArray, transfer: ComplexArray
+) -> tuple[FloatArray, FloatArray]:
+    """Gram matrices (t, p, p) and products with the residual (t, p) of responses (p, F, S) times transfers (t, F).
+
+    What the projection leaves of a column by less than rounding allows has no size.
+    """
+    power = np.abs(transfer) ** 2
+    conj = transfer.conj()
+    product = np.einsum("pfs,fs->fp", responses.conj(), projector.complex_residual)
+    overlap = np.einsum("pfs,qfs->fpq", responses.conj(), responses).real
+    count = len(responses)
+    whole = (power @ overlap.reshape(len(overlap), -1)).reshape(-1, count, count)
+    basis = projector.complex_q
+    inside = np.stack([(conj @ np.einsum("fs,fsq->fq", r.conj(), basis, optimize=True)).real for r in responses], 1)
+    left = whole - inside @ inside.transpose(0, 2, 1)
+    seen = np.einsum("tpp->tp", left) > _SEEN * np.einsum("tpp->tp", whole)
+    left = np.where(seen.all(axis=1)[:, None, None], left, 0.0)
+    return left, (conj @ product).real
+
+
+def _moved(projector: Projector, law: StructureLaw, name: str, axis: str) -> Iterator[tuple[Candidate, int]]:
+    """An element elsewhere along an axis: its force has another lever, and its deflection another share of rotation."""
+    system, fit, grid = projector.problem.system, projector.fit, projector.grid
+    band, plant = grid.band, fit.forward.plant
+    element = system.elements.index(name)
+    change = moved_row(system.mechanics, element, axis)
+    change = np.pad(change, (0, fit.motions.position.shape[1] - len(change)))
+    k, c = plant.structure.stiffness[element], plant.structure.damping[element]
+    force = k * fit.motions.deflection[band, element] + c * fit.motions.rate[band, element]
+    more = k * (fit.motions.position[band] @ change) + c * (fit.motions.velocity[band] @ change)
+    push = -(projector.of_load @ change)
+    column = projector.pack(push * force[:, None] + projector.of_force[:, :, element] * more[:, None])
+    score, offset = projector.score(column)
+    if abs(offset) >= projector.problem.rules.setup.offset:
+        term = Term(law, name, (offset,), axis, scales=(abs(offset),))
+        yield Candidate(term, score, STRUCTURE), 1

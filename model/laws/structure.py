@@ -1,0 +1,168 @@
+"""Parts that a structure has and its file does not state: a connection, a mass that hangs on a body, another place.
+
+All are linear.  A point (x, y) of a body moves by z + (y - y0) roll + (x - x0) pitch, as everywhere.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.laws.base import RARE, Observed, ParameterSpec, Site, StructureLaw, Values
+from sprung.model.laws.bodies import columns_of, with_element
+from sprung.model.mechanics import Mechanics
+from sprung.model.schema import SystemFile
+from sprung.model.signals import FloatArray
+
+AXES = {"x": "pitch", "y": "roll"}  # a place along an axis: the rotation that it is a lever of
+_ANYWHERE = 1e4  # m
+
+
+def point_rows(mechanics: Mechanics, body: int) -> FloatArray:
+    """Vertical motion of a body's points, row(x, y) = rows[0] + x rows[1] + y rows[2] over the degrees of freedom.
+
+    Shape (3, n).
+    """
+    columns = columns_of(mechanics, body)
+    rows = np.zeros((3, mechanics.n))
+    rows[0, columns["z"]] = 1.0
+    for number, (axis, centre) in enumerate(zip(AXES, mechanics.centre[body], strict=True), 1):
+        if AXES[axis] in columns:
+            rows[number, columns[AXES[axis]]] = 1.0
+            rows[0, columns[AXES[axis]]] = -centre
+    return rows
+
+
+def point(mechanics: Mechanics, body: int, x: float, y: float) -> FloatArray:
+    """Vertical motion of one point, (n,)."""
+    return np.array([1.0, x, y]) @ point_rows(mechanics, body)
+
+
+def _any(seen: Observed) -> float:
+    return 1.0
+
+
+def _place(axis: str) -> ParameterSpec:
+    return ParameterSpec(axis, "m", -_ANYWHERE, _ANYWHERE, f"place along {axis}", _any)
+
+
+def _connected(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+    """One more spring-damper from the first site to the second."""
+    stiffness, damping, x, y = (float(value) for value in p)
+    row, ground = np.zeros(mechanics.n), np.zeros(mechanics.G.shape[1])
+    for sign, site in zip((1.0, -1.0), sites, strict=True):
+        if site.kind == "body":
+            row += sign * point(mechanics, site.number, x, y)
+        else:
+            ground[site.number] += sign
+    return with_element(mechanics, row, stiffness, damping, ground)
+
+
+MISSING_CONNECTION = StructureLaw(
+    name="missing_connection",
+    title="a connection that the system file does not have",
+    parameters=(
+        ParameterSpec("stiffness", "N/m", 0.0, 1e15, "of the spring", _any),
+        ParameterSpec("damping", "N s/m", 0.0, 1e12, "of the damper", _any),
+        _place("x"),
+        _place("y"),
+    ),
+    where="bodies",
+    modify=_connected,
+    absent=(0.0, 0.0, 0.0, 0.0),
+    looks_like="two bodies pull each other; springs between them or to others seem off together",
+    confused_with=("anti_roll_bar", "wrong_position", "suspended_mass", "mass_change"),
+    sentence="they are connected by a spring of {stiffness} and a damper of {damping} that the system file does not "
+    "have",
+    axes={2: "x", 3: "y"},
+    prior_cost=RARE,
+)
+
+
+def _suspended(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+    """One more degree of freedom: a mass that hangs on a spring and a damper at a point of a body."""
+    mass, frequency, ratio, x, y = (float(value) for value in p)
+    ((_, body),) = sites
+    omega = 2 * np.pi * frequency
+    row = np.append(point(mechanics, body, x, y), -1.0)
+    extended = replace(
+        mechanics,
+        dofs=(*mechanics.dofs, f"{mechanics.dofs[columns_of(mechanics, body)['z']].rsplit('.', 1)[0]}.suspended"),
+        body_of_dof=np.append(mechanics.body_of_dof, -1),
+        mass=np.append(mechanics.mass, mass),
+        H=np.pad(mechanics.H, ((0, 0), (0, 1))),
+        F=np.pad(mechanics.F, ((0, 1), (0, 0))),
+        S=np.pad(mechanics.S, ((0, 0), (0, 1))),
+    )
+    return with_element(extended, row, mass * omega**2, 2 * ratio * omega * mass)
+
+
+SUSPENDED_MASS = StructureLaw(
+    name="suspended_mass",
+    title="a mass that hangs on the body on a spring",
+    parameters=(
+        ParameterSpec("mass", "kg", 1e-9, 1e9, "beside the body's own", _any, log=True),
+        ParameterSpec("frequency", "Hz", 0.05, 500.0, "of the mass on its spring, the body held", _any, log=True),
+        ParameterSpec("damping_ratio", "1", 1e-4, 2.0, "share of critical damping", _any, log=True),
+        _place("x"),
+        _place("y"),
+    ),
+    where="body",
+    modify=_suspended,
+    absent=(0.0, 1.0, 0.02, 0.0, 0.0),
+    looks_like="the body is heavier below a frequency, and its motion has a notch there; it moves as a rigid one",
+    confused_with=("flexible_mode", "mass_change", "external_force"),
+    sentence="a mass of {mass} hangs on it that swings at {frequency} with {damping_ratio} of critical damping",
+    axes={3: "x", 4: "y"},
+    adds_motion=True,
+    prior_cost=RARE,
+)
+
+
+def _moved(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+    """An element at another place along an axis: another lever at every body that it holds on to."""
+    (offset,) = (float(value) for value in p)
+    ((_, element),) = sites
+    H = mechanics.H.copy()
+    H[element] += offset * moved_row(mechanics, element, variant)
+    return replace(mechanics, H=H)
+
+
+def moved_row(mechanics: Mechanics, element: int, axis: str) -> FloatArray:
+    """Change of an element's deflection over the degrees of freedom per metre that it is moved along an axis, (n,)."""
+    row = np.zeros(mechanics.n)
+    for body in range(len(mechanics.centre)):
+        columns = columns_of(mechanics, body)
+        if AXES[axis] in columns:
+            row[columns[AXES[axis]]] = mechanics.H[element, columns["z"]]
+    return row
+
+
+WRONG_POSITION = StructureLaw(
+    name="wrong_position",
+    title="another lever arm than stated",
+    parameters=(ParameterSpec("offset", "m", -_ANYWHERE, _ANYWHERE, "from the stated position", lambda s: 0.1),),
+    where="element",
+    modify=_moved,
+    absent=(0.0,),
+    looks_like="rotations of the bodies at its ends are pushed more or less than their heave",
+    confused_with=("missing_connection", "anti_roll_bar", "mass_change"),
+    sentence="sits {offset} along {variant} from where the system file says",
+    variants=("x", "y"),
+    fault=True,
+)
+
+
+def sites_of(file: SystemFile, location: str) -> tuple[Site, ...]:
+    """What a location names: bodies, moving supports or elements, "|" between two."""
+    supports = [name for name, source in file.inputs.items() if source.kind != "force"]
+    found = []
+    for name in location.split("|"):
+        if name in file.bodies:
+            found.append(Site("body", list(file.bodies).index(name)))
+        elif name in supports:
+            found.append(Site("support", supports.index(name)))
+        else:
+            found.append(Site("element", list(file.elements).index(name)))
+    return tuple(found)
