@@ -3,7 +3,7 @@
 `python -m sprung.benchmarks.labelled_cases DIR [FILE...]`
 
 One line per recording: V verdict, L located, N named, then what was said.  Places and names count as right when the
-set of findings equals the label's; the effects of an unknown verdict are called `unknown`.
+set of findings equals the label's; the effects of an unknown verdict are called `unknown`, or told by a `formula`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation.verdict import UNLISTED
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.replay.record import load_record
@@ -38,7 +39,7 @@ def compare(report: Report, label: dict[str, Any], system: System) -> dict[str, 
     """Verdict, places, names, errors of parameters in standard deviations."""
     unknown = label["verdict"] == "unknown_physics"
     truth = {(f["location"], "unknown" if unknown else f["effect"]) for f in label["findings"]}
-    said = {(f.location, f.effect) for f in report.findings}
+    said = {(f.location, "unknown" if f.effect in UNLISTED else f.effect) for f in report.findings}
     return {
         "verdict": report.verdict == label["verdict"],
         "located": {place for place, _ in truth} == {place for place, _ in said},

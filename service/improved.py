@@ -84,7 +84,7 @@ def _place(file: Any, system: System, law: IdentifiedLaw) -> None:
     entry = _holder(file, system, names[0])
     if entry is None:
         return
-    values = CommentedMap()
+    values = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
     known = next((one for one in system.catalogue if one.name == law.effect), None)
     corner = known.corner if isinstance(known, ElementLaw) else None
     for index, parameter in enumerate(law.parameters):

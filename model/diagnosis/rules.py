@@ -133,6 +133,17 @@ class AcceptanceRules:
 
 
 @dataclass(frozen=True)
+class FormulaRules:
+    """When an unnamed force is told by a formula."""
+
+    partners: int = rule(16, "shapes that are tried in pairs; chosen: 120 pairs take a second", 8, 30)
+    fitted: int = rule(6, "formulas that are fitted; chosen", 3, 9)
+    slack: float = rule(15.0, "evidence behind the unnamed force; chosen: what a formula costs more", 8.0, 25.0)
+    beyond: float = rule(1.1, "times what a preferred named law explains; chosen", 1.05, 1.3)
+    says: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
+
+
+@dataclass(frozen=True)
 class NoiseRules:
     """When the noise of a single channel is a fault."""
 
@@ -239,6 +250,7 @@ class Rules:
     selection: SelectionRules = SelectionRules()
     plausible: PlausibleRules = PlausibleRules()
     acceptance: AcceptanceRules = AcceptanceRules()
+    formula: FormulaRules = FormulaRules()
     noise: NoiseRules = NoiseRules()
     verdict: VerdictRules = VerdictRules()
     report: ReportRules = ReportRules()

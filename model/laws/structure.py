@@ -148,7 +148,7 @@ WRONG_POSITION = StructureLaw(
     absent=(0.0,),
     looks_like="rotations of the bodies at its ends are pushed more or less than their heave",
     confused_with=("missing_connection", "anti_roll_bar", "mass_change"),
-    sentence="sits {offset} along {variant} from where the system file says",
+    sentence="sits {offset} from where the system file says",
     variants=("x", "y"),
     fault=True,
 )

@@ -20,6 +20,7 @@ from sprung.model.diagnosis.investigation.course import (
     Recorded,
 )
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
+from sprung.model.diagnosis.investigation.formula import formula_of
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
@@ -35,6 +36,7 @@ from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, 
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
 from sprung.model.laws import ElementLaw
+from sprung.model.laws.formula import EFFECT
 from sprung.model.system import System
 
 
@@ -173,11 +175,14 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
     worthy = [t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)]
-    trials = preferred([t for t in worthy if any(t is one for one in believed)], options.rules.selection)
+    plain = [t for t in worthy if any(t is one for one in believed)]
+    trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
     state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials, plausible)))
     if not trials:
         return state
+    tell(share + 0.08, f"checking {trials[0].term.location}")
+    trials, note = _with_formula(state, plain[0], trials)
     chosen = trials[0]
     if options.held_out and not state.held.still and state.held.compare(state.fit, chosen.fit).refuted:
         return state
@@ -196,6 +201,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         held=replace(state.held, noise=problem.noise),
         found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value)),
         last=screen(problem, fit, options.catalogue, options.project),
+        notes=(*state.notes, *note),
     )
 
 
@@ -223,6 +229,24 @@ def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[
     return best
 
 
+def _with_formula(state: Investigation, leader: Trial, trials: list[Trial]) -> tuple[list[Trial], tuple[str, ...]]:
+    """Trials led by the formula of the force that leads by evidence where that has no name; a note where none is found.
+
+    A named law that was preferred to an unnamed force makes way only for a formula that explains more than it does.
+    """
+    if leader.named or state.problem.process_noise:
+        return trials, ()
+    with np.errstate(all="ignore"):  # trial formulas overflow
+        formula = formula_of(state.problem, state.fit, leader, state.held)
+    beyond = state.options.rules.formula.beyond
+    if formula is not None and (not trials[0].named or formula.explains > beyond * trials[0].explains):
+        return [formula, *(trial for trial in trials if trial is not leader)], ()
+    if formula is not None or trials[0].named:
+        return trials, ()
+    place = leader.term.location
+    return trials, (f"{place}: surface only; no formula of the grammar says as much as the measured force map",)
+
+
 def _smoother(state: Investigation, fit: Fit) -> Fit:
     """The unnamed force of a fit as an estimated surface, if that serves the held-out part better."""
     surface = with_surface(state.problem, fit)
@@ -236,7 +260,7 @@ def _repeats(state: Investigation, hit: Candidate) -> bool:
     for term in state.fit.point.terms:
         if hit.term.key[:2] == term.key[:2]:
             return True
-        if hit.location == term.location and not term.law.named:
+        if hit.location == term.location and (not term.law.named or term.law.name == EFFECT):
             return True
     return False
 

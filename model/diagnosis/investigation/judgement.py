@@ -9,12 +9,13 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
-from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import UNLISTED, HeldOutErrors, bounded_noise, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.laws.basis import UNKNOWN
 from sprung.model.signals import FloatArray
 
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
@@ -46,7 +47,8 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     effects += [found.trial.term.law.name for found in state.found]
     verdict = verdict_of(effects, deciding, rules)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
-    carried = verdict != "unknown_physics" or not state.found or not state.found[0].trial.named
+    first = state.found[0].trial.term.law.name if state.found else UNKNOWN
+    carried = verdict != "unknown_physics" or first in UNLISTED
     return Judgement(
         errors=errors,
         verdict=verdict,

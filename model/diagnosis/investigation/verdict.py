@@ -20,6 +20,7 @@ import numpy as np
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.formula import EFFECT
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
@@ -27,6 +28,7 @@ SETUP_EFFECTS = frozenset(
     {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position", "wrong_body"}
 )
 SENSOR_FAULTS = frozenset({law.name for law in CATALOGUE if law.fault} | SETUP_EFFECTS)
+UNLISTED = frozenset({UNKNOWN, EFFECT})  # physics that no law of the catalogue explains
 NO_FAULTS = frozenset({law.name for law in CATALOGUE if law.nuisance})
 
 
@@ -72,7 +74,7 @@ def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRule
     physics = [effect for effect in named if effect not in SENSOR_FAULTS]
     if not physics:
         return "sensor_fault"
-    return "unknown_physics" if physics[0] == UNKNOWN else "missing_physics"
+    return "unknown_physics" if physics[0] in UNLISTED else "missing_physics"
 
 
 def bounded_noise(

@@ -54,11 +54,13 @@ class IdentifiedLaw:
     effect: str
     parameters: tuple[LawParameter, ...]
     variant: str = ""  # of body laws: the mode's shape, the direction of a force
+    formula: str = ""  # of a force that is known by its formula alone, in d, v and z
+    memory: str = ""  # the rate of z
 
     def to_dict(self) -> dict[str, Any]:
-        """Without a variant where there is none."""
-        variant = {"variant": self.variant} if self.variant else {}
-        return {"location": self.location, "effect": self.effect} | variant | {"parameters": plain(self.parameters)}
+        """Without a variant or a formula where there is none."""
+        texts = {name: getattr(self, name) for name in ("variant", "formula", "memory") if getattr(self, name)}
+        return {"location": self.location, "effect": self.effect} | texts | {"parameters": plain(self.parameters)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +100,8 @@ class Finding:
     quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
     # evidence by which it beats each law that similar data may suggest and that was fitted
     look_alikes: Mapping[str, float] = field(default_factory=dict)
+    formula: str = ""  # of a law found by regression, in deflection d, rate v and a hidden state z
+    memory: str = ""  # the rate of z
 
     def to_dict(self) -> dict[str, Any]:
         """Without what there is nothing of."""
@@ -114,7 +118,8 @@ class Finding:
             effect, delta_bic = self.runner_up
             place = {} if self.runner_up_location is None else {"location": self.runner_up_location}
             result["runner_up"] = {"effect": effect, "delta_bic": plain(delta_bic)} | place
-        more = {"family": self.family, "advice": self.advice, "quoted": self.quoted, "look_alikes": self.look_alikes}
+        names = ("formula", "memory", "family", "advice", "quoted", "look_alikes")
+        more = {name: getattr(self, name) for name in names}
         return result | {name: plain(value) for name, value in more.items() if value}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -17,6 +17,36 @@ from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import static_law, trials
 from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class ElementMotion:
+    """One element of a fit as trial forces see it."""
+
+    projector: Projector
+    location: str
+    deflection: FloatArray  # oversampled, (4N,)
+    rate: FloatArray
+    seen: Observed
+    element: SpringDamper
+    channel: ScalarResponse
+
+    @classmethod
+    def of(cls, projector: Projector, location: str) -> ElementMotion:
+        """Of a fit's projector."""
+        index = projector.problem.system.elements.index(location)
+        d, v = (motion[:, index] for motion in projector.fit.element_motion)
+        seen, element = _seen(projector, location, d, v)
+        channel = ScalarResponse(projector, projector.of_force[:, :, index])
+        return cls(projector, location, d, v, seen, element, channel)
+
+    def spectra(self, term: Term, trials: FloatArray) -> ComplexArray:
+        """Forces of a law for trial values (m, P) over the compared bins, (m, F); zero where they overflow."""
+        of = [
+            _force_spectrum(self.projector, term.at(trial), self.deflection, self.rate, self.element)
+            for trial in trials
+        ]
+        return np.where(np.isfinite(of), of, 0.0)[:, self.projector.grid.band]
 
 
 def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
