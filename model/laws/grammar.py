@@ -9,7 +9,7 @@ is paid for by the number of formulas of as many parts (`formula_cost`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -132,7 +132,9 @@ def formula_cost(parts: int) -> float:
 
 def law_of(forms: tuple[Form, ...]) -> ElementLaw:
     """The law of a sum of shapes, each with an amplitude a, b, ...; at most one of them with the hidden state."""
-    texts, names, units = [], [], {}
+    texts: list[str] = []
+    names: list[str] = []
+    units: dict[str, str] = {}
     specs: list[ParameterSpec] = []
     for number, form in enumerate(forms):
         amplitude = "abc"[number]
@@ -147,17 +149,17 @@ def law_of(forms: tuple[Form, ...]) -> ElementLaw:
         units |= {amplitude: form.unit, **{new: _INNER[name][0] for name, new in renamed.items()}}
     remembers = any(form.memory for form in forms)
     law = formula_law(" + ".join(texts), "v - z / tau" if remembers else "", tuple(names), units)
-    changes = {
-        "parameters": tuple(specs),
-        "absent": tuple(0.0 if spec.name in "abc" else 1.0 for spec in specs),
-        "strength": 0 if len(forms) == 1 else None,
-        "prior_cost": formula_cost(sum(form.parts for form in forms)),
-        "passive": False,
-        "odd": False,
-        "shapes": (lambda seen: _trials(forms[0], seen)) if len(forms) == 1 else law.shapes,
-        "path": _filtered(law, names.index("tau")) if remembers else None,
-    }
-    return replace(law, **changes)
+    return replace(
+        law,
+        parameters=tuple(specs),
+        absent=tuple(0.0 if spec.name in "abc" else 1.0 for spec in specs),
+        strength=0 if len(forms) == 1 else None,
+        prior_cost=formula_cost(sum(form.parts for form in forms)),
+        passive=False,
+        odd=False,
+        shapes=(lambda seen: _trials(forms[0], seen)) if len(forms) == 1 else law.shapes,
+        path=_filtered(law, names.index("tau")) if remembers else None,
+    )
 
 
 def _renamed(text: str, name: str, new: str) -> str:
@@ -187,7 +189,7 @@ def _trials(form: Form, seen: Observed) -> FloatArray:
     return grid([0.1 * size], *inner)
 
 
-def _filtered(law: ElementLaw, tau: int) -> object:
+def _filtered(law: ElementLaw, tau: int) -> Callable[[Motion, Values], FloatArray]:
     """Force along an evenly sampled motion: z' = v - z / tau is a first-order filter of the deflection."""
 
     def path(motion: Motion, p: Values) -> FloatArray:

@@ -14,6 +14,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import FormulaRules
 from sprung.model.diagnosis.screening.elements import ElementMotion
@@ -22,7 +23,6 @@ from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.diagnosis.selection.compete import Trial, compete
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.laws.grammar import Form, forms, formula_cost, law_of
-from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Scored:
     form: Form
     values: tuple[float, ...]  # amplitude, own values
     score: float
-    spectrum: FloatArray  # of the force per unit of amplitude, complex, (F,)
+    spectrum: ComplexArray  # of the force per unit of amplitude, (F,)
 
     @property
     def worth(self) -> float:
