@@ -8,14 +8,16 @@ import numpy as np
 
 from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.setup import SetupFault
+from sprung.model.diagnosis.investigation.verdict import UNLISTED
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of, with_deviation
-from sprung.model.diagnosis.report.values import law_parameters
+from sprung.model.diagnosis.report.values import formula_of, law_parameters
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
+from sprung.model.signals import FloatArray
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
@@ -31,7 +33,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
-    if said.verdict == "unknown_physics" and not any(f.effect == UNKNOWN for f in findings):
+    if said.verdict == "unknown_physics" and not any(f.effect in UNLISTED for f in findings):
         findings.insert(len(course.setup_faults), _unknown_finding(outcome))
     return findings
 
@@ -60,7 +62,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
     course, findings = outcome.investigation, []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[course.given + index]
-        parameters, block = law_parameters(outcome.final, course.given + index)
+        parameters, block = _free(term, *law_parameters(outcome.final, course.given + index))
         rival = found.runner_up
         family, advice = _look_alikes(found, course.options.rules.report)
         finding = Finding(
@@ -75,9 +77,21 @@ def _physics(outcome: Outcome) -> list[Finding]:
             advice=advice,
             parameter_covariance=block,
             look_alikes=_beaten(found),
+            formula=formula_of(term)[0],
+            memory=formula_of(term)[1],
         )
         findings.append(replace(finding, sentence=sentence_of(outcome, term, finding)))
     return findings
+
+
+def _free(
+    term: Term, parameters: tuple[LawParameter, ...], block: FloatArray
+) -> tuple[tuple[LawParameter, ...], FloatArray]:
+    """Parameters and their covariance without those that nothing depends on: where a body that only heaves is held."""
+    if not parameters or not any(term.fixed):
+        return parameters, block
+    free = [i for i, fixed in enumerate(term.fixed) if not fixed]
+    return tuple(parameters[i] for i in free), block[np.ix_(free, free)]
 
 
 def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:

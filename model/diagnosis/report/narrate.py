@@ -17,7 +17,7 @@ from sprung.model.diagnosis.report.report import (
     Report,
     Unexplained,
 )
-from sprung.model.diagnosis.report.values import deviations, figures, law_parameters, reported_parameters
+from sprung.model.diagnosis.report.values import deviations, figures, formula_of, law_parameters, reported_parameters
 
 
 def narrate(outcome: Outcome, record: Recorded) -> Report:
@@ -69,7 +69,8 @@ def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
         if term.law.named:
-            found.append(IdentifiedLaw(term.location, term.law.name, law_parameters(fit, index)[0], term.variant))
+            values, texts = law_parameters(fit, index)[0], formula_of(term)
+            found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
     for fault in course.input_faults:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
         parameter = LawParameter(spec.name, value, fault.std, spec.unit)

@@ -8,6 +8,7 @@ from sprung.model.diagnosis.investigation.course import Outcome
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import StructureLaw
 
 _NO_LONGER = 900.0  # %, of a value that stood for something else
 
@@ -24,9 +25,11 @@ def with_deviation(parameter: LawParameter) -> str:
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     values = {p.name: with_deviation(p) for p in finding.parameters}
     try:
-        words = term.law.sentence.format(**values)
+        words = _told(finding) if finding.formula else term.law.sentence.format(**values)
     except (KeyError, IndexError):
         words = term.law.title
+    if isinstance(term.law, StructureLaw) and term.variant:
+        words += f", along {term.variant}"
     if finding.family is not None:
         words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
@@ -34,6 +37,13 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     if bias is not None:
         sentence += f"; {bias}"
     return sentence
+
+
+def _told(finding: Finding) -> str:
+    """A formula with its values."""
+    values = ", ".join(f"{p.name} = {with_deviation(p)}" for p in finding.parameters)
+    hidden = f" with z' = {finding.memory}" if finding.memory else ""
+    return f"a force that no law of the catalogue explains, by regression {finding.formula}{hidden} ({values})"
 
 
 def _worst_bias(outcome: Outcome) -> str | None:

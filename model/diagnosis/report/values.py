@@ -8,6 +8,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import ElementLaw, reversal_step
+from sprung.model.laws.formula import EFFECT
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -83,3 +84,9 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
     along = covariance[:, corner] / covariance[corner, corner]  # what the others do when the width is off
     found: FloatArray = covariance + 2 * np.outer(along, along) * (width * x / np.sinh(x)) ** 2
     return found
+
+
+def formula_of(term: Term) -> tuple[str, str]:
+    """Text of the force and of its hidden state's rate, of a law that is known by them alone; empty for others."""
+    law = term.law
+    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and law.name == EFFECT else ("", "")
