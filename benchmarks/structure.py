@@ -36,7 +36,7 @@ HIDDEN = "hidden"
 
 
 @dataclass(frozen=True)
-class Part:
+class ConcealedPart:
     """One concealed part: what the diagnosis should say, and the file with it."""
 
     effect: str  # "" of a clean recording
@@ -46,7 +46,7 @@ class Part:
 
 
 @dataclass(frozen=True)
-class Recording:
+class MadeSamples:
     """Samples in the order of a system's channels."""
 
     values: Array
@@ -101,7 +101,7 @@ def run(
     }
 
 
-def errors(findings: Any, part: Part) -> dict[str, list[float]]:
+def errors(findings: Any, part: ConcealedPart) -> dict[str, list[float]]:
     """Value found and deviations from the truth, of the parameters of the right finding."""
     for finding in findings:
         if (finding.location, finding.effect) == (part.location, part.effect):
@@ -113,7 +113,7 @@ def errors(findings: Any, part: Part) -> dict[str, list[float]]:
     return {}
 
 
-def drawn(data: dict[str, Any], kind: str, random: np.random.Generator) -> Part:
+def drawn(data: dict[str, Any], kind: str, random: np.random.Generator) -> ConcealedPart:
     """A vehicle with elements within 15 % of nominal, and with a part of a kind."""
     data = copy.deepcopy(data)
     for element in data["elements"].values():
@@ -125,7 +125,7 @@ def drawn(data: dict[str, Any], kind: str, random: np.random.Generator) -> Part:
         return _suspended(data, random)
     if kind == "wrong_position":
         return _moved(data, random)
-    return Part("", "", {}, data)
+    return ConcealedPart("", "", {}, data)
 
 
 def _span(data: dict[str, Any], names: tuple[str, ...], axis: int) -> tuple[float, float]:
@@ -134,7 +134,7 @@ def _span(data: dict[str, Any], names: tuple[str, ...], axis: int) -> tuple[floa
     return min(at), max(at)
 
 
-def _connected(data: dict[str, Any], random: np.random.Generator) -> Part:
+def _connected(data: dict[str, Any], random: np.random.Generator) -> ConcealedPart:
     bodies, inputs, elements = list(data["bodies"]), list(data["inputs"]), data["elements"]
     joined = {frozenset((e["upper"], e["lower"])) for e in elements.values()}
     pairs = [(a, b) for i, a in enumerate(bodies) for b in bodies[i + 1 :]]
@@ -148,7 +148,7 @@ def _connected(data: dict[str, Any], random: np.random.Generator) -> Part:
         x, y = (float(random.uniform(*_span(data, (one, other), axis))) for axis in (0, 1))
     elements[HIDDEN] = {"upper": one, "lower": other, "position": [x, y], **values}
     place = {name: value for name, value in (("x", x), ("y", y)) if _turns(data, (one, other), name)}
-    return Part("missing_connection", f"{one}|{other}", values | place, data)
+    return ConcealedPart("missing_connection", f"{one}|{other}", values | place, data)
 
 
 def _turns(data: dict[str, Any], names: tuple[str, ...], axis: str) -> bool:
@@ -156,7 +156,7 @@ def _turns(data: dict[str, Any], names: tuple[str, ...], axis: str) -> bool:
     return any(key in data["bodies"].get(name, {}) for name in names)
 
 
-def _suspended(data: dict[str, Any], random: np.random.Generator) -> Part:
+def _suspended(data: dict[str, Any], random: np.random.Generator) -> ConcealedPart:
     body = list(data["bodies"])[0 if random.random() < 0.8 else -1]
     mass = data["bodies"][body]["mass"] * float(np.exp(random.uniform(np.log(0.01), np.log(0.08))))
     frequency, ratio = float(random.uniform(3.0, 12.0)), float(random.uniform(0.02, 0.15))
@@ -166,10 +166,12 @@ def _suspended(data: dict[str, Any], random: np.random.Generator) -> Part:
     spring = {"stiffness": mass * omega**2, "damping": 2 * ratio * omega * mass}
     data["elements"][HIDDEN] = {"upper": body, "lower": HIDDEN, "position": [x, y], **spring}
     place = {name: value for name, value in (("x", x), ("y", y)) if _turns(data, (body,), name)}
-    return Part("suspended_mass", body, {"mass": mass, "frequency": frequency, "damping_ratio": ratio} | place, data)
+    return ConcealedPart(
+        "suspended_mass", body, {"mass": mass, "frequency": frequency, "damping_ratio": ratio} | place, data
+    )
 
 
-def _moved(data: dict[str, Any], random: np.random.Generator) -> Part:
+def _moved(data: dict[str, Any], random: np.random.Generator) -> ConcealedPart:
     """An element is not where the file says: the one that the diagnosis is given is the unmoved one."""
     elements = data["elements"]
     places = [
@@ -183,12 +185,12 @@ def _moved(data: dict[str, Any], random: np.random.Generator) -> Part:
     position = list(elements[name]["position"])
     position["xy".index(axis)] += offset
     elements[name]["position"] = position
-    return Part("wrong_position", name, {"offset": offset}, data)
+    return ConcealedPart("wrong_position", name, {"offset": offset}, data)
 
 
 def made(
-    part: Part, stated: dict[str, Any], system: System, random: np.random.Generator, seconds: float
-) -> tuple[Recording, float]:
+    part: ConcealedPart, stated: dict[str, Any], system: System, random: np.random.Generator, seconds: float
+) -> tuple[MadeSamples, float]:
     """The recording of a vehicle, and the signal-to-noise ratio of its part."""
     vehicle, whole = vehicle_of(stated), vehicle_of(part.data)
     case = Case(
@@ -204,7 +206,7 @@ def made(
     snr = oracle_snr(vehicle, case, clean, clean)
     noise = np.concatenate([vehicle.input_noise.ravel(), vehicle.sensor_noise])
     values = clean + random.standard_normal(clean.shape) * noise
-    return Recording(in_order(vehicle, system, values)), float(snr or 0.0)
+    return MadeSamples(in_order(vehicle, system, values)), float(snr or 0.0)
 
 
 def in_order(vehicle: Vehicle, system: System, values: Array) -> Array:

@@ -250,7 +250,7 @@ class BodyLaw(Parametrised):
     prior_cost: float = 0.0
 
 
-class Site(NamedTuple):
+class Foothold(NamedTuple):
     """What a change of the structure takes hold of, by its index in the mechanics."""
 
     kind: Literal["body", "support", "element"]
@@ -269,7 +269,7 @@ class StructureLaw(Parametrised):
     parameters: tuple[ParameterSpec, ...]
     where: Where  # "body", "bodies" or "element"
     # The mechanics with the law, of the sites that its location names; `variant` as in a term
-    modify: Callable[[Mechanics, tuple[Site, ...], Values, str], Mechanics]
+    modify: Callable[[Mechanics, tuple[Foothold, ...], Values, str], Mechanics]
     absent: tuple[float, ...]
     looks_like: str
     confused_with: tuple[str, ...]

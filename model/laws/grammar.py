@@ -69,7 +69,7 @@ _LINEAR = {("d", ""), ("", "v")}  # spring and damper
 
 
 @dataclass(frozen=True)
-class Form:
+class Shape:
     """One shape of the grammar."""
 
     first: Factor
@@ -107,21 +107,21 @@ class Form:
         return f"N{times}{over}"
 
 
-def forms() -> tuple[Form, ...]:
+def forms() -> tuple[Shape, ...]:
     """Every shape of the grammar but spring and damper themselves."""
     return tuple(_forms())
 
 
-def _forms() -> Iterator[Form]:
+def _forms() -> Iterator[Shape]:
     powers_d, powers_v = (NOTHING, *OF_DEFLECTION), (NOTHING, *OF_RATE)
     for first, second in product(powers_d, powers_v):
         if first.text + second.text and (first.text, second.text) not in _LINEAR:
-            yield Form(first, second) if first.text else Form(second)
+            yield Shape(first, second) if first.text else Shape(second)
     simple = [factor for factor in (*powers_d, *OF_RATE) if factor.text in _SIMPLE]
     for own, beside in product((*OF_LENGTH, *OF_SPEED), simple):
-        yield Form(own, beside)
+        yield Shape(own, beside)
     for own in OF_MEMORY:
-        yield from (Form(own, beside, memory=True) for beside in (NOTHING, *OF_DEFLECTION[:2], OF_RATE[1]))
+        yield from (Shape(own, beside, memory=True) for beside in (NOTHING, *OF_DEFLECTION[:2], OF_RATE[1]))
 
 
 def formula_cost(parts: int) -> float:
@@ -130,7 +130,7 @@ def formula_cost(parts: int) -> float:
     return RARE + 2.0 * float(np.log(len(OF_DEFLECTION) + len(OF_RATE))) * parts / 2
 
 
-def law_of(forms: tuple[Form, ...]) -> ElementLaw:
+def law_of(forms: tuple[Shape, ...]) -> ElementLaw:
     """The law of a sum of shapes, each with an amplitude a, b, ...; at most one of them with the hidden state."""
     texts: list[str] = []
     names: list[str] = []
@@ -166,7 +166,7 @@ def _renamed(text: str, name: str, new: str) -> str:
     return text.replace(f"/ {name})", f"/ {new})").replace(f"- {name},", f"- {new},")
 
 
-def _amplitude(name: str, form: Form) -> ParameterSpec:
+def _amplitude(name: str, form: Shape) -> ParameterSpec:
     def typical(seen: Observed) -> float:
         return 0.1 * max(seen.stiffness * seen.deflection_rms, seen.damping * seen.rate_rms, 1e-12) / form.size(seen)
 
@@ -182,7 +182,7 @@ def _scale(kind: str, seen: Observed) -> float:
     return {"L": max(seen.deflection_rms, 1e-9), "U": max(seen.rate_rms, 1e-9), "tau": 1.0}[kind]
 
 
-def _trials(form: Form, seen: Observed) -> FloatArray:
+def _trials(form: Shape, seen: Observed) -> FloatArray:
     """Values of a single shape to be scored: unit amplitude, its own values over a grid."""
     inner = [np.array(_INNER[kind][3]) * _scale(kind, seen) for kind in form.inner]
     size = max(seen.stiffness * seen.deflection_rms, 1e-12) / form.size(seen)

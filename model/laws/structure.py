@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, Observed, ParameterSpec, Site, StructureLaw, Values
+from sprung.model.laws.base import RARE, Foothold, Observed, ParameterSpec, StructureLaw, Values
 from sprung.model.laws.bodies import columns_of, with_element
 from sprung.model.mechanics import Mechanics
 from sprung.model.schema import SystemFile
@@ -47,7 +47,7 @@ def _place(axis: str) -> ParameterSpec:
     return ParameterSpec(axis, "m", -_ANYWHERE, _ANYWHERE, f"place along {axis}", _any)
 
 
-def _connected(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+def _connected(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
     """One more spring-damper from the first site to the second."""
     stiffness, damping, x, y = (float(value) for value in p)
     row, ground = np.zeros(mechanics.n), np.zeros(mechanics.G.shape[1])
@@ -80,7 +80,7 @@ MISSING_CONNECTION = StructureLaw(
 )
 
 
-def _suspended(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+def _suspended(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
     """One more degree of freedom: a mass that hangs on a spring and a damper at a point of a body."""
     mass, frequency, ratio, x, y = (float(value) for value in p)
     ((_, body),) = sites
@@ -120,7 +120,7 @@ SUSPENDED_MASS = StructureLaw(
 )
 
 
-def _moved(mechanics: Mechanics, sites: tuple[Site, ...], p: Values, variant: str) -> Mechanics:
+def _moved(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
     """An element at another place along an axis: another lever at every body that it holds on to."""
     (offset,) = (float(value) for value in p)
     ((_, element),) = sites
@@ -154,15 +154,15 @@ WRONG_POSITION = StructureLaw(
 )
 
 
-def sites_of(file: SystemFile, location: str) -> tuple[Site, ...]:
+def sites_of(file: SystemFile, location: str) -> tuple[Foothold, ...]:
     """What a location names: bodies, moving supports or elements, "|" between two."""
     supports = [name for name, source in file.inputs.items() if source.kind != "force"]
     found = []
     for name in location.split("|"):
         if name in file.bodies:
-            found.append(Site("body", list(file.bodies).index(name)))
+            found.append(Foothold("body", list(file.bodies).index(name)))
         elif name in supports:
-            found.append(Site("support", supports.index(name)))
+            found.append(Foothold("support", supports.index(name)))
         else:
-            found.append(Site("element", list(file.elements).index(name)))
+            found.append(Foothold("element", list(file.elements).index(name)))
     return tuple(found)

@@ -7,7 +7,7 @@ import pytest
 
 from sprung.model.laws import SpringDamper, observe
 from sprung.model.laws.base import Motion
-from sprung.model.laws.grammar import OF_DEFLECTION, OF_RATE, Factor, Form, forms, formula_cost, law_of
+from sprung.model.laws.grammar import OF_DEFLECTION, OF_RATE, Factor, Shape, forms, formula_cost, law_of
 from sprung.model.laws.trajectory import along
 
 TIME = np.arange(2000) / 400
@@ -27,10 +27,10 @@ def test_every_shape_is_a_law_with_trials_along_a_motion():
 
 
 def test_units_make_the_product_a_force():
-    assert Form(OF_DEFLECTION[0], OF_RATE[1]).unit == "N s/m^2"  # d |v|
-    assert Form(OF_DEFLECTION[3]).unit == "N/m^2"  # d^2
-    assert Form(Factor("sin(d / L)", inner="L")).unit == "N"
-    assert Form(OF_RATE[2]).unit == "N s^2/m^2"  # v |v|
+    assert Shape(OF_DEFLECTION[0], OF_RATE[1]).unit == "N s/m^2"  # d |v|
+    assert Shape(OF_DEFLECTION[3]).unit == "N/m^2"  # d^2
+    assert Shape(Factor("sin(d / L)", inner="L")).unit == "N"
+    assert Shape(OF_RATE[2]).unit == "N s^2/m^2"  # v |v|
 
 
 def test_spring_and_damper_are_no_formulas():
@@ -42,14 +42,14 @@ def test_more_parts_cost_more():
 
 
 def test_a_sum_names_its_values_apart():
-    one, other = Form(Factor("sin(d / L)", inner="L")), Form(Factor("max(d - L, 0)", 1, inner="L"))
+    one, other = Shape(Factor("sin(d / L)", inner="L")), Shape(Factor("max(d - L, 0)", 1, inner="L"))
     law = law_of((one, other))
     assert law.formula == "a * sin(d / L) + b * max(d - L2, 0)"
     assert law.names == ("a", "L", "b", "L2")
 
 
 def test_the_hidden_state_is_filtered_as_it_is_integrated():
-    law = law_of((Form(Factor("z**2", 2), memory=True),))
+    law = law_of((Shape(Factor("z**2", 2), memory=True),))
     p = (3e7, 0.08)
     assert law.path is not None
     quick = law.path(Motion(D, V, TIME), p)

@@ -17,19 +17,19 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import FormulaRules
-from sprung.model.diagnosis.screening.elements import ElementMotion
+from sprung.model.diagnosis.screening.elements import TrialElement
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.diagnosis.selection.compete import Trial, compete
 from sprung.model.diagnosis.selection.holdout import HeldOut
-from sprung.model.laws.grammar import Form, forms, formula_cost, law_of
+from sprung.model.laws.grammar import Shape, forms, formula_cost, law_of
 
 
 @dataclass(frozen=True)
 class Scored:
     """One shape with its own values, as screened."""
 
-    form: Form
+    form: Shape
     values: tuple[float, ...]  # amplitude, own values
     score: float
     spectrum: ComplexArray  # of the force per unit of amplitude, (F,)
@@ -46,7 +46,7 @@ def formula_of(problem: Problem, base: Fit, unnamed: Trial, held: HeldOut) -> Tr
     base: the model without it.  Single shapes come first; two together only where no single one says as much.
     """
     rules = problem.rules.formula
-    motion = ElementMotion.of(Projector(problem, base), unnamed.term.location)
+    motion = TrialElement.of(Projector(problem, base), unnamed.term.location)
     singles = sorted((_best(motion, form) for form in forms()), key=lambda one: -one.worth)
     alone = [_candidate(motion, (one.form,), one.values, one.score) for one in singles[: rules.fitted]]
     found = _believed(compete(problem, base, alone), unnamed, held, rules)
@@ -70,7 +70,7 @@ def _worth(hit: Candidate) -> float:
     return hit.score - hit.term.law.prior_cost
 
 
-def _best(motion: ElementMotion, form: Form) -> Scored:
+def _best(motion: TrialElement, form: Shape) -> Scored:
     """A shape at the values of its own that score best."""
     law = law_of((form,))
     trials = law.shapes(motion.seen)
@@ -81,14 +81,14 @@ def _best(motion: ElementMotion, form: Form) -> Scored:
     return Scored(form, values, float(scores[i]), spectra[i] / trials[i][0])
 
 
-def _candidate(motion: ElementMotion, parts: tuple[Form, ...], values: tuple[float, ...], score: float) -> Candidate:
+def _candidate(motion: TrialElement, parts: tuple[Shape, ...], values: tuple[float, ...], score: float) -> Candidate:
     law = law_of(parts)
     scales = tuple(max(abs(spec.typical(motion.seen)), 1e-12) for spec in law.parameters)
     term = Term(law, motion.location, values, " + ".join(form.text for form in parts), scales=scales)
     return Candidate(term, score, ELEMENT)
 
 
-def _pair(motion: ElementMotion, one: Scored, other: Scored) -> Candidate | None:
+def _pair(motion: TrialElement, one: Scored, other: Scored) -> Candidate | None:
     """Two shapes together; None for two hidden states, which would need a time each."""
     if one.form.memory and other.form.memory:
         return None

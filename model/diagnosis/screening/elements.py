@@ -20,7 +20,7 @@ from sprung.model.signals import FloatArray
 
 
 @dataclass(frozen=True)
-class ElementMotion:
+class TrialElement:
     """One element of a fit as trial forces see it."""
 
     projector: Projector
@@ -32,7 +32,7 @@ class ElementMotion:
     channel: ScalarResponse
 
     @classmethod
-    def of(cls, projector: Projector, location: str) -> ElementMotion:
+    def of(cls, projector: Projector, location: str) -> TrialElement:
         """Of a fit's projector."""
         index = projector.problem.system.elements.index(location)
         d, v = (motion[:, index] for motion in projector.fit.element_motion)
