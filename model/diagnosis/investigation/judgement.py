@@ -14,8 +14,8 @@ from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
