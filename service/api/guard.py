@@ -22,6 +22,7 @@ from sprung.service.api.problems import ApiProblem, problem_response
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, need_of, place_of
 from sprung.service.logs import request_id
 from sprung.service.oidc import Provider, Unreachable, looks_like_jwt
+from sprung.service.pages.render import signed_in
 from sprung.service.settings import Settings
 from sprung.service.tokens import Actor, Refused, Tokens
 
@@ -127,6 +128,7 @@ class Guard:
             await response(scope, receive, with_headers)
             return
         scope["sprung.actor"] = actor
+        signed_in.set(actor.name if by_cookie and actor.name not in ("local", "nobody") else "")
         await self.app(scope, receive, with_headers)
 
     @property

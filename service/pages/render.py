@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from markupsafe import Markup, escape
 from sprung.service.times import to_iso
 from sprung.service.views import spoken
 
+signed_in: ContextVar[str] = ContextVar("signed_in", default="")  # whose session the request is of
 STATIC = Path(__file__).parent / "static"
 LITERAL = re.compile(r"`([^`]*)`")
 PREFIXES = ((1e9, "G"), (1e6, "M"), (1e3, "k"))
@@ -30,7 +32,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment, "spoken": spoken}
-    environment.globals["asset"] = asset
+    environment.globals |= {"asset": asset, "signed_in": signed_in.get}
     return environment
 
 

@@ -206,7 +206,8 @@ def test_people_sign_in_with_a_token_and_pages_send_them_there(client: TestClien
     assert (answer.status_code, answer.headers["location"]) == (303, "/pages/work")
     cookie = answer.headers["set-cookie"].lower()
     assert "httponly" in cookie and "samesite=strict" in cookie and text.lower() not in cookie
-    assert client.get("/", headers=page).status_code == 200
+    assert "Sign out" in client.get("/", headers=page).text
+    assert "Sign out" not in client.get("/", headers=page | bearer(text)).text  # no session: nothing to end
     assert client.post("/signin", data={"token": text, "to": "//evil.example"}).headers["location"] == "/"
     core.tokens.revoke(row.id)
     assert client.get("/vehicles").status_code == 401
