@@ -34,6 +34,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.day",
         "months of service: weather, loads, clocks, drifting gains; false alarms, hidden faults",
     ),
+    "load": ("sprung.benchmarks.load", "passengers board at a stop, off the middle too: alarms, load, 24 parameters"),
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),

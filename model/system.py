@@ -240,13 +240,6 @@ class System:
         return LoadState(f"{name}.load", name, mass, declared, float(std), least, most)
 
     @cached_property
-    def load_of_dof(self) -> FloatArray:
-        """1 where a load moves with a degree of freedom, shape (loads, n): mass and inertias grow together."""
-        return np.array(
-            [self.mechanics.body_of_dof == self.bodies.index(load.body) for load in self.loads], dtype=float
-        ).reshape(len(self.loads), self.mechanics.n)
-
-    @cached_property
     def tolerances(self) -> tuple[Tolerance, ...]:
         """What the data sheet of every channel leaves open."""
         addresses: list[Address] = []

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage, signal
 
-from sprung.benchmarks.generator.timetable import Timetable, channel_names
+from sprung.benchmarks.generator.timetable import STEP, Timetable, channel_names
 from sprung.benchmarks.generator.track import LONGEST, LOW_TRACK, SHORTEST, errib176
 from sprung.benchmarks.generator.vehicle import Vehicle
 
@@ -119,8 +119,10 @@ class _Modes:
         return sensors, (self.vectors @ motion[-1]).real
 
 
-def modes(vehicle: Vehicle, log_ratio: Array, load: float, centre: float) -> _Modes:
+def modes(vehicle: Vehicle, log_ratio: Array, load: float, centre: float, spread: Array) -> _Modes:
     """The vehicle with these values, a load (of the car's mass) at `centre` m along it.
+
+    spread: roll and pitch inertia of the load against one that is spread like the car's own mass, (2,).
 
     Inputs: displacements and velocities of the wheels, roll and pitch moment and vertical force on the car.
     """
@@ -128,7 +130,7 @@ def modes(vehicle: Vehicle, log_ratio: Array, load: float, centre: float) -> _Mo
     k, c = vehicle.stiffness * np.exp(log_ratio[:E]), vehicle.damping * np.exp(log_ratio[E:])
     mass = np.diag(vehicle.inertia.copy())
     car = vehicle.on_body(vehicle.bodies[0])
-    mass[car, car] *= 1 + load
+    mass[car, car] *= 1 + load * np.array([1.0, *spread])
     empty = vehicle.inertia[car.start]
     mass[car.start, car.start + 2] = mass[car.start + 2, car.start] = empty * load * centre
     mass[car.start + 2, car.start + 2] += empty * abs(load) * centre**2
@@ -175,6 +177,7 @@ def run_day(vehicle: Vehicle, timetable: Timetable, level: float = LOW_TRACK) ->
         vehicle_now = modes(
             vehicle, timetable.log_ratio(vehicle, middle),
             float(timetable.at(timetable.load, middle)), float(timetable.at(timetable.centre, middle)),
+            timetable.spread[int(middle / STEP)],
         )  # fmt: skip
         state = vehicle_now.rest(inputs[0]) if start == 0 else state
         sensors, state = vehicle_now.run(state, inputs)

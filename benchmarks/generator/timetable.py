@@ -45,6 +45,10 @@ class Service:
     crawling: float = 0.3  # share of stops that are approached at walking pace for a while
     load: tuple[float, float] = (-0.3, 0.3)  # of the empty car's mass, drawn anew at every stop
     off_centre: float = 0.5  # m, standard deviation of the load's centre along the car
+    spread: tuple[float, float] = (
+        0.6,
+        1.1,
+    )  # of a load's roll and pitch inertia: 1, spread like the car
     gain_drift: float = 0.02  # per month, standard deviation of every channel's
     clock: float = 5e-3  # s, largest offset of a node's clock
     temperature: tuple[float, float] = (-20.0, 40.0)  # degC of the air, drawn for the day
@@ -73,6 +77,7 @@ class Timetable:
     yaw_rate: Array  # rad/s
     load: Array  # of the empty mass: what is carried
     centre: Array  # m, of the load along the car
+    spread: Array  # of the load's inertias, see `Service.spread`: roll and pitch, shape (N, 2)
     air: Array  # degC
     oil: Array  # degC
     boarding: Array  # 1 while doors are open
@@ -140,8 +145,9 @@ def draw_timetable(vehicle: Vehicle, service: Service, seconds: float, seed: int
     E, C = len(vehicle.elements), len(channel_names(vehicle))
     clocks = {node: float(rng.uniform(-service.clock, service.clock)) for node in dict.fromkeys(nodes(vehicle))}
     place = np.cumsum(speed) * STEP
+    spread = _spreads(np.random.default_rng([seed, 5]), service, load)
     return Timetable(
-        service, time, speed, np.gradient(speed, STEP), lateral, yaw, load, centre, air, oil, boarding,
+        service, time, speed, np.gradient(speed, STEP), lateral, yaw, load, centre, spread, air, oil, boarding,
         tuple(float(place[i]) for i in stops),
         np.log(rng.uniform(1 - service.spread, 1 + service.spread, 2 * E)),
         np.abs(rng.normal(0, max(service.wear, 1e-300), 2 * E)) / MONTH,
@@ -169,6 +175,13 @@ def _runs(rng: np.random.Generator, service: Service, count: int) -> tuple[Array
         load = np.concatenate([load, before + (carried - before) * exchange, np.full(len(shape), carried)])
         centre = np.concatenate([centre, shifted + (where - shifted) * exchange, np.full(len(shape), where)])
     return speed[:count], doors[:count], load[:count], centre[:count], [s for s in stops if s < count]
+
+
+def _spreads(rng: np.random.Generator, service: Service, load: Array) -> Array:
+    """How each load is spread, (N, 2): another whenever it has changed."""
+    stays = np.concatenate([[False], np.diff(load) == 0])
+    number = np.cumsum(~stays & np.concatenate([[True], stays[:-1]]))
+    return np.asarray(rng.uniform(*service.spread, (int(number[-1]) + 1, 2))[number])
 
 
 def _run(rng: np.random.Generator, service: Service, seconds: float) -> Array:

@@ -51,6 +51,8 @@ class RecordRules:
     gap: float = rule(0.05, "s; derived: a period of the highest frequency compared at 100 Hz loses nothing", 0.02, 0.1)
     moves: float = rule(2.0, "noise deviations by which one sensor has to move; chosen: 1 is noise alone", 1.5, 3.0)
     longest: int = rule(18_000, "samples; chosen: three minutes of a vehicle, 2 to 3 GB of memory", 12_000, 60_000)
+    passed: float = rule(0.4, "of the slowest mode, edge of the filter for integrals; chosen", 0.3, 0.5)
+    settled: float = rule(2.0, "periods of that edge lost at either end; derived: 1e-4 of a transient left", 1.5, 3.0)
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
 
 

@@ -52,7 +52,7 @@ class DeviationSensitivity:
         system = model.system
         self.model, self.deviations = model, deviations(system)
         self.inputs = len(system.inputs)
-        self.loads = model.simulator.load_of
+        self.loads = len(model.simulator.loading)
         time = np.arange(model.samples) / system.sample_rate
         self.slope = torch.as_tensor(CubicSpline(time, np.eye(model.samples))(time, 1))
         drive, share = [], []
@@ -128,9 +128,10 @@ class DeviationSensitivity:
         by_sensor = (at.whiten @ model.compression.matrix(data.present).to(at.whiten.dtype)).to(kind)
         out[..., columns] = by_sensor * shown[:, :, None]
         out[..., C + columns] = by_sensor * late[:, :, None]
-        if len(self.loads) and at.x.shape[1] == len(model.simulator.k_of):  # else they are refined themselves
+        if self.loads and at.x.shape[1] == len(model.simulator.k_of):  # else they are refined themselves
             values = model.simulator.element_values(at.x)
-            out[..., 2 * C :] = model.by_mass(values, at.transfer, at.whiten, after.states, data, self.loads).to(kind)
+            terms = model.inertia_terms(loads=True, masses=False)
+            out[..., 2 * C :] = model.by_inertia(values, at.transfer, at.whiten, after.states, data, terms).to(kind)
         dropped = self.dropped(data.present).to(kind)
         if not len(dropped):
             return out, None

@@ -10,9 +10,11 @@ import numpy as np
 
 from sprung.model.schema import TrackInput
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
+from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
-Kind = Literal["gain", "delay", "load"]
+Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre"]
+CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre")  # another after every stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,12 +23,12 @@ class Deviation:
 
     name: str  # of the channel, or of the body
     kind: Kind
-    std: float  # what the data sheet leaves open: relative, or s; of the logarithm of the mass for a load
+    std: float  # what the data sheet leaves open: relative, or s; of loads see `model.simulate.loading`
     group: int  # channels that share a clock have the same number; -1 for a load
 
 
 def deviations(system: System) -> tuple[Deviation, ...]:
-    """Gains of all channels, delays of all channels, loads of the bodies that carry passengers or goods."""
+    """Gains of all channels, delays of all channels, what describes the loads of bodies with passengers or goods."""
     tracks = any(isinstance(source, TrackInput) for source in system.file.inputs.values())
     if tracks or not system.bodies or len(system.tracked) > len(system.parameters):
         return ()  # unmeasured tracks, component tests and laws have identifiers of their own
@@ -36,7 +38,7 @@ def deviations(system: System) -> tuple[Deviation, ...]:
     return (
         *(Deviation(c.name, "gain", t.gain, g) for c, t, g in zip(channels, stated, groups, strict=True)),
         *(Deviation(c.name, "delay", t.delay, g) for c, t, g in zip(channels, stated, groups, strict=True)),
-        *(Deviation(load.body, "load", load.std, -1) for load in system.loads),
+        *(Deviation(term.body, term.kind, term.std, -1) for term in load_terms(system)),
     )
 
 

@@ -34,7 +34,7 @@ class FrequencyModel:
         K = (values.stiffness @ s.outer).reshape(B, 1, n, n)
         C = (values.damping @ s.outer).reshape(B, 1, n, n)
         w = self.omega[None, :, None, None]
-        return torch.complex(K - w**2 * torch.diag_embed(values.mass)[:, None], w * C)
+        return torch.complex(K - w**2 * values.inertia[:, None], w * C)
 
     def dynamic(self, values: ElementValues) -> Tensor:
         """Dynamic stiffness k + j w c of the elements, (B, F, E)."""

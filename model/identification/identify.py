@@ -15,12 +15,13 @@ from sprung.model.identification.estimates import estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.faults import Explainer
-from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.identification.linearise import PRIOR_STD, prior_std
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.simulate.drives import ORDERS, drives_of
+from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
 
@@ -223,7 +224,8 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
     if not (whole or loaded):
         return None
     C = len(system.channels)
-    H = 2 * C + len(system.loads)
+    H = 2 * C + len(load_terms(system))
+    prior = prior_std(system)[P:] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
     at = np.zeros(H) if point is None else point.copy()
     covariance = refined.covariance[b]
     cross = refined.cross[b] if whole else np.zeros((len(covariance), H))
@@ -239,7 +241,8 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
         information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
         information[: 2 * C, loads] = -moved.T @ inverse
         information[loads, : 2 * C] = information[: 2 * C, loads].T
-        information[loads, loads] = inverse
+        information[loads, loads] = inverse - np.diag(prior)
+        score[loads] = prior * refined.log_ratio[b, P:]
         given = given - per_load @ covariance[P:, :P]
         cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
         cross[:, loads] = per_load

@@ -15,6 +15,7 @@ from sprung.model.identification.gauss_newton import Chord, Linearisation, Trans
 from sprung.model.mechanics import DEFLECTION, FORCE
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
+from sprung.model.simulate.loading import by_inertia, load_terms
 from sprung.model.system import USUAL_NOISE, System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
@@ -36,6 +37,7 @@ class WindowModel:
         self.drive_noise = torch.as_tensor(self.frequency.drive_noise())  # (F, W/2)
         self.input_noise = np.array([channel.noise or USUAL_NOISE[channel.unit] for channel in system.inputs])
         self.compression = Compression(system, samples)
+        self.precision = torch.as_tensor(prior_std(system) ** -2)
 
     @property
     def states_count(self) -> int:
@@ -90,19 +92,17 @@ class WindowModel:
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
         states = forced + s.free_states(discrete, x0, self.samples)
         J = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
-        masses = s.m_of[s.m_of.any(dim=1)]
-        if x.shape[1] > len(s.m_of):
-            masses = torch.cat([masses, s.load_of])
-        if len(masses):
-            J = torch.cat([J, self.by_mass(values, transfer, whiten, states, data, masses)], dim=3)
+        terms = self.inertia_terms(loads=x.shape[1] > len(s.m_of))
+        if len(terms[0]):
+            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, terms)], dim=3)
         J = as_rows(J)
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
         information = J @ J.mT - across_products.mT @ across
         gradient = (J @ r.mT - across.mT @ along).squeeze(2)
-        prior = torch.eye(x.shape[1], dtype=x.dtype) / PRIOR_STD**2
-        covariance = torch.linalg.inv(information + prior)
-        step = (covariance @ (gradient - x / PRIOR_STD**2).unsqueeze(2)).squeeze(2)
+        precision = self.precision[: x.shape[1]]
+        covariance = torch.linalg.inv(information + torch.diag(precision))
+        step = (covariance @ (gradient - x * precision).unsqueeze(2)).squeeze(2)
         return Linearisation(
             whiten, transfer, basis, free_scale, J, factor, across, covariance, x, x0, cost, gradient, step
         )
@@ -119,7 +119,7 @@ class WindowModel:
         along = at.free @ r
         free_part = torch.cholesky_solve(along, at.factor)
         gradient = at.sensitivities @ r - at.across.mT @ along
-        step = at.covariance @ (gradient - x.unsqueeze(2) / PRIOR_STD**2)
+        step = at.covariance @ (gradient - (x * self.precision[: x.shape[1]]).unsqueeze(2))
         cost = r.square().sum(dim=(1, 2)) - (along * free_part).sum(dim=(1, 2))
         x0 = x0 + ((free_part - at.across @ step).squeeze(2) / at.free_scale)[:, : x0.shape[1]]
         error = self.compression.without_trends(error, data.present)
@@ -297,24 +297,42 @@ class WindowModel:
             [per_force[..., k_at] * deflection[:, :, None, k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3
         )
 
-    def by_mass(
+    def inertia_terms(self, *, loads: bool, masses: bool = True) -> tuple[Tensor, Tensor]:
+        """Exponents (X, n) and couplings (X, n, n) of the masses that are parameters, then of the loads."""
+        s = self.simulator
+        own = s.m_of[s.m_of.any(dim=1)] if masses else s.m_of[:0]
+        none = own.new_zeros(len(own), *s.loading.pattern.shape[1:])
+        if not loads:
+            return own, none
+        return torch.cat([own, s.loading.exponents]), torch.cat([none, s.loading.pattern])
+
+    def by_inertia(
         self,
         values: ElementValues,
         transfer: Transfer,
         whiten: Tensor,
         states: Tensor,
         data: WindowBatch,
-        masses: Tensor,
+        terms: tuple[Tensor, Tensor],
     ) -> Tensor:
-        """Whitened sensitivities to the logarithms of groups of masses, `masses` (X, n), (B, F, R, X)."""
+        """Whitened sensitivities to masses and loads, see `inertia_terms`, (B, F, R, X)."""
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]
         acceleration = (
             states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
         )
-        spectra = self.spectra(acceleration) * values.mass[:, None]
-        return (-(whiten @ transfer.per_load) * spectra[:, :, None]) @ masses.T.to(transfer.per_load.dtype)
+        force = by_inertia(self.spectra(acceleration), values.mass, values.coupling, *terms)
+        return -(whiten @ transfer.per_load) @ force
+
+
+def prior_std(system: System) -> FloatArray:
+    """Standard deviations of the priors of all that can be refined, (P + X,): parameters, then loads.
+
+    Weak ones, but for how a load is spread and where it lies, which a window alone tells worse than common sense.
+    """
+    spread = [PRIOR_STD if term.kind == "load" else term.std for term in load_terms(system)]
+    return np.array([*(PRIOR_STD for _ in system.parameters), *spread], dtype=np.float64)
 
 
 def _inverse(stiffness: Tensor) -> Tensor:

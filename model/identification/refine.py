@@ -28,7 +28,7 @@ from torch import Tensor
 from sprung.model.chunks import alike, chunks, share
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
-from sprung.model.identification.linearise import PRIOR_STD, WindowModel
+from sprung.model.identification.linearise import WindowModel
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
@@ -110,7 +110,7 @@ class Refiner:
         present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         everything = np.arange(len(windows))
         knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
-        size = len(self.system.parameters) + (len(self.system.loads) if loads else 0)
+        size = len(self.system.parameters) + (len(self.model.simulator.loading) if loads else 0)
         deviations = len(self.calibration.deviations) if weigh is not None else 0
         progress = _Progress.begin(start, present.shape, size, self.model.states_count, deviations)
 
@@ -210,7 +210,7 @@ class Refiner:
         # What the model cannot follow is treated as more noise, so that intervals stay honest.
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]
-        prior = torch.eye(x.shape[1], dtype=torch.float64) * PRIOR_STD**2
+        prior = torch.diag(1 / self.model.precision[: x.shape[1]])
         rms = np.full((len(x), len(data.present)), np.nan)
         rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
         path = self.model.states(x, x0, data) if states else x0.new_zeros(len(x), 0, x0.shape[1])

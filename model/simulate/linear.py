@@ -23,6 +23,7 @@ from torch import Tensor
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import knots
+from sprung.model.simulate.loading import Loading
 from sprung.model.system import System
 
 _TAYLOR_NORM = 1.0  # 1-norm up to which the Taylor polynomial of degree 15 is exact to double precision
@@ -41,6 +42,23 @@ class ElementValues:
     stiffness: Tensor  # N/m, shape (B, E)
     damping: Tensor  # N s/m, shape (B, E)
     mass: Tensor  # kg or kg m^2 per degree of freedom, shape (B, n)
+    coupling: Tensor | None = None  # K of the mass matrix sqrt(m) (1 + K) sqrt(m), (B, n, n); None: diagonal
+
+    @property
+    def inertia(self) -> Tensor:
+        """The mass matrix, (B, n, n)."""
+        if self.coupling is None:
+            return torch.diag_embed(self.mass)
+        root = self.mass.sqrt()
+        return torch.diag_embed(self.mass) + root[:, :, None] * self.coupling * root[:, None]
+
+    def accelerated(self, forces: Tensor) -> Tensor:
+        """Accelerations under generalised forces (B, n, X)."""
+        if self.coupling is None:
+            return forces / self.mass[:, :, None]
+        root = self.mass.sqrt().unsqueeze(2)
+        whole = torch.eye(self.mass.shape[1], dtype=self.mass.dtype, device=self.mass.device) + self.coupling
+        return torch.linalg.solve(whole, forces / root) / root
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +106,7 @@ class LinearSimulator:
         bodies = {name: i for i, name in enumerate(system.bodies)}
         per_body = _scatter(system, "mass", bodies, len(bodies), constant)
         self.m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
-        self.load_of = constant(system.load_of_dof)
+        self.loading = Loading(system, constant)
         self.estimates_mass = "mass" in quantity
         self.estimated_masses = quantity.count("mass")
         self.estimated_elements = tuple(  # indices of elements, in the order of the parameters
@@ -131,17 +149,17 @@ class LinearSimulator:
         return (self.H * self.nominal_k[:, None]).T @ self.H * root[:, None] * root[None, :]
 
     def element_values(self, log_ratio: Tensor) -> ElementValues:
-        """theta = nominal exp(log_ratio) put in place; log_ratio (B, P), or (B, P + loads) with logarithms of the
-        loaded masses over the empty ones."""
+        """theta = nominal exp(log_ratio) put in place; log_ratio (B, P), or (B, P + X) with what describes the loads,
+        see `model.simulate.loading`."""
         log_ratio, load = log_ratio[:, : len(self.k_of)], log_ratio[:, len(self.k_of) :]
         k = self.nominal_k * torch.exp(log_ratio @ self.k_of)
         c = self.nominal_c * torch.exp(log_ratio @ self.c_of)
         m = self.nominal_m.expand(len(log_ratio), -1)
         if self.estimates_mass:
             m = m * torch.exp(log_ratio @ self.m_of)
-        if load.shape[1]:
-            m = m * torch.exp(load @ self.load_of)
-        return ElementValues(k, c, m)
+        if not load.shape[1]:
+            return ElementValues(k, c, m)
+        return ElementValues(k, c, m * self.loading.factors(load), self.loading.coupling(load))
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:
         """A (B, N, N), input columns of the knots' values and rates, each (B, N, W/2)."""
@@ -153,7 +171,7 @@ class LinearSimulator:
         """[A, input columns of the knots' values, of their rates], (B, N, N + W)."""
         B, n = values.mass.shape
         forces = torch.cat([values.stiffness, values.damping], dim=1) @ self.loads + self.applied
-        accelerations = forces.reshape(B, n, -1) / values.mass[:, :, None]
+        accelerations = values.accelerated(forces.reshape(B, n, -1))
         return torch.cat([self.rates.expand(B, -1, -1), accelerations], dim=1)
 
     def _outputs(self, values: ElementValues, dynamics: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,7 +26,7 @@ from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
 CERTAIN = 2.5  # standard deviations within which two explanations are equally good
-LARGEST = {"gain": 0.3, "delay": 0.03, "load": 0.7}  # a deviation beyond this is none that a sensor has for long
+LARGEST = {"gain": 0.3, "delay": 0.03}  # a deviation beyond this is none that a sensor has for long
 PATIENCE = 20.0  # s that an alarm waits for windows weighed for deviations
 ALIKE = 0.35  # of the common change: elements within this of it move together
 MOST_OF = 0.75  # of the elements of a kind
@@ -242,7 +242,7 @@ class Attribution:
         found = []
         for h, deviation in enumerate(self.deviations):
             slope = calibration.cross[i, h]
-            if deviation.kind not in LARGEST or deviation.kind == "load" or calibration.curvature[h] <= 0 or slope == 0:
+            if deviation.kind not in LARGEST or calibration.curvature[h] <= 0 or slope == 0:
                 continue
             needed = moved / -slope  # a reading that is too large by this moves the estimate so
             std = calibration.curvature[h] ** -0.5

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.identification.deviations import Deviation
+from sprung.model.identification.deviations import CARGO, Deviation
 from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
 
@@ -27,7 +27,8 @@ SETTLED = 600.0  # s of used windows in which the gains of the learning phase go
 GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock
 GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
 CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
-LOAD_WALK = 1e-3  # per sqrt(s), of a running vehicle: 1 % in two minutes
+CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4}  # per sqrt(s), of a running
+# vehicle: 1 % of the mass, 0.3 % of how it is spread in two minutes; one walks 10 m along the car for 1e-3
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
 JUMPED = {"gain": 0.005, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
@@ -43,7 +44,8 @@ class DeviationModel:
     prior: FloatArray  # covariance, shape (H, H)
     walk: FloatArray  # covariance per second, shape (H, H)
     directions: FloatArray  # shape (V, H)
-    loads: BoolArray  # True at loads, shape (H,)
+    loads: BoolArray  # True at the masses of loads, shape (H,)
+    cargo: BoolArray  # True at all that describes loads, their masses included, shape (H,)
 
     @property
     def size(self) -> int:
@@ -69,18 +71,19 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     std = np.array([d.std for d in deviations], dtype=np.float64)
     group = np.array([d.group for d in deviations], dtype=np.int64)
     late = np.array([kind == "delay" for kind in kinds], dtype=bool)
-    gain = np.array([kind == "gain" for kind in kinds], dtype=bool)
     together = late[:, None] & late[None, :] & (group[:, None] == group[None, :])
     own = np.eye(H)
     shared = np.where(together, GROUP_SHARE, 0.0) + own * np.where(late, 1 - GROUP_SHARE, 1.0)
-    walk = np.diag(np.where(gain, GAIN_WALK**2, np.where(late, OWN_WALK**2, LOAD_WALK**2))) + together * CLOCK_WALK**2
+    own_walk = {"gain": GAIN_WALK, "delay": OWN_WALK, **CARGO_WALK}
+    walk = np.diag([own_walk[kind] ** 2 for kind in kinds]).reshape(H, H) + together * CLOCK_WALK**2
     rows = [*own]
     for number in np.unique(group[late]):
         members = (late & (group == number)).astype(float)
         if members.sum() > 1:
             rows.append(members)
     loads = np.array([kind == "load" for kind in kinds], dtype=bool)
-    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H), loads)
+    cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H), loads, cargo)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +108,26 @@ def start(parameters: int, model: DeviationModel) -> DeviationRecord:
         zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), zeros(V), zeros(V),
         zeros(V, dtype=np.int64), zeros(1), zeros(3, dtype=np.int64),
     )  # fmt: skip
+
+
+def grown(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tuple[DeviationRecord, Belief]:
+    """Of a state of an older format, which did not know the last of the model's deviations yet."""
+    old, H = belief.deviations, model.size
+    if old >= H:
+        return record, belief
+    more, first = H - old, len(belief.mean)
+    covariance = np.zeros((first + more, first + more))
+    covariance[:first, :first] = belief.covariance
+    covariance[first:, first:] = model.prior[old:, old:]
+    groups = len(model.directions) - H
+    wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
+    longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved")}
+    zeros = np.zeros(H + groups)
+    evidence = {"slope": zeros, "curvature": zeros, "since": zeros.astype(np.int64)}
+    return (
+        replace(record, **wider, **longer, **evidence),
+        Belief(np.pad(belief.mean, (0, more)), covariance, H),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,12 +196,12 @@ def explained(belief: Belief, found: Deviating) -> float:
 
 def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float) -> Belief:
     """Belief after a window that speaks of loads only."""
-    at = np.flatnonzero(model.loads)
+    at = np.flatnonzero(model.cargo)
     rows = at + len(belief.mean) - model.size
     M = found.information[at][:, at] * share
-    off = belief.mean[rows] - found.point[at]
+    u = found.score[at] * share - M @ (belief.mean[rows] - found.point[at])
     across = belief.covariance[:, rows]
-    gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([-M @ off, M]))
+    gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([u, M]))
     covariance = belief.covariance - across @ gain[:, 1:] @ across.T
     return replace(belief, mean=belief.mean + across @ gain[:, 0], covariance=0.5 * (covariance + covariance.T))
 
@@ -225,32 +248,37 @@ def _loosened(belief: Belief, model: DeviationModel, cross: FloatArray, jump: Ju
 def boarded(
     belief: Belief, model: DeviationModel, mean: FloatArray | None = None, variance: FloatArray | None = None
 ) -> Belief:
-    """Belief after a stop: any load, or what is known of it, `mean` and `variance` (L,)."""
+    """Belief after a stop: any load, or what is known of its mass, `mean` and `variance` (L,)."""
     covariance, state = belief.covariance.copy(), belief.mean.copy()
     first = len(belief.mean) - model.size
-    at = np.flatnonzero(model.loads) + first
+    at = np.flatnonzero(model.cargo) + first
     covariance[at, :] = covariance[:, at] = 0.0
-    covariance[at, at] = np.diag(model.prior)[model.loads]
+    state[at], covariance[at, at] = 0.0, np.diag(model.prior)[model.cargo]
     if mean is not None and variance is not None:
-        state[at], covariance[at, at] = mean, variance
+        masses = np.flatnonzero(model.loads) + first
+        state[masses], covariance[masses, masses] = mean, variance
     return replace(belief, mean=state, covariance=covariance)
 
 
 def moved(belief: Belief, model: DeviationModel, found: Deviating) -> bool:
     """Whether a window's loads are none that the belief allows: something was put on, or let down, on the way."""
-    at = np.flatnonzero(model.loads)
-    information = found.information[np.ix_(at, at)]
-    if not len(at) or np.any(np.diag(information) <= 0):
+    at = np.flatnonzero(model.cargo)
+    if not len(at):
         return False
+    values, vectors = np.linalg.eigh(found.information[np.ix_(at, at)])
+    told = values > 1e-9 * max(float(values[-1]), 1e-300)
+    root = vectors[:, told] * np.sqrt(values[told])  # information = root root', of what the window tells
     rows = at + len(belief.mean) - model.size
-    off = belief.mean[rows] - found.point[at]
-    spread = np.linalg.inv(information) + belief.covariance[np.ix_(rows, rows)]
-    return bool(off @ np.linalg.solve(spread, off) > LOST_LOAD**2)
+    seen = root.T @ (found.point[at] - belief.mean[rows]) + (vectors[:, told].T @ found.score[at]) / np.sqrt(
+        values[told]
+    )
+    spread = np.eye(len(seen)) + root.T @ belief.covariance[np.ix_(rows, rows)] @ root
+    return bool(seen @ np.linalg.solve(spread, seen) > LOST_LOAD**2)
 
 
 def unsure(belief: Belief, model: DeviationModel) -> Belief:
     """Belief after a parameter was lost: it may have been a sensor, whose deviation is open to a third of its prior."""
     H = model.size
     covariance = belief.covariance.copy()
-    covariance[-H:, -H:] += model.prior / 9 * ~(model.loads[:, None] | model.loads[None, :])
+    covariance[-H:, -H:] += model.prior / 9 * ~(model.cargo[:, None] | model.cargo[None, :])
     return replace(belief, covariance=covariance)

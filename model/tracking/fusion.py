@@ -64,8 +64,8 @@ class Fusion:
         belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
         if found is not None and not found.whole:
             belief = dev.loaded(belief, model, found, share)
-            gains = np.where(model.loads, found.cross, calibration.cross)
-            found = replace(found, cross=gains, point=np.where(model.loads, found.point, 0.0))
+            gains = np.where(model.cargo, found.cross, calibration.cross)
+            found = replace(found, cross=gains, point=np.where(model.cargo, found.point, 0.0))
         elif found is not None:
             apart = (time_ns - int(calibration.recent[-1])) * 1e-9
             calibration, belief, jump, agrees = dev.weigh(
@@ -176,7 +176,7 @@ class Fusion:
         """Whether known deviations move this window so far that mean sensitivities are not good enough for it."""
         if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
             return False
-        moved = state.calibration.cross @ np.where(self.model.loads, 0, state.belief.mean[-self.model.size :])
+        moved = state.calibration.cross @ np.where(self.model.cargo, 0, state.belief.mean[-self.model.size :])
         return bool(np.any(np.abs(moved) > BENT * np.sqrt(estimate.covariance.diagonal())))
 
     def armed(self, state: TrackerState) -> bool:
@@ -215,7 +215,7 @@ class Fusion:
     def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
         H = self.model.size
-        other = (calibration.moved > 0) | self.model.loads
+        other = (calibration.moved > 0) | self.model.cargo
         if H == 0 or not other.any():
             return np.zeros(len(cross))
         at = np.flatnonzero(other)
@@ -231,7 +231,7 @@ class Fusion:
         """
         if not self.model.size:
             return np.zeros(len(cross))
-        stays = ~self.model.loads
+        stays = ~self.model.cargo
         learned = state.changes.learned >= self.settings.learning
         here = np.where(stays, belief.mean[-self.model.size :], 0.0)
         reference = np.where(stays, calibration.reference, 0.0)
@@ -267,7 +267,7 @@ class Fusion:
             base = base + state.weather.effect + weathers.usual(state.weather, self.weather)
         if not self.model.size:
             return np.asarray(base)
-        reference = np.where(self.model.loads, 0.0, calibration.reference)
+        reference = np.where(self.model.cargo, 0.0, calibration.reference)
         return np.asarray(base + calibration.base_cross @ reference)
 
     def drift(self, state: TrackerState) -> Drift:

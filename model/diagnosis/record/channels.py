@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.interpolate import CubicSpline
 
+from sprung.model.diagnosis.record.highpass import carries_everything, passed
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
@@ -70,8 +71,19 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     first, last, used = _affordable(system, values, sample_rate, (first, last), rules.longest)
     values = _close_gaps(values[first:last])
     prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
-    _require_motion(system, prepared.signals, rules)
-    return replace(prepared, used=used)
+    signals, edge = passed(system, prepared.signals, rules)
+    if edge:
+        notes.append(
+            f"supports measured by accelerations alone: all signals are compared above {edge:.2g} Hz, "
+            f"{signals.start:.1f} s to {signals.start + signals.samples / sample_rate:.1f} s of the recording"
+        )
+        if signals.samples < rules.minimum_samples:
+            raise TooLittleError(
+                f"too short to decide anything: {len(values) / sample_rate:.1f} s, of which "
+                f"{rules.settled / edge:.1f} s at either end are lost to accelerations that must be integrated"
+            )
+    _require_motion(system, signals, rules)
+    return replace(prepared, signals=signals, notes=tuple(notes), used=used)
 
 
 def _affordable(
@@ -177,8 +189,7 @@ def _by_role(
         column += len(quantities)
         if not there:
             raise DiagnosisError(_missing(name, frozen))
-        if set(there) == {"acceleration"}:
-            _require_common_motion(system, name)
+        if set(there) == {"acceleration"} and carries_everything(system, name):
             levelled = there["acceleration"]
         elif "displacement" not in there and "displacement" in quantities:
             notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
@@ -225,28 +236,6 @@ def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> 
     noise = {ORDERS[quantity]: source.measured[quantity].noise for quantity in measured}
     d, _ = motion(by_order, dt, noise)
     return d, measured.get("velocity", apart) if set(measured) == {"velocity"} else apart
-
-
-def _require_common_motion(system: System, name: str) -> None:
-    """Over a whole recording the twofold integral of an acceleration wanders by metres.
-
-    What is carried by that one support alone wanders with it, and no deflection or acceleration sees it.
-    """
-    others = [n for n, source in system.file.inputs.items() if isinstance(source, SupportInput) and n != name]
-    grounded = [n for n, e in system.file.elements.items() if "ground" in (e.upper, e.lower)]
-    kinds = (DISPLACEMENT, VELOCITY)
-    absolute = [n for n, kind in zip(system.sensors, system.mechanics.sensor_kind, strict=True) if kind in kinds]
-    for what, reason in (
-        (others, "moves on its own beside it"),
-        (grounded, "is held by the ground, which does not wander"),
-        (absolute, "measures a motion that does not wander"),
-    ):
-        if what:
-            raise DiagnosisError(
-                f"input {name} is measured by its acceleration alone, which a whole recording can be diagnosed with "
-                f"where nothing but {name} carries the bodies; {what[0]} {reason}; measure the displacement or "
-                f"velocity of {name} as well"
-            )
 
 
 def _without_offsets(sensors: FloatArray, base: FloatArray, accelerations: np.ndarray) -> FloatArray:

@@ -1,0 +1,63 @@
+"""Recordings whose supports are measured by their acceleration alone.
+
+Over a whole recording the integral of an acceleration's noise goes by metres.  A filter that passes every signal alike
+leaves the relation between them as it was, so all of them lose what lies well below the slowest mode of the vehicle:
+there a body follows its support, elements hardly deflect, and nothing is told.  What the filter does not know
+at either end of the recording is cut off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.signal import butter, sosfiltfilt
+
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.rules import RecordRules
+from sprung.model.mechanics import DISPLACEMENT, VELOCITY
+from sprung.model.schema import SupportInput
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_ORDER = 4  # of the filter, which runs forwards and backwards
+_HELD = 0.05  # Hz; a slower motion is one that no stiffness holds
+
+
+def carries_everything(system: System, support: str) -> bool:
+    """Whether all bodies rest on one support and nothing else: they wander with it, and no sensor sees that they do."""
+    others = [n for n, source in system.file.inputs.items() if isinstance(source, SupportInput) and n != support]
+    grounded = any("ground" in (element.upper, element.lower) for element in system.file.elements.values())
+    absolute = np.isin(system.mechanics.sensor_kind, (DISPLACEMENT, VELOCITY)).any()
+    return not (others or grounded or absolute)
+
+
+def slowest_mode(system: System) -> float:
+    """Hz, of the motions that a stiffness holds."""
+    return min(mode.frequency for mode in system.mechanics.modes(system.bodies) if mode.frequency > _HELD)
+
+
+def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signals, float]:
+    """Signals without what the integrals of accelerations leave open, and the filter's edge, Hz; 0: nothing is."""
+    alone = signals.integrated & signals.accelerated & np.isnan(signals.velocity[0])
+    if not alone.any() or carries_everything(system, signals.support_names[0]):
+        return signals, 0.0
+    edge = rules.passed * slowest_mode(system)
+    cut = round(rules.settled / edge * signals.sample_rate)
+    filtered = butter(_ORDER, edge, "highpass", fs=signals.sample_rate, output="sos")
+
+    def high(series: FloatArray) -> FloatArray:
+        known = np.isfinite(series[0]) if series.shape[1] else np.zeros(0, dtype=bool)
+        out = series.copy()
+        if known.any():
+            out[:, known] = sosfiltfilt(filtered, series[:, known], axis=0, padlen=min(3 * cut, len(series) - 1))
+        return out
+
+    whole = replace(
+        signals,
+        displacement=high(signals.displacement),
+        velocity=high(signals.velocity),
+        force=high(signals.force),
+        sensors=high(signals.sensors),
+    )
+    return whole.part(cut, max(signals.samples - cut, cut)), edge

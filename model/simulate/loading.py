@@ -1,0 +1,103 @@
+"""What passengers and goods change of a body: its mass, how that is spread, and where its centre of gravity lies.
+
+With m0, J0, I0 the body's mass, roll and pitch inertia without them, and one load's four numbers l, r, p, c,
+
+    m = m0 exp(l)     J = J0 exp(l + r)     I = I0 exp(l + p)     x_c = c sqrt(I / m)
+
+J and I are about the body's `position` and x_c is how far its centre of gravity lies from there along x, so that the
+mass matrix of [z, roll, pitch] has m x_c = c sqrt(m I) between z and pitch.  All four are zero for the empty body, of
+the size of a relative change, and give a positive mass matrix for any |c| < 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+Kind = Literal["load", "roll_inertia", "pitch_inertia", "centre"]
+SPREAD_STD = 0.1  # of r and p: seated passengers have 0.6 times the inertia of a load spread like the body
+CENTRE_STD = 0.04  # of c: one metre off the middle of a car that carries 30 % is 0.03
+_MOST = 0.9  # of |c|: a step of the refinement does not leave the masses that there are
+
+
+@dataclass(frozen=True, slots=True)
+class LoadTerm:
+    """One number of one load."""
+
+    body: str
+    kind: Kind
+    std: float  # before any window
+
+
+def load_terms(system: System) -> tuple[LoadTerm, ...]:
+    """What loads are described by, in order: the masses of all of them, then how each is spread, where it has axes."""
+    found = [LoadTerm(load.body, "load", load.std) for load in system.loads]
+    for load in system.loads:
+        body = system.file.bodies[load.body]
+        if body.roll_inertia is not None:
+            found.append(LoadTerm(load.body, "roll_inertia", SPREAD_STD))
+        if body.pitch_inertia is not None:
+            found.append(LoadTerm(load.body, "pitch_inertia", SPREAD_STD))
+            found.append(LoadTerm(load.body, "centre", CENTRE_STD))
+    return tuple(found)
+
+
+class Loading:
+    """The loads of a system as constant tensors: X terms over n degrees of freedom."""
+
+    def __init__(self, system: System, constant: Callable[[FloatArray], Tensor]) -> None:
+        self.terms = load_terms(system)
+        dofs = system.mechanics.dofs
+        exponents = np.zeros((len(self.terms), len(dofs)))
+        pattern = np.zeros((len(self.terms), len(dofs), len(dofs)))
+        for i, term in enumerate(self.terms):
+            if term.kind == "load":
+                exponents[i] = [dof.rpartition(".")[0] == term.body for dof in dofs]
+            elif term.kind == "centre":
+                z, pitch = dofs.index(f"{term.body}.z"), dofs.index(f"{term.body}.pitch")
+                pattern[i, z, pitch] = pattern[i, pitch, z] = 1.0
+            else:
+                exponents[i, dofs.index(f"{term.body}.{term.kind.removesuffix('_inertia')}")] = 1.0
+        self.exponents = constant(exponents)  # powers of each mass and inertia, (X, n)
+        self.pattern = constant(pattern)  # where each couples degrees of freedom, (X, n, n)
+        self.couples = any(term.kind == "centre" for term in self.terms)
+
+    def __len__(self) -> int:
+        return len(self.terms)
+
+    def factors(self, load: Tensor) -> Tensor:
+        """What masses and inertias are multiplied by, (B, n), for terms (B, X)."""
+        return torch.exp(load @ self.exponents)
+
+    def coupling(self, load: Tensor) -> Tensor | None:
+        """K of the mass matrix sqrt(m) (1 + K) sqrt(m), (B, n, n); None where no centre can move."""
+        if not self.couples:
+            return None
+        return torch.einsum("bx,xij->bij", load.clamp(-_MOST, _MOST), self.pattern)
+
+
+def by_inertia(
+    acceleration: Tensor, mass: Tensor, coupling: Tensor | None, exponents: Tensor, pattern: Tensor
+) -> Tensor:
+    """Derivative of the inertia forces M q'' with respect to terms, (B, F, n, X).
+
+    acceleration: spectra (B, F, n); mass (B, n); exponents (X, n) and pattern (X, n, n) of the terms.
+    """
+    kind = acceleration.dtype
+    root = mass.sqrt()[:, None, :, None]
+    moved = root * acceleration.unsqueeze(3)  # sqrt(m) q'', (B, F, n, 1)
+    if coupling is None:
+        return root * moved * exponents.T.to(kind)
+    whole = torch.eye(mass.shape[1], dtype=mass.dtype) + coupling
+    whole = whole[:, None].to(kind)
+    powers = exponents.T.to(kind)
+    scaled = 0.5 * (powers * (whole @ moved) + whole @ (powers * moved))
+    return root * (scaled + torch.einsum("xij,bfj->bfix", pattern.to(kind), moved.squeeze(3)))
