@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,8 @@ from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.running import run_day
 from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, channel_names, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
-from sprung.model.identification.deviations import deviations
+from sprung.benchmarks.hours import full_hours
+from sprung.model.identification.deviations import CARGO, deviations
 from sprung.model.identification.identify import Identifier
 from sprung.model.signals import Conditions, Deviating, Estimate, FloatArray
 from sprung.model.system import System, load_system
@@ -39,6 +40,7 @@ class Life:
 
     days: float
     rides: int
+    unused: int  # rides that told the tracker nothing, or while windows were said not to fit
     strangers: list[str]  # alarms of changes and misfits that are none
     sensors: int  # alarms of kind sensor
     found_after: float | None  # s of calendar from the fault to its alarm
@@ -58,30 +60,66 @@ def library(system: System, count: int, seed: int) -> list[Estimate]:
     return [e for e in found if e.adequate and e.identifiable.all() and e.deviating is not None and not e.faults]
 
 
-def drawn(rng: np.random.Generator, window: Estimate, truth: FloatArray, off: FloatArray) -> Estimate:
-    """An estimate with the errors of `POOLED` windows like `window` at true log-ratios (P,) and deviations (H,)."""
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """What `POOLED` windows like one of the library say, ready to be drawn from; P parameters, H deviations."""
+
+    window: Estimate
+    like: Deviating
+    information: FloatArray  # on the deviations, (H, H)
+    root: FloatArray  # information = root root'
+    error: FloatArray  # Cholesky factor of the parameters' covariance given the deviations, (P, P)
+    given: FloatArray
+    spread: FloatArray  # covariance of what describes the load, (X, X)
+    covariance: FloatArray  # of the parameters, (P, P)
+
+
+def pool(window: Estimate, cargo: int) -> Pool:
+    """cargo: how many of the deviations, the last ones, describe the load."""
     like = window.deviating
     assert like is not None
-    information, given = like.information * POOLED, like.given / POOLED
-    values, vectors = np.linalg.eigh(0.5 * (information + information.T))
-    score = vectors @ (np.sqrt(values.clip(0)) * rng.standard_normal(len(values)))  # at the true deviations
-    point = np.zeros(len(off))
-    loads = np.array([len(off) - 1])  # the load of the car is the last
-    others = np.setdiff1d(np.arange(len(off)), loads)
-    pulled = score[loads] + information[np.ix_(loads, others)] @ off[others]
-    point[loads] = off[loads] + np.linalg.solve(information[np.ix_(loads, loads)], pulled)
-    error = np.linalg.cholesky(given) @ rng.standard_normal(len(truth))
-    found = Deviating(point, given, like.cross, information, score - information @ (point - off), like.freedom)
-    spread = np.linalg.inv(information[np.ix_(loads, loads)])
-    covariance = given + like.cross[:, loads] @ spread @ like.cross[:, loads].T
-    return Estimate(
-        truth + like.cross @ (point - off) + error, covariance, np.ones(len(truth), dtype=bool), 0.03,
-        window.per_sensor, float(np.exp(0.05 * rng.standard_normal())), True, True, 3, deviating=found,
+    information, given = POOLED * 0.5 * (like.information + like.information.T), like.given / POOLED
+    values, vectors = np.linalg.eigh(information)
+    spread = np.linalg.inv(information[-cargo:, -cargo:])
+    of_cargo = like.cross[:, -cargo:]
+    return Pool(
+        window, like, information, vectors * np.sqrt(values.clip(0)), np.linalg.cholesky(given), given, spread,
+        given + of_cargo @ spread @ of_cargo.T,
     )  # fmt: skip
 
 
+def drawn(rng: np.random.Generator, pool: Pool, truth: FloatArray, off: FloatArray) -> Estimate:
+    """An estimate with the errors of those windows at true log-ratios (P,) and deviations (H,)."""
+    X = len(pool.spread)
+    score = pool.root @ rng.standard_normal(pool.root.shape[1])  # at the true deviations
+    point = np.zeros(len(off))
+    point[-X:] = off[-X:] + pool.spread @ (score[-X:] + pool.information[-X:, :-X] @ off[:-X])
+    away = point - off
+    found = replace(
+        pool.like, point=point, given=pool.given, information=pool.information, score=score - pool.information @ away
+    )
+    return Estimate(
+        truth + pool.like.cross @ away + pool.error @ rng.standard_normal(len(truth)), pool.covariance,
+        np.ones(len(truth), dtype=bool), 0.03, pool.window.per_sensor, float(np.exp(0.05 * rng.standard_normal())),
+        True, True, 3, deviating=found,
+    )  # fmt: skip
+
+
+def boarded(rng: np.random.Generator, service: Service, empty: FloatArray) -> FloatArray:
+    """A drawn load as deviations [load, roll_inertia, pitch_inertia, centre]; `empty`: mass, roll, pitch inertia."""
+    load, place, spread = (
+        rng.uniform(*service.load),
+        rng.normal(0, service.off_centre),
+        rng.uniform(*service.load_spread, 2),
+    )
+    mass, roll, pitch = empty * (1 + load * np.array([1.0, *spread]))
+    pitch += abs(load) * empty[0] * place**2
+    grown = np.log([mass, roll, pitch] / empty)
+    return np.array([grown[0], *(grown[1:] - grown[0]), load * empty[0] * place / np.sqrt(mass * pitch)])
+
+
 def live(
-    system: System, windows: list[Estimate], days: float, seed: int, *, measured: bool, fault: str | None = None
+    system: System, windows: list[Pool], days: float, seed: int, *, measured: bool, fault: str | None = None
 ) -> Life:
     """One vehicle for `days`; `measured`: its air temperature is; `fault`: parameter that loses its share at once."""
     rng = np.random.default_rng([seed, 7])
@@ -98,7 +136,8 @@ def live(
     if fault:
         lost[names.index(fault)] = np.log(FAULTS[fault.rpartition(".")[2]])
     slopes = _slopes(names, service, rng)
-    clock, ran, rides, front = 0.0, 0.0, 0, 0.0
+    empty = system.mechanics.mass[:3]
+    clock, ran, rides, front, unused, used = 0.0, 0.0, 0, 0.0, 0, 0
     while clock < days * DAY:
         front = 0.8 * front + rng.normal(0, 3.0) if ran == 0 else front
         ride = rng.uniform(*service.stop_every)
@@ -110,14 +149,16 @@ def live(
         )
         truth = truth + lost * (clock >= began * DAY)
         off = np.array([_off(part, i, clocks, drift, clock) for i, part in enumerate(parts)])
-        off[-1] = np.log1p(rng.uniform(*service.load))
+        off[-len(windows[0].spread) :] = boarded(rng, service, empty)
         estimate = drawn(rng, windows[rng.integers(len(windows))], truth, off)
         conditions = Conditions(rng.uniform(*service.cruise), air + rng.normal(0, 0.3) if measured else np.nan)
         state = tracker.update(state, estimate, round((clock + 0.5 * ride) * 1e9), conditions)
+        unused += state.used != used + 1 or state.misfit_since is not None
+        used = state.used
         clock, ran, rides = clock + ride, ran + ride, rides + 1
         if ran > SERVICE_DAY:
             clock, ran = clock + DAY - SERVICE_DAY, 0.0
-    return _judged(state, days, rides, began, fault)
+    return _judged(state, days, (rides, unused), began, fault)
 
 
 def _slopes(names: list[str], service: Service, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
@@ -134,49 +175,72 @@ def _off(part: Any, index: int, clocks: FloatArray, drift: FloatArray, clock: fl
     return float(drift[index] * clock) if part.kind == "gain" else 0.0
 
 
-def _judged(state: TrackerState, days: float, rides: int, began: float, fault: str | None) -> Life:
+def _judged(state: TrackerState, days: float, rides: tuple[int, int], began: float, fault: str | None) -> Life:
     kinds = [a for a in state.alarms if a.kind in ("change", "misfit")]
     after = [a for a in kinds if a.opened * 1e-9 >= began * DAY]
     right = [a for a in after if a.parameter == fault]
     return Life(
-        days, rides, [f"{a.kind} {a.parameter}" for a in kinds if a not in right],
+        days, *rides, [f"{a.kind} {a.parameter}" for a in kinds if a not in right],
         sum(a.kind == "sensor" for a in state.alarms),
         min((a.opened * 1e-9 - began * DAY for a in right), default=None),
         bool(after) and after[0].parameter == fault,
     )  # fmt: skip
 
 
-def run(months: float = 2.0, faults: int = 6, seed: int = 1, windows: int = 48) -> Iterator[dict[str, Any]]:
-    """Healthy vehicles for `months` in all, a month each, every other with its temperature measured; then faults."""
+def run(
+    months: float = 2.0, faults: int = 6, seed: int = 1, windows: int = 48, hours: int = 0
+) -> Iterator[dict[str, Any]]:
+    """Healthy vehicles for `months` in all, a month each, every other with its temperature measured; then `faults`
+    vehicles with a hidden one each; then `hours` of full simulation, see `benchmarks.hours`."""
     system = load_system()
-    found = library(system, windows, seed)
+    if months or faults:
+        cargo = sum(part.kind in CARGO for part in deviations(system))
+        found = [pool(window, cargo) for window in library(system, windows, seed)]
+        yield from _healthy(system, found, months, seed)
+        yield from _hidden(system, found, faults, seed)
+    if hours:
+        yield from full_hours(hours, seed)
+
+
+def _healthy(system: System, found: list[Pool], months: float, seed: int) -> Iterator[dict[str, Any]]:
     begin, lives = time.process_time(), []
-    for number in range(max(1, round(months))):
+    for number in range(max(1, round(months)) if months else 0):
         days = min(1.0, months) * MONTH / DAY
         lives.append(live(system, found, days, 1000 * seed + number, measured=number % 2 == 0))
-    run_months = sum(life.days for life in lives) * DAY / MONTH
-    strangers = [name for life in lives for name in life.strangers]
-    bound = float(chi2.ppf(0.95, 2 * (len(strangers) + 1)) / 2 / run_months)
-    yield {"name": "vehicle_months", "value": run_months, "rides": sum(life.rides for life in lives),
-           "cpu_seconds": time.process_time() - begin}  # fmt: skip
-    yield {"name": "false_alarms", "value": len(strangers) / run_months, "unit": "1/vehicle-month", "target": "< 1",
-           "bound_95": bound, "of": strangers[:10]}  # fmt: skip
-    yield {
-        "name": "sensor_alarms",
-        "value": sum(life.sensors for life in lives) / run_months,
-        "unit": "1/vehicle-month",
-    }
+        if lives[-1].strangers:
+            yield {"name": "false_alarms_of", "vehicle": number, "of": lives[-1].strangers}
+    if not lives:
+        return
+    run_months, rides = sum(life.days for life in lives) * DAY / MONTH, sum(life.rides for life in lives)
+    strangers = sum(len(life.strangers) for life in lives)
+    yield {"name": "vehicle_months", "value": run_months, "rides": rides, "cpu_seconds": time.process_time() - begin}
+    yield {"name": "false_alarms", "value": strangers / run_months, "unit": "1/vehicle-month", "target": "< 1",
+           "count": strangers, "bound_95": float(chi2.ppf(0.95, 2 * (strangers + 1)) / 2 / run_months)}  # fmt: skip
+    sensors = sum(life.sensors for life in lives)
+    yield {"name": "sensor_alarms", "value": sensors / run_months, "unit": "1/vehicle-month"}
+    unused = sum(life.unused for life in lives)
+    yield {"name": "unmonitored", "value": 100 * unused / rides, "unit": "% of rides", "target": "< 1"}
+
+
+def _hidden(system: System, found: list[Pool], faults: int, seed: int) -> Iterator[dict[str, Any]]:
     rng = np.random.default_rng([seed, 9])
     names = [p.name for p in system.parameters]
-    hidden = []
-    for number in range(faults):
-        quantity = ("damping", "stiffness")[number % 2]
-        fault = str(rng.choice([n for n in names if n.endswith(quantity)]))
-        hidden.append(
-            live(system, found, SETTLED_DAYS + 2.0, 2000 * seed + number, measured=number % 4 < 2, fault=fault)
-        )
-    if hidden:
-        soon = sum(life.found_after is not None and life.found_after <= DAY for life in hidden)
-        yield {"name": "found_in_a_day", "value": 100 * soon / faults, "unit": "%", "of": faults, "target": ">= 98"}
-        isolated = sum(life.isolated for life in hidden)
-        yield {"name": "isolated", "value": 100 * isolated / faults, "unit": "%", "of": faults, "target": ">= 98"}
+    for quantity in FAULTS if faults else ():
+        lives = []
+        for number in range(faults // len(FAULTS)):
+            fault = str(rng.choice([n for n in names if n.endswith(quantity)]))
+            at = 2000 * seed + 500 * list(FAULTS).index(quantity) + number
+            lives.append(live(system, found, SETTLED_DAYS + 2.0, at, measured=number % 2 == 0, fault=fault))
+            if not lives[-1].isolated:
+                yield {"name": "not_isolated", "fault": fault, "alarms": lives[-1].strangers}
+        after = [life.found_after for life in lives if life.found_after is not None]
+        soon, isolated = sum(a <= DAY for a in after), sum(life.isolated for life in lives)
+        note = {"quantity": quantity, "of": len(lives), "change": f"{100 * (FAULTS[quantity] - 1):.0f} %"}
+        yield {"name": "found_in_a_day", "value": 100 * soon / len(lives), "unit": "%", "target": ">= 98"} | note
+        yield {"name": "isolated", "value": 100 * isolated / len(lives), "unit": "%", "target": ">= 98"} | note
+        if after:
+            yield {
+                "name": "hours_to_alarm",
+                "value": float(np.median(after)) / 3600,
+                "largest": max(after) / 3600,
+            } | note

@@ -25,12 +25,14 @@ from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System, load_system
+from sprung.service.engine import load_engine
+from sprung.service.settings import settings_with
 
 
 def run(
     part: str = "all", windows: int = 2000, paper_windows: int = 12000, bounds: int = 24, scipy_windows: int = 2
 ) -> Iterator[dict[str, Any]]:
-    """One dict per figure; `part` is accuracy, paper, sensing, speed or all."""
+    """One dict per figure; `part` is accuracy, paper, sensing, tracked, speed or all."""
     system = load_system()
     torch.set_num_threads(1)
     if part in ("accuracy", "all"):
@@ -39,6 +41,8 @@ def run(
         yield _paper_feature(system, paper_windows)
     if part in ("sensing", "all"):
         yield from _paper_sensing(min(windows, 500))
+    if part in ("tracked", "all"):
+        yield from _tracked_speed(system)
     if part in ("speed", "all"):
         yield from _speed(system, scipy_windows)
 
@@ -208,6 +212,34 @@ def _speed(system: System, scipy_windows: int) -> Iterator[dict[str, Any]]:
         "unit": "s/window",
         "error_percent": round(100 * wrong_by, 2),
         "ratio": round(seconds * batch, 0),
+    }
+
+
+def _tracked_speed(system: System) -> Iterator[dict[str, Any]]:
+    """Windows of one vehicle under load, as the tracker wants them: loads refined along, one of `WEIGHED_OF` weighed
+    for gains and delays; identification and tracker's update."""
+    engine = load_engine(settings_with({}))
+    terms = [0.2, -0.05, -0.05, 0.01]
+    truth = np.tile([*(0.05 * np.random.default_rng(107).standard_normal(len(system.parameters))), *terms], (1024, 1))
+    runs = simulate_runs(system, truth, system.window, np.random.default_rng(107))
+    starts = [round(i * 1e9 * system.hop / system.sample_rate) for i in range(len(truth))]
+    rates, of_processor, updates = [], [], []
+    for _ in range(4):
+        begin, spent = time.perf_counter(), time.process_time()
+        estimates, _ = engine.identify(runs.values, starts=starts)
+        rates.append(len(truth) / (time.perf_counter() - begin))
+        of_processor.append(len(truth) / (time.process_time() - spent))
+        state, spent = engine.tracker.initial_state(), time.process_time()
+        for estimate, start in zip(estimates, starts, strict=True):
+            state = engine.tracker.update(state, estimate, start)
+        updates.append(1e3 * (time.process_time() - spent) / len(truth))
+    yield {
+        "name": "windows per second, batch, loads and gains free",
+        "value": round(float(np.median(rates[1:])), 1),
+        "per_cpu_second": round(float(np.median(of_processor[1:])), 1),
+        "update_cpu_ms": round(float(np.median(updates[1:])), 2),
+        "workers": os.cpu_count() or 1,
+        "target": ">= 600 on 2 cores",
     }
 
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from sprung.benchmarks.generator.ride import SYSTEM
-from sprung.benchmarks.generator.running import run_day
-from sprung.benchmarks.generator.timetable import Service, Timetable, channel_names, draw_timetable
+from sprung.benchmarks.generator.timetable import Service, Timetable, draw_timetable
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
+from sprung.benchmarks.through import through
 from sprung.model.system import load_system
 from sprung.service.engine import Engine, load_engine
 from sprung.service.settings import settings_with
@@ -26,7 +26,6 @@ DWELL = 20.0  # s
 WITHIN = 30.0  # s of running after which the load is asked for
 FIRST = (-0.1, 0.1)  # load of the first ride, of the empty mass
 CENTRES = (0.0, 0.5, -0.5, 1.0, -1.0)  # m off the middle, in turn
-START = 1_790_000_000_000_000_000  # ns
 SILENT = 3.0  # stated deviations
 SERVICE = Service(stop_every=(RIDE, RIDE), dwell=(DWELL, DWELL), load=(0.0, 0.0), off_centre=0.0, crawling=0.0)
 
@@ -53,34 +52,25 @@ def stepped(vehicle: Vehicle, step: float, centre: float, seed: int) -> Timetabl
         timetable,
         load=np.where(after, first + step, first),
         centre=np.where(after, centre, rng.normal(0, 0.3)),
-        spread=np.where(after[:, None], rng.uniform(*SERVICE.spread, 2), rng.uniform(*SERVICE.spread, 2)),
+        spread=np.where(after[:, None], rng.uniform(*SERVICE.load_spread, 2), rng.uniform(*SERVICE.load_spread, 2)),
     )
 
 
 def followed(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Step:
     """One drawn day through windows, identification and tracker."""
-    system, tracker = engine.system, engine.tracker
-    columns = [channel_names(vehicle).index(c.name) for c in system.channels]
-    values = np.concatenate(list(run_day(vehicle, timetable)))[:, columns]
-    size, hop = system.window, system.hop
-    begins = list(range(0, len(values) - size + 1, hop))
-    state, seen, scores, ran = tracker.initial_state(), (np.inf, np.inf), [], 0.0
-    for first in range(0, len(begins), 64):
-        part = begins[first : first + 64]
-        starts = [START + k * 10_000_000 for k in part]
-        found, _ = engine.identify(np.stack([values[k : k + size] for k in part]), starts=starts)
-        for k, start, estimate in zip(part, starts, found, strict=True):
-            state = tracker.update(state, estimate, start)
-            now = (k + size / 2) / system.sample_rate
-            if now < RIDE + DWELL or not estimate.informative:
-                continue
-            ran += hop / system.sample_rate
-            if ran <= WITHIN:
-                value, std = next(iter(tracker.loads(state).values()), (np.inf, np.inf))
-                seen = (float(np.expm1(value - np.log1p(timetable.at(timetable.load, now)))), std)
-            if ran >= WITHIN:
-                mean, std_ = tracker.posterior(state)
-                scores.append(np.abs((mean - timetable.log_ratio(vehicle, now)) / std_))
+    tracker, hop = engine.tracker, engine.system.hop / engine.system.sample_rate
+    seen, scores, ran = (np.inf, np.inf), [], 0.0
+    for moment in through(engine, vehicle, timetable):
+        now, state = moment.time, moment.state
+        if now < RIDE + DWELL or not moment.estimate.informative:
+            continue
+        ran += hop
+        if ran <= WITHIN:
+            value, std = next(iter(tracker.loads(state).values()), (np.inf, np.inf))
+            seen = (float(np.expm1(value - np.log1p(timetable.at(timetable.load, now)))), std)
+        if ran >= WITHIN:
+            mean, deviation = tracker.posterior(state)
+            scores.append(np.abs((mean - timetable.log_ratio(vehicle, now)) / deviation))
     last = scores[-1] if scores else np.array([np.inf])
     return Step(
         float(timetable.load[-1]), float(timetable.centre[-1]), [f"{a.kind} {a.parameter}" for a in state.alarms],

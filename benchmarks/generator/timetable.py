@@ -45,10 +45,7 @@ class Service:
     crawling: float = 0.3  # share of stops that are approached at walking pace for a while
     load: tuple[float, float] = (-0.3, 0.3)  # of the empty car's mass, drawn anew at every stop
     off_centre: float = 0.5  # m, standard deviation of the load's centre along the car
-    spread: tuple[float, float] = (
-        0.6,
-        1.1,
-    )  # of a load's roll and pitch inertia: 1, spread like the car
+    load_spread: tuple[float, float] = (0.6, 1.1)  # of a load's inertias; 1: spread like the car
     gain_drift: float = 0.02  # per month, standard deviation of every channel's
     clock: float = 5e-3  # s, largest offset of a node's clock
     temperature: tuple[float, float] = (-20.0, 40.0)  # degC of the air, drawn for the day
@@ -77,7 +74,7 @@ class Timetable:
     yaw_rate: Array  # rad/s
     load: Array  # of the empty mass: what is carried
     centre: Array  # m, of the load along the car
-    spread: Array  # of the load's inertias, see `Service.spread`: roll and pitch, shape (N, 2)
+    spread: Array  # of the load's inertias, see `Service.load_spread`: roll and pitch, shape (N, 2)
     air: Array  # degC
     oil: Array  # degC
     boarding: Array  # 1 while doors are open
@@ -181,7 +178,7 @@ def _spreads(rng: np.random.Generator, service: Service, load: Array) -> Array:
     """How each load is spread, (N, 2): another whenever it has changed."""
     stays = np.concatenate([[False], np.diff(load) == 0])
     number = np.cumsum(~stays & np.concatenate([[True], stays[:-1]]))
-    return np.asarray(rng.uniform(*service.spread, (int(number[-1]) + 1, 2))[number])
+    return np.asarray(rng.uniform(*service.load_spread, (int(number[-1]) + 1, 2))[number])
 
 
 def _run(rng: np.random.Generator, service: Service, seconds: float) -> Array:

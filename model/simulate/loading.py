@@ -95,9 +95,11 @@ def by_inertia(
     root = mass.sqrt()[:, None, :, None]
     moved = root * acceleration.unsqueeze(3)  # sqrt(m) q'', (B, F, n, 1)
     if coupling is None:
-        return root * moved * exponents.T.to(kind)
-    whole = torch.eye(mass.shape[1], dtype=mass.dtype) + coupling
-    whole = whole[:, None].to(kind)
-    powers = exponents.T.to(kind)
-    scaled = 0.5 * (powers * (whole @ moved) + whole @ (powers * moved))
-    return root * (scaled + torch.einsum("xij,bfj->bfix", pattern.to(kind), moved.squeeze(3)))
+        scaled = moved * exponents.T.to(kind)
+    else:
+        powers = exponents.T.to(kind)
+        whole = (torch.eye(mass.shape[1], dtype=mass.dtype) + coupling)[:, None].to(kind)
+        scaled = 0.5 * (powers * (whole @ moved) + whole @ (powers * moved))
+    if bool(pattern.any()):
+        scaled = scaled + torch.einsum("xij,bfj->bfix", pattern.to(kind), moved.squeeze(3))
+    return root * scaled

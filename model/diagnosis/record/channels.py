@@ -11,7 +11,7 @@ from sprung.model.diagnosis.record.highpass import carries_everything, passed
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
-from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
+from sprung.model.mechanics import ACCELERATION
 from sprung.model.schema import SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS

@@ -1,0 +1,103 @@
+"""Loads: the mass matrix of a body that carries something somewhere, its slopes, and windows that tell where."""
+
+import numpy as np
+import pytest
+import torch
+
+from sprung.model.identification.deviations import deviations
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import Identifier
+from sprung.model.identification.refine import Refiner
+from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.simulate.loading import by_inertia, load_terms
+from sprung.model.system import load_system, parse_system
+from tests.test_system import QUARTER_CAR
+
+CAR = slice(0, 3)  # z, roll, pitch
+MASS, ROLL, PITCH = 32000.0, 56800.0, 1.97e6
+CARRIED, AT, OWN_ROLL, OWN_PITCH = 6400.0, 1.5, 4000.0, 150e3  # kg, m, kg m^2 about its own centre
+
+
+def described():
+    """Load, roll, pitch and centre of goods of `CARRIED` kg at `AT` m."""
+    mass, roll = MASS + CARRIED, ROLL + OWN_ROLL
+    pitch = PITCH + OWN_PITCH + CARRIED * AT**2
+    load = np.log(mass / MASS)
+    return np.array(
+        [load, np.log(roll / ROLL) - load, np.log(pitch / PITCH) - load, CARRIED * AT / np.sqrt(mass * pitch)]
+    )
+
+
+@pytest.fixture(scope="module")
+def system():
+    return load_system()
+
+
+@pytest.fixture(scope="module")
+def simulator(system):
+    return LinearSimulator(system)
+
+
+def values_at(simulator, terms):
+    x = np.concatenate([np.zeros(24), terms])
+    return simulator.element_values(torch.as_tensor(x)[None])
+
+
+def test_the_mass_matrix_is_that_of_the_body_and_what_it_carries(simulator):
+    inertia = values_at(simulator, described()).inertia[0].numpy()
+    expected = np.diag([MASS + CARRIED, ROLL + OWN_ROLL, PITCH + OWN_PITCH + CARRIED * AT**2])
+    expected[0, 2] = expected[2, 0] = CARRIED * AT
+    np.testing.assert_allclose(inertia[CAR, CAR], expected, rtol=1e-12, atol=1e-9)
+    assert np.count_nonzero(inertia[CAR, 3:]) == 0
+
+
+def test_forces_accelerate_by_the_inverse_of_the_mass_matrix(simulator):
+    forces = torch.as_tensor(np.random.default_rng(1).normal(size=(1, 9, 2)))
+    for terms in (np.zeros(4), described()):
+        values = values_at(simulator, terms)
+        expected = torch.linalg.solve(values.inertia, forces)
+        np.testing.assert_allclose(values.accelerated(forces), expected, rtol=1e-10)
+
+
+def test_slopes_of_the_inertia_forces_agree_with_finite_differences(simulator):
+    rng, at, step = np.random.default_rng(2), described(), 1e-6
+    acceleration = torch.as_tensor(rng.normal(size=(1, 3, 9)) + 1j * rng.normal(size=(1, 3, 9)))
+    here, loading = values_at(simulator, at), simulator.loading
+    slopes = by_inertia(acceleration, here.mass, here.coupling, loading.exponents, loading.pattern)
+    for i, unit in enumerate(np.eye(4)):
+        up, down = (values_at(simulator, at + sign * step * unit).inertia.to(acceleration.dtype) for sign in (1, -1))
+        expected = (acceleration @ (up - down)) / (2 * step)
+        np.testing.assert_allclose(slopes[..., i], expected, rtol=1e-6, atol=1e-3)
+
+
+def test_a_body_without_axes_has_a_mass_alone():
+    assert [term.kind for term in load_terms(parse_system(QUARTER_CAR))] == ["load"]
+
+
+def test_windows_tell_where_goods_lie_and_blame_no_spring(system):
+    x = np.tile(np.concatenate([np.zeros(24), described()]), (24, 1))
+    runs = simulate_runs(system, x, system.window, np.random.default_rng(3))
+    alone = Refiner(system).refine(runs.values)
+    found = Refiner(system).refine(runs.values, loads=True)
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    score = (found.log_ratio - x)[:, :24] / std[:, :24]
+    assert 0.85 < np.sqrt(np.mean(score**2)) < 1.15
+    weight = std[:, 24:] ** -2
+    mean = (found.log_ratio[:, 24:] * weight).sum(axis=0) / weight.sum(axis=0)
+    assert abs(mean[0] - described()[0]) < 0.03
+    assert np.median(alone.chi_square) > 1.1 * np.median(found.chi_square)
+
+
+def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
+    """Summed over many windows, information and score lead to the truth, not to the middle of what is likely."""
+    x = np.tile(np.concatenate([np.zeros(24), described()]), (48, 1))
+    runs = simulate_runs(system, x, system.window, np.random.default_rng(4))
+    at = [i for i, d in enumerate(deviations(system)) if d.kind not in ("gain", "delay")]
+    total, pull = np.zeros((4, 4)), np.zeros(4)
+    for estimate in Identifier(system).examine(runs.values, np.zeros(48, dtype=bool)):
+        said = estimate.deviating
+        total += said.information[np.ix_(at, at)]
+        pull += said.score[at] + said.information[np.ix_(at, at)] @ said.point[at]
+    found, std = np.linalg.solve(total, pull), np.sqrt(np.diag(np.linalg.inv(total)))
+    assert np.abs((found - described()) / std).max() < 3.5
+    assert std[3] < 0.01
