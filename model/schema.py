@@ -130,6 +130,7 @@ class Element(Strict):
     position: Point | None = None
     stiffness: Quantity = Value(value=0.0, fixed=True)  # N/m
     damping: Quantity = Value(value=0.0, fixed=True)  # N s/m
+    by_load: float = Field(default=0.0, ge=0, le=2)  # power of the load that the stiffness grows with; air spring: 1
     laws: Laws = ()
     depends_on: tuple[str, ...] = ()  # measured `signals` that its stiffness, damping and laws may follow
 

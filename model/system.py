@@ -323,6 +323,8 @@ def _without_empty_laws(part: Any) -> None:
     if isinstance(part, dict):
         if not part.get("laws", True):
             del part["laws"]
+        if part.get("by_load") == 0:
+            del part["by_load"]
         for setting in (s for law in part.get("laws", ()) for s in law.values()):
             for value in setting.values():
                 if isinstance(value, dict):
@@ -384,6 +386,12 @@ def unsupported(file: SystemFile) -> list[str]:
         found.append(
             f"inputs.{other}: measured inputs beside a track are not supported; make all wheels kind track, or none"
         )
+    follows = [name for name, element in file.elements.items() if element.by_load]
+    if tracks and follows:
+        found.append(f"elements.{follows[0]}.by_load: not supported where nothing is measured below; leave it out")
+    for name in follows:
+        if file.elements[name].upper not in file.bodies:
+            found.append(f"elements.{name}.by_load: its upper end must be the body that is loaded")
     seconds = file.window / file.sample_rate
     if tracks and seconds < SHORTEST_TRACK:
         least = round(SHORTEST_TRACK * file.sample_rate)

@@ -86,7 +86,7 @@ class AmbientIdentifier:
         told = self.told(values, start)
         present = np.asarray(np.isfinite(values[:, len(self.system.inputs) :]).all(axis=0))
         P = len(self.system.parameters)
-        return _silent(P, len(present)) if told is None else _as_estimate(told, P, present)
+        return _silent(P, len(present)) if told is None else as_estimate(told, P, present)
 
     def _checked(self, windows: FloatArray) -> FloatArray:
         return checked(self.system, windows)
@@ -127,7 +127,7 @@ class OutputOnlyIdentifier:
         if not told.adequate:
             coloured = self.coloured.told(values, start)
             if coloured is not None:
-                seen = _as_estimate(coloured, P, present)
+                seen = as_estimate(coloured, P, present)
                 if seen.adequate and seen.identifiable.any():
                     return seen
         return _of_transient(told, P, present)
@@ -165,7 +165,7 @@ def _of_transient(told: TransientFit, P: int, present: BoolArray) -> Estimate:
     )
 
 
-def _as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:
+def as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:
     """The first P unknowns are the system's parameters."""
     fitted = told.fitted
     # What the model cannot follow is treated as more noise, so that intervals stay honest.

@@ -1,9 +1,9 @@
-"""What a window says about the measurements themselves: gain and delay of every channel, load of the bodies.
+"""What a window says about the measurements themselves: gain and delay of every channel.
 
 A channel reads `(1 + g) y(t - tau)` of the true signal y.  At the refined parameters the simulated outputs are known,
 so every sensitivity is nearly free: to a sensor's gain it is the sensor's own output, to its delay minus the derivative
 of it; to an input's gain and delay the same of what that input makes the sensors show (with the opposite sign: a
-reading too large is a motion too small); to the load of a body the response to its inertia forces.
+reading too large is a motion too small).  Loads are refined with the parameters.
 
     r = J_x dx + J_h dh + noise,    free responses eliminated as in the refinement
 
@@ -52,7 +52,6 @@ class DeviationSensitivity:
         system = model.system
         self.model, self.deviations = model, deviations(system)
         self.inputs = len(system.inputs)
-        self.loads = len(model.simulator.loading)
         time = np.arange(model.samples) / system.sample_rate
         self.slope = torch.as_tensor(CubicSpline(time, np.eye(model.samples))(time, 1))
         drive, share = [], []
@@ -128,10 +127,6 @@ class DeviationSensitivity:
         by_sensor = (at.whiten @ model.compression.matrix(data.present).to(at.whiten.dtype)).to(kind)
         out[..., columns] = by_sensor * shown[:, :, None]
         out[..., C + columns] = by_sensor * late[:, :, None]
-        if self.loads and at.x.shape[1] == len(model.simulator.k_of):  # else they are refined themselves
-            values = model.simulator.element_values(at.x)
-            terms = model.inertia_terms(loads=True, masses=False)
-            out[..., 2 * C :] = model.by_inertia(values, at.transfer, at.whiten, after.states, data, terms).to(kind)
         dropped = self.dropped(data.present).to(kind)
         if not len(dropped):
             return out, None

@@ -91,10 +91,15 @@ class WindowModel:
         x0 = x0[:, : discrete.Ad.shape[1]]
         noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
         states = forced + s.free_states(discrete, x0, self.samples)
-        J = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
-        terms = self.inertia_terms(loads=x.shape[1] > len(s.m_of))
-        if len(terms[0]):
-            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, terms)], dim=3)
+        J, by_load = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
+        masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
+        if len(masses):
+            none = none.new_zeros(len(masses), *none.shape[1:])
+            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none))], dim=3)
+        if x.shape[1] > len(s.m_of):
+            terms = s.loading.exponents, s.loading.pattern
+            of_load = self.by_inertia(values, transfer, whiten, states, data, terms)
+            J = torch.cat([J, of_load if by_load is None else of_load + by_load], dim=3)
         J = as_rows(J)
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
@@ -274,8 +279,9 @@ class WindowModel:
         states: Tensor,
         data: WindowBatch,
         noise: Tensor,
-    ) -> Tensor:
-        """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P')."""
+    ) -> tuple[Tensor, Tensor | None]:
+        """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P'), and to loads
+        through the stiffnesses that follow them, (B, F, R, X); None: none does."""
         s = self.simulator
         n = s.H.shape[1]
         d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
@@ -293,18 +299,11 @@ class WindowModel:
         deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
         rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
         k_at, c_at = s.estimated_elements
-        return torch.cat(
-            [per_force[..., k_at] * deflection[:, :, None, k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3
+        of_k, powers = per_force * deflection[:, :, None], s.loading.stiffness
+        return (
+            torch.cat([of_k[..., k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3),
+            of_k @ powers.T.to(kind) if bool(powers.any()) else None,
         )
-
-    def inertia_terms(self, *, loads: bool, masses: bool = True) -> tuple[Tensor, Tensor]:
-        """Exponents (X, n) and couplings (X, n, n) of the masses that are parameters, then of the loads."""
-        s = self.simulator
-        own = s.m_of[s.m_of.any(dim=1)] if masses else s.m_of[:0]
-        none = own.new_zeros(len(own), *s.loading.pattern.shape[1:])
-        if not loads:
-            return own, none
-        return torch.cat([own, s.loading.exponents]), torch.cat([none, s.loading.pattern])
 
     def by_inertia(
         self,
@@ -315,7 +314,7 @@ class WindowModel:
         data: WindowBatch,
         terms: tuple[Tensor, Tensor],
     ) -> Tensor:
-        """Whitened sensitivities to masses and loads, see `inertia_terms`, (B, F, R, X)."""
+        """Whitened sensitivities to masses and loads, exponents (X, n) and couplings (X, n, n), (B, F, R, X)."""
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]

@@ -159,6 +159,7 @@ class LinearSimulator:
             m = m * torch.exp(log_ratio @ self.m_of)
         if not load.shape[1]:
             return ElementValues(k, c, m)
+        k = k * torch.exp(load @ self.loading.stiffness)
         return ElementValues(k, c, m * self.loading.factors(load), self.loading.coupling(load))
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""What passengers and goods change of a body: its mass, how that is spread, and where its centre of gravity lies.
+"""What passengers and goods change of a body: its mass, how that is spread, where its centre of gravity lies.
 
 With m0, J0, I0 the body's mass, roll and pitch inertia without them, and one load's four numbers l, r, p, c,
 
@@ -7,6 +7,9 @@ With m0, J0, I0 the body's mass, roll and pitch inertia without them, and one lo
 J and I are about the body's `position` and x_c is how far its centre of gravity lies from there along x, so that the
 mass matrix of [z, roll, pitch] has m x_c = c sqrt(m I) between z and pitch.  All four are zero for the empty body, of
 the size of a relative change, and give a positive mass matrix for any |c| < 1.
+
+An air spring that a valve keeps at its height has a pressure, and so a stiffness, in proportion to the weight on it: an
+element with `by_load: a` under the body is stiffer by exp(a l).
 """
 
 from __future__ import annotations
@@ -66,6 +69,12 @@ class Loading:
                 pattern[i, z, pitch] = pattern[i, pitch, z] = 1.0
             else:
                 exponents[i, dofs.index(f"{term.body}.{term.kind.removesuffix('_inertia')}")] = 1.0
+        stiffness = np.zeros((len(self.terms), len(system.elements)))
+        for e, element in enumerate(system.file.elements.values()):
+            for i, term in enumerate(self.terms):
+                if term.kind == "load" and term.body == element.upper:
+                    stiffness[i, e] = element.by_load
+        self.stiffness = constant(stiffness)  # powers of each stiffness, of air springs under a load, (X, E)
         self.exponents = constant(exponents)  # powers of each mass and inertia, (X, n)
         self.pattern = constant(pattern)  # where each couples degrees of freedom, (X, n, n)
         self.couples = any(term.kind == "centre" for term in self.terms)

@@ -1,5 +1,7 @@
 """Loads: the mass matrix of a body that carries something somewhere, its slopes, and windows that tell where."""
 
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from sprung.model.identification.identify import Identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.simulate.loading import by_inertia, load_terms
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import MANCHESTER, load_system, parse_system
 from tests.test_system import QUARTER_CAR
 
 CAR = slice(0, 3)  # z, roll, pitch
@@ -101,3 +103,37 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
     found, std = np.linalg.solve(total, pull), np.sqrt(np.diag(np.linalg.inv(total)))
     assert np.abs((found - described()) / std).max() < 3.5
     assert std[3] < 0.01
+
+
+def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
+    """Air springs: at 20 % more weight they are 20 % stiffer, and nothing has changed."""
+    text = MANCHESTER.read_text()
+    aired = re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 1, ", text)
+    system, steel = parse_system(aired), parse_system(text)
+    assert aired != text and system.digest != steel.digest
+    x = np.tile(np.concatenate([np.zeros(24), [np.log(1.2), 0.0, 0.0, 0.0]]), (24, 1))
+    runs = simulate_runs(system, x, system.window, np.random.default_rng(5))
+    found, taken = (Refiner(one).refine(runs.values, loads=True) for one in (system, steel))
+    secondary = [i for i, p in enumerate(system.parameters) if p.name.startswith("secondary") and "stiff" in p.name]
+    std = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2))
+    assert 0.8 < np.sqrt(np.mean((found.log_ratio[:, :24] / std[:, :24]) ** 2)) < 1.2
+    assert abs(np.median(found.log_ratio[:, secondary])) < 0.02
+    assert np.median(taken.log_ratio[:, secondary]) == pytest.approx(np.log(1.2), abs=0.03)
+
+
+def test_slopes_along_loads_of_air_springs_agree_with_finite_differences():
+    system = parse_system(re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 0.8, ", MANCHESTER.read_text()))
+    x = np.tile(np.concatenate([np.zeros(24), described()]), (2, 1))
+    runs = simulate_runs(system, x, system.window, np.random.default_rng(6))
+    model = Refiner(system).model
+    data = model.batch(model.knots(runs.clean), runs.clean, np.ones(len(system.sensors), dtype=bool))
+    x = torch.as_tensor(x)
+    at = model.linearise(x, data)
+    known = torch.linalg.qr(at.free.mT)[0]
+    for row in (24, 27):
+        step = torch.zeros_like(x)
+        step[:, row] = 1e-5
+        up, down = (model.chord(at, x + sign * step, at.x0, data).residual for sign in (1, -1))
+        expected, slope = (down - up) / 2e-5, at.sensitivities[:, row, :, None]
+        expected, slope = (v - known @ (known.mT @ v) for v in (expected, slope))
+        assert float((expected - slope).norm() / expected.norm()) < 0.01

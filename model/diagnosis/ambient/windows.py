@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.ambient.identify import AmbientIdentifier
+from sprung.model.ambient.identify import AmbientIdentifier, as_estimate
 from sprung.model.ambient.sensing import sensing
 from sprung.model.ambient.transient import TransientWindow
 from sprung.model.diagnosis.record.signals import Signals
@@ -51,38 +51,49 @@ class WindowResult:
 class ShakenStructure:
     """Windows of a structure under forces that nobody measured."""
 
-    def __init__(self, system: System, sensors: np.ndarray) -> None:
-        self.system, self.sensors, self.window = system, sensors, TransientWindow(system)
+    def __init__(self, system: System, signals: Signals) -> None:
+        self.system, self.signals, self.window = system, signals, TransientWindow(system)
 
-    def result(self, values: FloatArray, at: tuple[float, float], known: FloatArray | None) -> WindowResult | None:
-        """Of a window (T, S); with `known` log-ratios only the forces' levels are fitted."""
-        told = self.window.told(values, self.sensors, None, known)
+    def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
+        """Of a window of samples; with `known` log-ratios only the forces' levels are fitted."""
+        told = self.window.told(self.signals.sensors[start:stop], self.signals.sensor_index, None, known)
         if told is None:
             return None
         P = len(self.system.parameters)
         powers = Powers(told.frequency, told.whole, told.rest, told.expected, np.ones(len(told.frequency)))
+        at = times(self.signals, start, stop)
         return WindowResult(*at, told.fitted.x[:P], told.covariance[:P, :P], told.adequate, powers)
 
 
 class UnmeasuredTrack:
     """Windows of a vehicle on a track that nobody measured."""
 
-    def __init__(self, system: System, sensors: np.ndarray) -> None:
-        self.system, self.sensors, self.identifier = system, sensors, AmbientIdentifier(system)
+    def __init__(self, system: System, signals: Signals) -> None:
+        self.system, self.signals, self.identifier = system, signals, AmbientIdentifier(system)
 
-    def result(self, values: FloatArray, at: tuple[float, float], known: FloatArray | None) -> WindowResult | None:
-        """Of a window (T, S); its parameters are always its own."""
-        window = np.full((len(values), len(self.system.channels)), np.nan)
-        window[:, len(self.system.inputs) + self.sensors] = values
-        told, (estimate,) = self.identifier.told(window), self.identifier.identify(window[None])
+    def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
+        """Of a window of samples; its parameters are always its own."""
+        system, sensors = self.system, self.signals.sensor_index
+        window = np.full((stop - start, len(system.channels)), np.nan)
+        window[:, : len(system.inputs)] = self.signals.speed[start:stop]
+        window[:, len(system.inputs) + sensors] = self.signals.sensors[start:stop]
+        told = self.identifier.told(window)
         if told is None:
             return None
-        sensed = sensing(self.system.mechanics, self.sensors, self.system.sensor_noise[self.sensors])
-        back, P = np.linalg.pinv(sensed.rows), len(self.system.parameters)
+        present = np.isin(np.arange(len(system.sensors)), sensors)
+        estimate = as_estimate(told, len(system.parameters), present)
+        sensed = sensing(system.mechanics, sensors, system.sensor_noise[sensors])
+        back = np.linalg.pinv(sensed.rows)
         seen = np.einsum("sr,frt,st->fs", back, sensed.seen(told.spectra.matrix), back).real
         expected = np.einsum("sr,frt,st->fs", back, told.fitted.at.covariance, back).real
         powers = Powers(told.spectra.frequency, seen, seen, expected, told.spectra.weight)
-        return WindowResult(*at, told.log_ratio[:P], told.covariance[:P, :P], estimate.adequate, powers)
+        at = times(self.signals, start, stop)
+        return WindowResult(*at, estimate.log_ratio, estimate.covariance, estimate.adequate, powers)
+
+
+def times(signals: Signals, start: int, stop: int) -> tuple[float, float]:
+    """Of samples, s since the recording began."""
+    return signals.start + start / signals.sample_rate, signals.start + stop / signals.sample_rate
 
 
 def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], str]:
@@ -105,13 +116,12 @@ def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], 
 def all_windows(system: System, signals: Signals, tell: Told) -> tuple[list[WindowResult], str]:
     """Every window that tells anything, and what was left out, in words."""
     kind = UnmeasuredTrack if system.on_track else ShakenStructure
-    looked = kind(system, signals.sensor_index)
+    looked = kind(system, signals)
     cuts, note = stretches(system, signals)
     found = []
     for number, (start, stop) in enumerate(cuts):
         tell(number / len(cuts))
-        at = (signals.start + start / signals.sample_rate, signals.start + stop / signals.sample_rate)
-        result = looked.result(signals.sensors[start:stop], at, None)
+        result = looked.result(start, stop, None)
         if result is not None:
             found.append(result)
     return found, note
@@ -121,10 +131,10 @@ def with_known(system: System, signals: Signals, windows: list[WindowResult], kn
     """The same windows under parameters (P,) that all of them share."""
     if system.on_track:
         return windows
-    looked, again = ShakenStructure(system, signals.sensor_index), []
+    looked, again = ShakenStructure(system, signals), []
     for window in windows:
         start, stop = (round((at - signals.start) * signals.sample_rate) for at in (window.begin, window.end))
-        result = looked.result(signals.sensors[start:stop], (window.begin, window.end), known)
+        result = looked.result(start, stop, known)
         if result is not None:
             again.append(result)
     return again

@@ -12,7 +12,7 @@ from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import ACCELERATION
-from sprung.model.schema import SupportInput
+from sprung.model.schema import SupportInput, TrackInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS
 from sprung.model.simulate.fusion import motion
@@ -57,7 +57,8 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
         notes.append(
             f"standstill of {still.sum() / sample_rate:.1f} s is left out: the longest stretch that moves is used"
         )
-    stuck = _blank_stuck(values, names, sample_rate, resting, rules.stuck)
+    steady = {"speed"} if system.on_track else set()  # may be the same for minutes
+    stuck = _blank_stuck(values, names, sample_rate, resting | steady, rules.stuck)
     first, last = _usable_stretch(values, max(1, int(rules.gap * sample_rate)))
     if last - first < rules.minimum_samples:
         raise TooLittleError(
@@ -176,6 +177,8 @@ def _by_role(
     levelled: FloatArray | None = None  # the acceleration of a support that nothing else tells of
     frozen = {name for name, _ in stuck}
     for name, source in system.file.inputs.items():
+        if isinstance(source, TrackInput):  # nobody measures it
+            continue
         if not isinstance(source, SupportInput):
             series = values[:, column]
             column += 1
@@ -199,7 +202,7 @@ def _by_role(
         integrated.append("displacement" not in there)
         accelerated.append("acceleration" in there)
         support_names.append(name)
-    sensors = values[:, column:]
+    sensors = values[:, len(system.inputs) :]
     present = np.isfinite(sensors).all(axis=0)
     if not present.any():
         raise DiagnosisError("no sensor of the system file has data in the recording")
@@ -223,6 +226,7 @@ def _by_role(
         integrated=np.array(integrated, dtype=bool),
         accelerated=np.array(accelerated, dtype=bool),
         start=first / sample_rate,
+        speed=values[:, : len(system.inputs)] if system.on_track else empty,
     )
     return Prepared(signals, stuck, tuple(notes))
 

@@ -11,7 +11,7 @@ and the faults of the input channels.  A measured acceleration is fused with wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import comb
 
 import numpy as np
@@ -45,6 +45,7 @@ class Signals:
     integrated: np.ndarray  # supports whose displacement is only an integral, (supports,)
     accelerated: np.ndarray  # supports in whose displacement a measured acceleration is fused already, (supports,)
     start: float = 0.0  # s, time of the first sample since the start of the recording
+    speed: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # m/s, on a track, where measured, (T, 0 or 1)
 
     @property
     def samples(self) -> int:
@@ -58,6 +59,7 @@ class Signals:
             velocity=self.velocity[start:stop],
             force=self.force[start:stop],
             sensors=self.sensors[start:stop],
+            speed=self.speed[start:stop],
             start=self.start + start / self.sample_rate,
         )
 
