@@ -34,6 +34,7 @@ _MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
 _TRIALS = 3  # of those, by their squares at the nominal values
+_SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 _FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
 _CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
 
@@ -69,6 +70,12 @@ class Explainer:
         self.channels = len(system.channels)
         self.groups = clock_groups(system)
         self.directions = self._directions()
+        self._std = np.array([d.std for d in deviations])
+        self._measured = np.arange(len(deviations)) < 2 * self.channels
+        late = self.directions[:, self.channels : 2 * self.channels]
+        whole = [(late[:, self.groups == group] > 0).all(axis=1) for group in np.unique(self.groups)]
+        alone = (late > 0).sum(axis=1) == np.array([[np.sum(self.groups == g)] for g in np.unique(self.groups)])
+        self._clocks = self.directions[(np.array(whole) & alone).any(axis=0)]  # one delay for each clock
 
     def refiner(self, samples: int) -> Refiner:
         if samples not in self._refiners:
@@ -94,6 +101,11 @@ class Explainer:
             others = np.array([b for b in bad if b not in found or self._key(found[b].point) != self._key(common)])
             again = self._by_steps(windows[others], [()] * len(others), common) if len(others) else {}
             found |= {int(others[i]): e for i, e in again.items()}
+        together = self._together(found)
+        if together is not None:
+            others = np.array([b for b in bad if b not in found], dtype=np.int64)
+            again = self._by_steps(windows[others], [()] * len(others), together) if len(others) else {}
+            found |= {int(others[i]): e for i, e in again.items()}
         if found:
             rest = np.array([b for b in bad[TRIED:] if b not in found], dtype=np.int64)
             found |= self._explain(windows[rest], rest)
@@ -111,10 +123,28 @@ class Explainer:
             return None
         return np.asarray(np.median([p for p, key in zip(plain, keys, strict=True) if key == most], axis=0))
 
+    def _together(self, found: dict[int, Explained]) -> FloatArray | None:
+        """Gains and delays as the explained windows of a batch say them together; None: fewer than two do."""
+        plain = [e for e in found.values() if self._key(e.point)]
+        if len(plain) < 2:
+            return None
+        total = np.diag(self._std**-2.0)
+        pull = np.zeros(len(total))
+        for e in plain:
+            information = e.refined.information[0]
+            total += information
+            pull += e.refined.score[0] + information @ np.where(self._measured, e.point, 0.0)
+        point = np.where(self._measured, np.linalg.solve(total, pull), 0.0)
+        return np.where(np.abs(point) > _SLIGHT * self._std, point, 0.0)
+
     def _explain(self, windows: FloatArray, names: IntArray) -> dict[int, Explained]:
         stuck = [self._stuck(window) for window in windows]
         plain = np.array([i for i, faults in enumerate(stuck) if not faults], dtype=np.int64)
         found = {int(plain[i]): e for i, e in self._by_steps(windows[plain], [()] * len(plain)).items()}
+        left = np.array([i for i in plain if i not in found], dtype=np.int64)
+        if len(left) and len(self._clocks) > 1:
+            again = self._by_steps(windows[left], [()] * len(left), clocks=True)
+            found |= {int(left[i]): e for i, e in again.items()}
         late = 0
         for i, window in enumerate(windows):
             if i not in found:
@@ -126,9 +156,15 @@ class Explainer:
         return {int(names[i]): explained for i, explained in found.items()}
 
     def _by_steps(
-        self, windows: FloatArray, known: list[tuple[MeasurementFault, ...]], start: FloatArray | None = None
+        self,
+        windows: FloatArray,
+        known: list[tuple[MeasurementFault, ...]],
+        start: FloatArray | None = None,
+        *,
+        clocks: bool = False,
     ) -> dict[int, Explained]:
-        """One deviation at a time, the one with the most evidence; `known`: faults that were mended before."""
+        """One deviation at a time, the one with the most evidence, or all `clocks` together; `known`: faults that were
+        mended before."""
         found: dict[int, Explained] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
         if start is not None:
@@ -140,7 +176,7 @@ class Explainer:
             going = []
             for i, one in zip(active, parts, strict=True):
                 chi_square, weight = float(one.chi_square[0]), (one.score[0], one.information[0])
-                step, _ = self._step(*weight)
+                step = self._clock_step(*weight) if clocks else self._step(*weight)[0]
                 good = bool(fits(one)[0])
                 if good:
                     found[int(i)] = Explained(one, self._with_load(point[i], one), (*known[i], *self._named(point[i])))
@@ -193,6 +229,12 @@ class Explainer:
         curvature = ((V @ information) * V).sum(axis=1).clip(1e-12)
         best = int(np.argmax(slope**2 / curvature))
         return np.asarray(V[best] * slope[best] / curvature[best]), float(slope[best] ** 2 / curvature[best] / 2)
+
+    def _clock_step(self, score: FloatArray, information: FloatArray) -> FloatArray:
+        """The delays of all clocks at their most likely sizes, shape (H,)."""
+        V = self._clocks
+        prior = np.diag(((V * self._std).max(axis=1)) ** -2.0)
+        return np.asarray(V.T @ np.linalg.solve(V @ information @ V.T + prior, V @ score))
 
     def apart(self, score: FloatArray, information: FloatArray) -> bool:
         """Whether a window that fits should be refined elsewhere: it speaks clearly for a sizeable deviation."""
