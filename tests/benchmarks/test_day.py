@@ -2,27 +2,37 @@
 
 import numpy as np
 import pytest
+import torch
 
 from sprung.benchmarks import day
+from sprung.benchmarks.generator.ride import SYSTEM
+from sprung.benchmarks.generator.timetable import Service, draw_timetable
+from sprung.benchmarks.generator.vehicle import read_vehicle
+from sprung.benchmarks.through import through
 from sprung.model.identification.deviations import deviations
+from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
+from sprung.service.engine import load_engine
+from sprung.service.settings import settings_with
+
+CARRIED = np.array([0.2, -0.05, -0.02, 0.01])
 
 
 @pytest.fixture(scope="module")
 def windows():
-    return day.library(load_system(), 6, 3)
+    return [day.pool(window, len(CARRIED)) for window in day.library(load_system(), 6, 3)]
 
 
 def test_estimates_scatter_about_the_truth_as_they_state(windows):
     system, rng = load_system(), np.random.default_rng(1)
     truth, off = rng.normal(0, 0.1, 24), np.zeros(len(deviations(system)))
-    off[-1] = 0.2
+    off[-4:] = CARRIED
     drawn = [day.drawn(rng, windows[0], truth, off) for _ in range(400)]
     errors = np.array([e.log_ratio for e in drawn]) - truth
     scores = errors / np.sqrt(np.diag(drawn[0].covariance))
     assert np.sqrt(np.mean(scores**2)) == pytest.approx(1.0, abs=0.1)
-    loads = np.array([e.deviating.point[-1] for e in drawn]) - 0.2
-    assert abs(loads.mean()) < 4 * loads.std() / np.sqrt(400)
+    loads = np.array([e.deviating.point[-4:] for e in drawn]) - CARRIED
+    assert np.all(np.abs(loads.mean(axis=0)) < 4 * loads.std(axis=0) / np.sqrt(400))
     gains = [e.deviating.information @ (off - e.deviating.point) for e in drawn]
     slopes = np.array([e.deviating.score for e in drawn]) - gains  # at the true deviations: no slope on average
     spread = np.sqrt(np.diag(drawn[0].deviating.information) / 400)
@@ -34,3 +44,27 @@ def test_a_damper_that_loses_a_seventh_is_found_beside_weather_and_loads(windows
     life = day.live(load_system(), windows, 1.2, 5, measured=True, fault="secondary_1r.damping")
     assert life.isolated or life.found_after is None  # another alarm never comes first
     assert life.strangers == []
+
+
+def test_a_drawn_load_gives_the_mass_matrix_of_the_generator():
+    system, service = load_system(), Service()
+    empty = system.mechanics.mass[:3]
+    terms = day.boarded(np.random.default_rng(3), service, empty)
+    rng = np.random.default_rng(3)
+    load, place = rng.uniform(*service.load), rng.normal(0, service.off_centre)
+    expected = np.diag(empty * (1 + load * np.array([1.0, *rng.uniform(*service.load_spread, 2)])))
+    expected[2, 2] += abs(load) * empty[0] * place**2
+    expected[0, 2] = expected[2, 0] = load * empty[0] * place
+    x = torch.as_tensor(np.concatenate([np.zeros(24), terms]))[None]
+    found = LinearSimulator(system).element_values(x).inertia[0, :3, :3].numpy()
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-6)
+
+
+def test_every_window_of_a_day_goes_through_once_and_in_order():
+    engine, vehicle = load_engine(settings_with({})), read_vehicle(SYSTEM)
+    timetable = draw_timetable(vehicle, Service(dwell=(1.0, 2.0)), 42.0, 4)
+    moments = list(through(engine, vehicle, timetable))
+    np.testing.assert_allclose(np.diff([m.time for m in moments]), 0.5)
+    assert len(moments) == (4200 - 100) // 50 + 1
+    last = moments[-1].state
+    assert last.used + last.rejected + last.idle == len(moments)

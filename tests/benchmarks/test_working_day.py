@@ -58,8 +58,8 @@ def test_a_rail_has_the_spectrum_that_it_is_drawn_from():
 
 def test_the_load_is_where_the_timetable_puts_it():
     """A load in front of the middle presses more on the front springs: the pitch responds to a vertical force."""
-    still = modes(VEHICLE, np.zeros(24), 0.3, 0.0)
-    ahead = modes(VEHICLE, np.zeros(24), 0.3, 2.0)
+    still = modes(VEHICLE, np.zeros(24), 0.3, 0.0, np.ones(2))
+    ahead = modes(VEHICLE, np.zeros(24), 0.3, 2.0, np.ones(2))
     force = np.zeros(19)
     force[18] = 1.0
     front, rear = (VEHICLE.sensors.index(name) for name in ("car_1l", "car_2l"))
