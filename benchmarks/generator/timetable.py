@@ -189,8 +189,9 @@ def _run(rng: np.random.Generator, service: Service, seconds: float) -> Array:
     t = np.arange(round(seconds / STEP)) * STEP
     ending = seconds - (15.0 if pace else 0.0)
     speed = np.minimum(np.minimum(up * t, top), np.maximum(down * (ending - t), pace))
-    slower = rng.uniform(0.6, 1.0)  # a restriction in the middle
-    return np.asarray(np.where(np.abs(t / seconds - 0.5) < 0.1, np.minimum(speed, slower * top), speed))
+    slower = rng.uniform(0.6, 1.0)  # a restriction in the middle, braked for and left as stations are
+    allowed = slower * top + down * np.maximum(0.4 * seconds - t, 0) + up * np.maximum(t - 0.6 * seconds, 0)
+    return np.asarray(np.minimum(speed, allowed))
 
 
 def _curves(rng: np.random.Generator, service: Service, speed: Array) -> tuple[Array, Array]:
