@@ -31,7 +31,7 @@ SERVICE = Service(stop_every=(RIDE, RIDE), dwell=(DWELL, DWELL), load=(0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class LoadStep:
     """What came of one step."""
 
     load: float  # of the empty mass, after the stop
@@ -56,7 +56,7 @@ def stepped(vehicle: Vehicle, step: float, centre: float, seed: int) -> Timetabl
     )
 
 
-def followed(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Step:
+def followed(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> LoadStep:
     """One drawn day through windows, identification and tracker."""
     tracker, hop = engine.tracker, engine.system.hop / engine.system.sample_rate
     seen, scores, ran = (np.inf, np.inf), [], 0.0
@@ -72,7 +72,7 @@ def followed(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Step:
             mean, deviation = tracker.posterior(state)
             scores.append(np.abs((mean - timetable.log_ratio(vehicle, now)) / deviation))
     last = scores[-1] if scores else np.array([np.inf])
-    return Step(
+    return LoadStep(
         float(timetable.load[-1]), float(timetable.centre[-1]), [f"{a.kind} {a.parameter}" for a in state.alarms],
         *seen, [float(s.max()) for s in scores], int(np.sum(last > SILENT)),
     )  # fmt: skip
@@ -97,7 +97,7 @@ def run(cases: int = 10, step: float = 0.3, seed: int = 1) -> Iterator[dict[str,
            "target": "<= 3", "note": "any parameter in any window from 30 s on"}  # fmt: skip
 
 
-def _row(number: int, size: float, one: Step) -> dict[str, Any]:
+def _row(number: int, size: float, one: LoadStep) -> dict[str, Any]:
     return {
         "case": number, "step": f"{100 * size:+.0f} %", "load": f"{100 * one.load:+.1f} %", "centre_m": one.centre,
         "load_error_%": 100 * one.error, "stated_%": 100 * one.stated, "largest_score": max(one.scores, default=np.inf),
