@@ -155,8 +155,6 @@ def law_of(forms: tuple[Shape, ...]) -> ElementLaw:
         absent=tuple(0.0 if spec.name in "abc" else 1.0 for spec in specs),
         strength=0 if len(forms) == 1 else None,
         prior_cost=formula_cost(sum(form.parts for form in forms)),
-        passive=False,
-        odd=False,
         shapes=(lambda seen: _trials(forms[0], seen)) if len(forms) == 1 else law.shapes,
         path=_filtered(law, names.index("tau")) if remembers else None,
     )
