@@ -140,6 +140,7 @@ class Estimate:
     converged: bool
     iterations: int
     states: FloatArray | None = None  # simulated states, shape (T, N), only when asked for
+    outputs: FloatArray | None = None  # simulated sensors, shape (T, S), with the states of systems with laws
     deviating: Deviating | None = None  # where it was asked for, or refined elsewhere than at the system file
     faults: tuple[MeasurementFault, ...] = ()  # that had to be taken back before the window fitted
     informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not

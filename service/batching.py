@@ -26,6 +26,7 @@ TOGETHER = 32  # windows of one batch: more gain little and let the first one wa
 @dataclass(slots=True)
 class _Asked:
     values: FloatArray  # shape (T, C)
+    engine: Engine
     states: bool
     start: int | None  # ns, of a window that will be tracked
     future: Future[Estimate] = field(default_factory=Future)
@@ -52,12 +53,14 @@ class Batcher:
         """Windows that no batch has taken yet."""
         return len(self._waiting)
 
-    def submit(self, values: FloatArray, states: bool = False, start: int | None = None) -> Future[Estimate]:
+    def submit(
+        self, values: FloatArray, states: bool = False, start: int | None = None, engine: Engine | None = None
+    ) -> Future[Estimate]:
         """Queue a window, shape (T, C), without waiting.  Raises Busy when too many wait.
 
-        start: ns, of a window that will be tracked (see `Engine.identify`).
+        start: ns, of a window that will be tracked (see `Engine.identify`); engine: of a vehicle that has its own.
         """
-        asked = _Asked(values, states, start)
+        asked = _Asked(values, engine or self._engine, states, start)
         with self._lock:
             if len(self._waiting) >= self._limit:
                 raise Busy("the numerics are busy; try again in a second")
@@ -78,10 +81,11 @@ class Batcher:
         wanted = [asked for asked in batch if asked.future.set_running_or_notify_cancel()]
         for asked in wanted:
             self._observe({"queue": now - asked.since})
-        for states in (False, True):
-            for tracked in (False, True):
-                alike = [a for a in wanted if a.states is states and (a.start is not None) is tracked]
-                self._answer(alike, states)
+        alike: dict[tuple[int, bool, bool], list[_Asked]] = {}
+        for asked in wanted:
+            alike.setdefault((id(asked.engine), asked.states, asked.start is not None), []).append(asked)
+        for together in alike.values():
+            self._answer(together)
 
     def _call_again(self) -> None:
         try:
@@ -93,11 +97,11 @@ class Batcher:
                     asked.future.set_exception(busy)
             self._waiting.clear()
 
-    def _answer(self, batch: list[_Asked], states: bool) -> None:
-        if not batch:
-            return
+    def _answer(self, batch: list[_Asked]) -> None:
+        """Windows that are asked about in the same way."""
+        states = batch[0].states
         try:
-            estimates, seconds = self._engine.identify(
+            estimates, seconds = batch[0].engine.identify(
                 np.stack([asked.values for asked in batch]),
                 states=states,
                 starts=None if states or batch[0].start is None else [asked.start or 0 for asked in batch],
@@ -107,7 +111,7 @@ class Batcher:
                 batch[0].future.set_exception(error)
                 return
             for asked in batch:  # one of them spoils it for the others
-                self._answer([asked], states)
+                self._answer([asked])
             return
         self._observe(seconds)
         for asked, estimate in zip(batch, estimates, strict=True):

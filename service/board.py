@@ -39,7 +39,6 @@ class Board:
     """
 
     def __init__(self, engine: Engine, vehicles: int, clock: Callable[[], int] = now_ns) -> None:
-        self._engine = engine
         self._limit = vehicles
         self._clock = clock
         self._channels = {channel.name for channel in engine.system.channels}
@@ -53,9 +52,9 @@ class Board:
             held = self._entries.get(batch.vehicle)
         if held is None and not batch.records:
             return
-        if last is None and held is not None:
+        if last is None and held is not None and held.view.model == batch.served.engine.digest:
             last = held.view.last
-        view = vehicle_view(self._engine, batch.vehicle, batch.state, last)
+        view = vehicle_view(batch.served.engine, batch.vehicle, batch.state, last)
         with self._lock:
             entry = self._entries.setdefault(batch.vehicle, Entry(view, self._clock()))
             entry.view = view

@@ -123,7 +123,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
     pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms)
     recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
-    diagnosis_jobs = DiagnosisJobs(settings, engine, store, pipeline.model_id, on_report=notices.report)
+    diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
     kinds = {
         "recording": Kind(recordings.run, settings.recording_seconds),
         "diagnosis": Kind(diagnosis_jobs.run, settings.diagnosis_seconds),
@@ -183,16 +183,18 @@ def stored_views(core: Core) -> list[tuple[VehicleView, int]]:
     From the store.
     """
     views = []
-    model_id = core.pipeline.model_id
+    engines = core.pipeline.engines
     with core.store.read() as connection:
-        recent = fleet.recent_vehicles(connection, model_id, core.settings.vehicles_in_memory)
+        models = engines.models_in_use(connection)
+        recent = fleet.recent_vehicles(connection, models, core.settings.vehicles_in_memory)
         wanted = dict.fromkeys([*status.alarmed_vehicles(connection), *recent[::-1]])
         for vehicle in wanted:
-            row = fleet.load_tracker(connection, vehicle, model_id)
+            served = engines.of(connection, vehicle)
+            row = fleet.load_tracker(connection, vehicle, served.model_id)
             listed = status.fleet_row(connection, vehicle)
             if row is not None and listed is not None and listed.retired_ns is None:
-                last = latest_window(connection, vehicle, model_id)
-                view = vehicle_view(core.engine, vehicle, core.engine.load_state(row.state), last)
+                last = latest_window(connection, vehicle, served.model_id)
+                view = vehicle_view(served.engine, vehicle, served.engine.load_state(row.state), last)
                 views.append((view, listed.received_ns))
     return sorted(views, key=lambda pair: pair[1])
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 import threading
@@ -14,17 +15,19 @@ from sqlalchemy import Connection
 from sprung.model.system import MANCHESTER
 from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
 from sprung.service.durable import sync_folder, sync_tree
-from sprung.service.engine import Engine
+from sprung.service.engines import Served
 from sprung.service.errors import Busy, UserError
 from sprung.service.jobs import Jobs, Progress
-from sprung.service.pipeline import Batch
+from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.recordings import stored_file
 from sprung.service.ring import Excerpt, Rings
 from sprung.service.settings import Settings
-from sprung.service.store import Store, fleet, work
+from sprung.service.store import Store, fleet, vehicle_models, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.worker import ProcessLimits, Task, Worker
+
+log = logging.getLogger("sprung.diagnosis")
 
 
 class Diagnoses:
@@ -98,17 +101,14 @@ class DiagnosisJobs:
     def __init__(
         self,
         settings: Settings,
-        engine: Engine,
-        store: Store,
-        model_id: int,
+        pipeline: Pipeline,
         task: Task[DiagnosisRequest, Stage, DiagnosisResult] = run,
         on_report: OnReport = lambda connection, vehicle, report_id, report: None,
     ) -> None:
         """on_report: told of a new report inside the transaction that stores it."""
         self._settings = settings
-        self._engine = engine
-        self._store = store
-        self._model_id = model_id
+        self._engines = pipeline.engines
+        self._store = pipeline.store
         self.task = task
         self._on_report = on_report
 
@@ -116,8 +116,11 @@ class DiagnosisJobs:
         """Handler of jobs of kind `diagnosis`; returns the report's id and verdict."""
         path, row = stored_file(self._settings, self._store, job)
         report_id = job.id  # one report a job: a job that is done again overwrites its own
-        found = self._diagnose(path, row, report_id, progress)
         vehicle = job.vehicle_id
+        with self._store.read() as connection:
+            served = self._engines.shared if vehicle is None else self._engines.of(connection, vehicle)
+            text = None if vehicle is None else vehicle_models.text_of(connection, vehicle, served.version)
+        found = self._diagnose(path, row, report_id, progress, served, text)
         with self._store.write() as connection:
             if vehicle is not None:
                 fleet.ensure_vehicle(connection, vehicle, now_ns())
@@ -126,16 +129,18 @@ class DiagnosisJobs:
                 work.add_report(connection, report)
                 self._on_report(connection, vehicle, report_id, found.report)
             if vehicle is not None and row.source == "excerpt":
-                fleet.attach_report(connection, vehicle, self._model_id, report_id)
+                fleet.attach_report(connection, vehicle, served.model_id, report_id)
         return {"report": report_id, "verdict": found.verdict}
 
-    def _diagnose(self, path: Path, row: RecordingRow, report_id: str, progress: Progress) -> DiagnosisResult:
+    def _diagnose(
+        self, path: Path, row: RecordingRow, report_id: str, progress: Progress, served: Served, text: str | None
+    ) -> DiagnosisResult:
         """Written beside, by one process only, and moved to its place when it is whole."""
         final = self._settings.reports / report_id
         part = final.with_name(f"{report_id}.{os.getpid()}.part")
         shutil.rmtree(part, ignore_errors=True)
-        source = self._settings.system or MANCHESTER
-        request = DiagnosisRequest(path, row.name, self._engine.system, self._engine.dbc, part, source)
+        engine = served.engine
+        request = DiagnosisRequest(path, row.name, engine.system, engine.dbc, part, text or self._shared_text())
         seconds = self._settings.diagnosis_seconds
         worker = Worker(
             self.task, request, ProcessLimits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"
@@ -150,3 +155,11 @@ class DiagnosisJobs:
         finally:
             shutil.rmtree(part, ignore_errors=True)
         return worker.result
+
+    def _shared_text(self) -> str | None:
+        source = self._settings.system or MANCHESTER
+        try:
+            return source.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            log.warning("%s: what is found cannot be written into a copy of it: %s", source, error)
+            return None

@@ -41,7 +41,7 @@ class DiagnosisRequest:
     system: System
     dbc: Path | None
     out: Path  # folder for page, pictures and report; made when absent
-    system_file: Path | None = None  # where the system was read from: what was found is written into a copy of it
+    system_text: str | None = None  # the file that the system was read from: what was found is written into a copy
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,11 +88,11 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
         report = diagnose(request.system, _load(request), Options(file=request.name), show)
         show(1.0, "writing the report")
         write_report(report, request.system, request.out)
-        if request.system_file is not None:
+        if request.system_text is not None:
             try:
-                write_improved(request.out / IMPROVED, request.system_file, request.system, report)
-            except (OSError, ValueError) as error:  # changed or gone since the service began: the report stays good
-                log.warning("%s: not written with what was found: %s", request.system_file, error)
+                write_improved(request.out / IMPROVED, request.system_text, request.system, report)
+            except (OSError, ValueError) as error:  # changed since the service began: the report stays good
+                log.warning("the system file is not written with what was found: %s", error)
         return DiagnosisResult(report.verdict, report.to_dict())
     except ValueError as error:
         raise ValueError(str(error).replace(str(request.path), request.name)) from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -104,6 +104,17 @@ def load_engine(settings: Settings) -> Engine:
     return Engine(
         system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc
     )
+
+
+def engine_like(engine: Engine, system: System) -> Engine:
+    """An engine of another system file with the same measurements.
+
+    Raises the model's one-line ValueErrors for a system whose windows cannot be identified.
+    """
+    from sprung.model.identification.identify import load_identifier  # brings torch
+
+    identifier = load_identifier(system, workers=os.cpu_count() or 1)
+    return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
 
 
 def make_tracker(system: System) -> Tracker:

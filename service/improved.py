@@ -54,9 +54,9 @@ def improved_text(text: str, system: System, report: Report) -> str:
     return out.getvalue()
 
 
-def write_improved(path: Path, source: Path, system: System, report: Report) -> None:
-    """Write the improved file, once it has been read back without an error."""
-    text = improved_text(source.read_text(encoding="utf-8"), system, report)
+def write_improved(path: Path, text: str, system: System, report: Report) -> None:
+    """Write the improved file of a text (that `system` was read from), once it has been read back without an error."""
+    text = improved_text(text, system, report)
     parse_system(text, str(path), system.catalogue)
     path.write_text(text, encoding="utf-8")
 

@@ -5,14 +5,19 @@ from __future__ import annotations
 import shutil
 from collections.abc import Sequence
 
+from sqlalchemy import Connection
+
 from sprung.service.board import Board
+from sprung.service.engines import Served
 from sprung.service.errors import NotFound
-from sprung.service.pipeline import Pipeline
+from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.settings import Settings
-from sprung.service.store import audit, fleet, marks, status
+from sprung.service.store import audit, fleet, marks, status, vehicle_models
 from sprung.service.store.archive import Archive
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.marks import MarkRow
+from sprung.service.store.vehicle_models import SERVICE_FILE
+from sprung.service.store.windows import latest_window
 from sprung.service.times import now_ns
 
 MOST_ALARMS = 10_000
@@ -68,7 +73,8 @@ class Operations:
         with self._store.write() as connection:
             self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
             if parameters is None:
-                fleet.close_alarms_of_other_models(connection, vehicle, self._pipeline.model_id, now)
+                model = self._pipeline.engines.of(connection, vehicle).model_id
+                fleet.close_alarms_of_other_models(connection, vehicle, model, now)
             if parameters is None or parameters:
                 batch = self._pipeline.relearn(vehicle, parameters, connection)
             learned = [] if parameters is None else list(parameters) or None
@@ -78,6 +84,59 @@ class Operations:
         if batch is not None:
             self._pipeline.tell(batch)
         return kept
+
+    def give_model(self, actor: str, vehicle: str, text: str, report: str | None) -> int:
+        """Keep a system file as the vehicle's next version and follow it with that from now on; the version.
+
+        Baselines are learned anew under it; what was estimated before stays under the version before.  Alarms that
+        windows do not fit close, since they were said of that one.  Raises NotFound, UserError for a file that is
+        not of the same measurements or that windows cannot be identified with.
+        """
+        engines, now = self._pipeline.engines, now_ns()
+        engine = engines.made(text, f"the system file for vehicle {vehicle}")  # takes a second: before the store waits
+        with self._store.write() as connection:
+            self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
+            fleet.hold_vehicle(connection, vehicle)
+            model = fleet.ensure_model(connection, engine.digest, engine.system.name, engine.description(), now)
+            version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
+            engines.remember(vehicle, Served(version, engine, model))
+            batch = self._switch(connection, actor, vehicle, version, report, now)
+        self._pipeline.tell(batch)
+        return version
+
+    def use_model(self, actor: str, vehicle: str, version: int) -> None:
+        """Follow a vehicle with an earlier version again, or with the service's own file (0).
+
+        Raises NotFound where there is no such version, UserError where it does not belong to this service any more.
+        """
+        now = now_ns()
+        with self._store.write() as connection:
+            self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
+            fleet.hold_vehicle(connection, vehicle)
+            if version != SERVICE_FILE and vehicle_models.get_version(connection, vehicle, version) is None:
+                raise NotFound(f"vehicle {vehicle} has no model {version}")
+            if version == vehicle_models.current_version(connection, vehicle):
+                return
+            self._pipeline.engines.version(connection, vehicle, version)
+            batch = self._switch(connection, actor, vehicle, version, None, now)
+        self._pipeline.tell(batch)
+
+    def _switch(
+        self, connection: Connection, actor: str, vehicle: str, version: int, report: str | None, now: int
+    ) -> Batch:
+        before = vehicle_models.current_version(connection, vehicle)
+        vehicle_models.put_to_use(connection, vehicle, version, actor, now)
+        model = self._pipeline.engines.of(connection, vehicle).model_id
+        fleet.close_misfits_of_other_models(connection, vehicle, model, now)
+        name = "the service's system file" if version == SERVICE_FILE else f"model {version}"
+        text = f"followed with {name} from here on" + (f", as found in report {report}" if report else "")
+        old = vehicle_models.get_version(connection, vehicle, before)
+        newest = latest_window(connection, vehicle, self._pipeline.model_id if old is None else old.model_id)
+        at = now if newest is None else newest.start  # on the data's time line, where recordings are older than today
+        marks.add_mark(connection, MarkRow(0, vehicle, "model", at, text, None, actor, now))
+        detail = {"version": version, "before": before, "report": report}
+        audit.record(connection, actor, "model", vehicle, detail, now)
+        return self._pipeline.switched(connection, vehicle)
 
     def rename(self, actor: str, vehicle: str, label: str | None) -> None:
         """Change what people call the vehicle; recordings keep its id.  Raises NotFound."""

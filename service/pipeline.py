@@ -15,6 +15,7 @@ from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
+from sprung.service.engines import Engines, Served
 from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.partitions import prepare
@@ -38,6 +39,7 @@ class Batch:
     fresh: list[Window]  # those that were not stored before
     late: int  # fresh, but older than what the tracker had seen: stored, not tracked
     state: TrackerState  # after the batch
+    served: Served  # with which the vehicle is followed
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
 
@@ -46,11 +48,16 @@ class Identified:
     """Windows on their way: identified, not yet tracked and stored."""
 
     vehicle: str
+    served: Served  # with which they were identified
     windows: Sequence[Window]
     known: dict[int, WindowRecord]  # those that are stored already, by start
     fresh: list[Window]
     estimates: list[Estimate | None]  # one per fresh window, None where dropped
     seconds: dict[str, float]  # by stage
+
+
+class ModelChanged(RuntimeError):
+    """While windows were identified the vehicle was given another model."""
 
 
 NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
@@ -67,6 +74,7 @@ def _outcome(window: Window, estimate: Estimate | None) -> tuple[str, str | None
 class HeldVehicle:
     """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
 
+    served: Served
     revision: int
     last_window_ns: int  # start of the newest window that it has seen; -1 before the first
     state: TrackerState
@@ -90,7 +98,10 @@ class Folded:
 
 
 class Pipeline:
-    """Feeds windows through the model into the store.  Safe to share between threads and processes."""
+    """Feeds windows through the model into the store.  Safe to share between threads and processes.
+
+    engine, model_id: of the service's own system file; `engines` knows vehicles that have one of their own.
+    """
 
     def __init__(
         self,
@@ -122,6 +133,7 @@ class Pipeline:
             self.model_id = fleet.ensure_model(
                 connection, staging or engine.digest, engine.system.name, engine.description(), clock()
             )
+        self.engines = Engines(engine, self.model_id, own=staging is None)
 
     def process(
         self,
@@ -139,14 +151,20 @@ class Pipeline:
     def identify(self, vehicle: str, windows: Sequence[Window], priority: Priority = Priority.BATCH) -> Identified:
         """The first half of `process`: may run while the batch before is still tracked and stored."""
         with self.store.read() as connection:
-            known = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+            served = self.engines.of(connection, vehicle)
+            known = known_windows(connection, vehicle, served.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
-        estimates, seconds = self._identify(fresh, priority)
-        return Identified(vehicle, windows, known, fresh, estimates, seconds)
+        estimates, seconds = self._identify(served.engine, fresh, priority)
+        return Identified(vehicle, served, windows, known, fresh, estimates, seconds)
 
     def keep(self, found: Identified, recording_id: str | None = None) -> Batch:
         """The second half of `process`: track and store, in order of time."""
-        batch = self._commit(found.vehicle, found.fresh, found.estimates, recording_id)
+        while True:
+            try:
+                batch = self._commit(found.vehicle, found.fresh, found.estimates, recording_id, found.served)
+                break
+            except ModelChanged:
+                found = self.identify(found.vehicle, found.windows)
         batch.seconds |= found.seconds
         if found.known:
             stored = {record.start: record for record in batch.records} | found.known
@@ -155,11 +173,14 @@ class Pipeline:
             listener(batch)
         return batch
 
-    def track(self, vehicle: str, window: Window, estimate: Estimate) -> Batch:
-        """Track and store one window that was identified elsewhere."""
+    def track(self, vehicle: str, window: Window, estimate: Estimate, served: Served) -> Batch:
+        """Track and store one window that was identified elsewhere, with what the vehicle was `served` by."""
         with self.store.read() as connection:
-            known = known_windows(connection, vehicle, self.model_id, [window.start])
-        batch = self._commit(vehicle, [] if known else [window], [] if known else [estimate], None)
+            known = known_windows(connection, vehicle, served.model_id, [window.start])
+        try:
+            batch = self._commit(vehicle, [] if known else [window], [] if known else [estimate], None, served)
+        except ModelChanged:
+            return self.process(vehicle, [window], priority=Priority.REQUEST)
         batch.records = batch.records or list(known.values())
         for listener in self._listeners:
             listener(batch)
@@ -170,14 +191,16 @@ class Pipeline:
         with self.store.read() as connection:
             return self._current(connection, vehicle).state
 
-    def _identify(self, windows: list[Window], priority: Priority) -> tuple[list[Estimate | None], dict[str, float]]:
+    def _identify(
+        self, engine: Engine, windows: list[Window], priority: Priority
+    ) -> tuple[list[Estimate | None], dict[str, float]]:
         """Estimates, None for dropped windows; and seconds by stage."""
         whole = [w.values for w in windows if w.outcome != "dropped"]
         if not whole:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
         starts = [w.start for w in windows if w.outcome != "dropped"]
-        estimates, seconds = self._compute.run(lambda: self.engine.identify(values, starts=starts), priority)
+        estimates, seconds = self._compute.run(lambda: engine.identify(values, starts=starts), priority)
         found = iter(estimates)
         return [None if w.outcome == "dropped" else next(found) for w in windows], seconds
 
@@ -187,10 +210,11 @@ class Pipeline:
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         recording_id: str | None,
+        served: Served,
     ) -> Batch:
         prepare(self.store, (window.start for window in windows))
         with self.store.write() as connection:
-            folded = self.fold(connection, vehicle, windows, estimates, recording_id)
+            folded = self.fold(connection, vehicle, windows, estimates, recording_id, served=served)
             done = time.perf_counter()
         self._remember(vehicle, folded.after)
         folded.batch.seconds["store"] += time.perf_counter() - done
@@ -204,8 +228,12 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
         held: HeldVehicle | None = None,
+        served: Served | None = None,
     ) -> Folded:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
+
+        served: with which they were identified; left out: the caller has looked in this transaction.  Raises
+        ModelChanged, before anything is stored, where the vehicle is followed with another model by now.
 
         The vehicle is held until the transaction ends: whoever folds several takes them in the order of their ids, and
         calls `partitions.prepare` before.  `held`: what `hold` said in this transaction; the caller has left out what
@@ -214,15 +242,18 @@ class Pipeline:
         now = self._clock()
         started = time.perf_counter()
         at = held or self.hold(connection, vehicle)
+        model_id = at.served.model_id
+        if served is not None and served.model_id != model_id:
+            raise ModelChanged(vehicle)
         raced: dict[int, WindowRecord] = {}
         if held is None:  # another process may have stored some of them while this one was identifying
-            raced = known_windows(connection, vehicle, self.model_id, [w.start for w in windows])
+            raced = known_windows(connection, vehicle, model_id, [w.start for w in windows])
         records, after = self._follow(at, windows, estimates, set(raced), now)
         new = [record for record in records if record.start not in raced]
         tracked = time.perf_counter()
         if new:
-            add_windows(connection, vehicle, self.model_id, new, now, recording_id)
-            history.add_to_rollups(connection, vehicle, self.model_id, new, now)
+            add_windows(connection, vehicle, model_id, new, now, recording_id)
+            history.add_to_rollups(connection, vehicle, model_id, new, now)
             after = replace(after, revision=at.revision + 1)
             self._save(connection, vehicle, after, now, new)
         done = time.perf_counter()
@@ -232,6 +263,7 @@ class Pipeline:
             [w for w in windows if w.start not in raced],
             sum(record.solved is not None and not record.tracked for record in new),
             after.state,
+            at.served,
             {"track": tracked - started, "store": done - tracked},
         )
         return Folded(batch, after)
@@ -255,15 +287,13 @@ class Pipeline:
         now: int,
     ) -> tuple[list[WindowRecord], HeldVehicle]:
         """Feed the windows that are not skipped, in order."""
-        tracker = self.engine.tracker
+        tracker, system = at.served.engine.tracker, at.served.engine.system
         followed = Followed(at.state, at.last_window_ns)
         records = []
         for window, estimate in zip(windows, estimates, strict=True):
             posterior, before = None, followed
             if window.start not in skip:
-                followed = followed.after(
-                    tracker, window, estimate, now, self.engine.system.conditions(window.auxiliary)
-                )
+                followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
             fed = estimate is not None and followed.last == window.start and followed is not before
             if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
                 posterior = Posterior(*tracker.posterior(followed.state))
@@ -283,22 +313,25 @@ class Pipeline:
         """The vehicle's tracker: from memory when that is still what is stored, else read anew."""
         with self._lock:
             held = self._vehicles.get(vehicle)
-        revision = fleet.tracker_revision(connection, vehicle, self.model_id)
-        if held is not None and held.revision == revision:
+        served = self.engines.of(connection, vehicle)
+        revision = fleet.tracker_revision(connection, vehicle, served.model_id)
+        if held is not None and held.revision == revision and held.served is served:
             return held
-        row = fleet.load_tracker(connection, vehicle, self.model_id)
+        row = fleet.load_tracker(connection, vehicle, served.model_id)
         if row is None:
             # a back-fill must not depend on which vehicle is done first
-            new = self._newcomer(connection) if self._shown else self.engine.tracker.initial_state()
-            return HeldVehicle(0, -1, new)
-        return HeldVehicle(row.revision, row.last_window_ns, self.engine.load_state(row.state))
+            new = self._newcomer(connection, served) if self._shown else served.engine.tracker.initial_state()
+            return HeldVehicle(served, 0, -1, new)
+        return HeldVehicle(served, row.revision, row.last_window_ns, served.engine.load_state(row.state))
 
-    def _newcomer(self, connection: Connection) -> TrackerState:
+    def _newcomer(self, connection: Connection, served: Served) -> TrackerState:
         """State of a vehicle never seen: what weather does to springs, others of its fleet have learned.
 
         Reading what they have learned takes as long as folding ten windows, and changes over days: it is kept until
         there are a tenth more of them, for an hour at the most.
         """
+        if served.model_id != self.model_id:  # a model of its own: no other vehicle has learned under it
+            return served.engine.tracker.initial_state()
         count, now = fleet.count_trackers(connection, self.model_id), self._clock()
         held = self._told
         if held is None or count >= FRESH_GROWTH * held.vehicles or not 0 <= now - held.at < FRESH_NS:
@@ -317,9 +350,9 @@ class Pipeline:
         fleet.ensure_vehicle(connection, vehicle, now)
         fleet.hold_vehicle(connection, vehicle)
         at = self._current(connection, vehicle)
-        after = replace(at, state=self.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
+        after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
         self._save(connection, vehicle, after, now, [])
-        return Batch(vehicle, [], [], 0, after.state)
+        return Batch(vehicle, [], [], 0, after.state, at.served)
 
     def tell(self, batch: Batch) -> None:
         """Let every listener know of a change that came without windows."""
@@ -341,17 +374,25 @@ class Pipeline:
         """Make the vehicle's line in the fleet's list anew from what is stored; hold the vehicle before."""
         now, at = self._clock(), self._current(connection, vehicle)
         fleet.ensure_vehicle(connection, vehicle, now)
-        view = vehicle_view(self.engine, vehicle, at.state, latest_window(connection, vehicle, self.model_id))
+        engine, model_id = at.served.engine, at.served.model_id
+        view = vehicle_view(engine, vehicle, at.state, latest_window(connection, vehicle, model_id))
         status.forget_counts(connection, vehicle)
-        counts = status.count_windows(connection, vehicle, self.model_id)
-        found = view.status(self.engine.system.elements)
-        status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
+        counts = status.count_windows(connection, vehicle, model_id)
+        status.save_status(connection, vehicle, model_id, at.revision, view.status(engine.system.elements), counts, now)
+
+    def switched(self, connection: Connection, vehicle: str) -> Batch:
+        """After a vehicle was given another model, inside the transaction that did it: its line in the fleet's list
+        is that of the model.  Hand the batch to `tell` once the transaction is committed."""
+        self.show(connection, vehicle)
+        at = self._current(connection, vehicle)
+        return Batch(vehicle, [], [], 0, at.state, at.served)
 
     def _save_status(
         self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
     ) -> None:
         last = next((record for record in reversed(new) if record.solved is not None), None)
-        view = vehicle_view(self.engine, vehicle, at.state, last)
+        engine, model_id = at.served.engine, at.served.model_id
+        view = vehicle_view(engine, vehicle, at.state, last)
         counts = Counter(record.outcome for record in new)
         unfitting = [
             record
@@ -359,18 +400,19 @@ class Pipeline:
             if record.outcome != "uninformative" and record.solved is not None and not record.solved.adequate
         ]
         counts["unfitting"] = len(unfitting)
-        found = view.status(self.engine.system.elements)
-        status.save_status(connection, vehicle, self.model_id, at.revision, found, counts, now)
+        found = view.status(engine.system.elements)
+        status.save_status(connection, vehicle, model_id, at.revision, found, counts, now)
         reasons = [(record.outcome, record.reason, record.start) for record in new if record.reason]
         reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
-        status.add_reasons(connection, vehicle, self.model_id, reasons)
+        status.add_reasons(connection, vehicle, model_id, reasons)
 
     def _save(
         self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
     ) -> None:
         row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
-        fleet.save_tracker(connection, vehicle, self.model_id, row, now)
-        changes = fleet.save_alarms(connection, vehicle, self.model_id, at.state.alarms)
+        model_id = at.served.model_id
+        fleet.save_tracker(connection, vehicle, model_id, row, now)
+        changes = fleet.save_alarms(connection, vehicle, model_id, at.state.alarms)
         if not self._shown:
             return
         if changes:

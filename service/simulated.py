@@ -64,8 +64,10 @@ def compare(engine: Engine, start: int, values: FloatArray) -> Compared:
     estimates, _ = engine.identify(values[None], states=True)
     estimate = estimates[0]
     assert estimate.states is not None
-    simulator = LinearSimulator(engine.system)
     inputs = len(engine.system.inputs)
+    if estimate.outputs is not None:
+        return Compared(start, engine.system.sample_rate, values[:, inputs:], estimate.outputs, estimate)
+    simulator = LinearSimulator(engine.system)
     drives = torch.as_tensor(simulator.knots(values[None, :, :inputs]))[0]
     discrete = simulator.discretise(simulator.element_values(torch.as_tensor(estimate.log_ratio)[None]))
     outputs = torch.as_tensor(estimate.states) @ discrete.C[0].T + drives @ discrete.D[0].T

@@ -97,6 +97,23 @@ class Client:
         body = {"text": text, "parameters": None if parameters is None else list(parameters)}
         return self._post(f"/vehicles/{_quoted(vehicle)}/maintenance", models.MarkAnswer, body)
 
+    def use_model(
+        self, vehicle: str, *, report: str | None = None, version: int | None = None, system: str | None = None
+    ) -> models.VehicleModels:
+        """Follow a vehicle with what a report found, with an earlier version (0: the service's file), or with the text
+        of a system file."""
+        chosen = {"report": report, "version": version, "system": system}
+        body = {name: value for name, value in chosen.items() if value is not None}
+        return self._post(f"/vehicles/{_quoted(vehicle)}/model", models.VehicleModels, body)
+
+    def vehicle_models(self, vehicle: str) -> models.VehicleModels:
+        """Every version that a vehicle was followed with."""
+        return self._get(f"/vehicles/{_quoted(vehicle)}/models", models.VehicleModels)
+
+    def model_file(self, vehicle: str, version: int) -> str:
+        """The system file of a version."""
+        return self._send("GET", f"/vehicles/{_quoted(vehicle)}/models/{version}").decode()
+
     def identify(self, window: Mapping[str, Any], **query: Any) -> models.IdentifyAnswer:
         """Identify one window; its form is that of `POST /identify`."""
         return self._post("/identify", models.IdentifyAnswer, window, query)

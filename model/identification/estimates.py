@@ -31,6 +31,7 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
             converged=bool(refined.converged[b]),
             iterations=int(refined.iterations[b]),
             states=refined.states[b] if states else None,
+            outputs=refined.outputs[b] if states and refined.outputs.shape[1] else None,
             informative=bool(informative[b]),
             deviating=deviating[b],
         )

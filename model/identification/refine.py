@@ -56,6 +56,7 @@ class Refined:
     error: FloatArray  # rms of measured minus simulated, NaN for absent sensors, shape (B, S)
     rms: FloatArray  # rms of measured, NaN for absent sensors, shape (B, S)
     states: FloatArray  # simulated, shape (B, T, N); T = 0 unless asked for
+    outputs: FloatArray  # simulated sensors, shape (B, T, S); T = 0 where states and values say them
     excitation: FloatArray  # power of the strongest input over that of its noise, shape (B,)
     weighed: BoolArray  # whether the next three were computed, shape (B,)
     cross: FloatArray  # change of the log-ratios per deviation, shape (B, P, H); H = 0 unless asked for
@@ -225,6 +226,7 @@ class Refiner:
             error=progress.error[rows].numpy(),
             rms=rms,
             states=path.numpy(),
+            outputs=np.zeros((len(x), 0, len(data.present))),
             excitation=excitation,
             weighed=progress.weighed[rows].numpy(),
             cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),

@@ -167,6 +167,7 @@ class _Search:
         self.iterations = torch.zeros(B, dtype=torch.long)
         self.error = torch.full((B, len(data.present)), torch.nan, dtype=torch.float64)
         self.states = torch.zeros(B, T, N, dtype=torch.float64)
+        self.outputs = torch.full((B, T, len(data.present)), torch.nan, dtype=torch.float64)
         self.smooth = np.zeros((2, B, T, len(windows.system.elements)))
 
     def run(self, states: bool, near: bool = False) -> Refined:
@@ -243,6 +244,7 @@ class _Search:
         self.converged[rows], self.covariance[rows], self.states[rows] = done, columns.covariance, motion.states
         self.iterations[rows] += 1
         shown = torch.as_tensor(np.flatnonzero(data.present))
+        self.outputs[rows[:, None], :, shown] = motion.outputs.mT
         self.error[rows[:, None], shown] = (data.measured - motion.outputs).square().mean(dim=1).sqrt()
 
     def _limited(self, step: Tensor) -> Tensor:
@@ -282,6 +284,7 @@ class _Search:
             error=self.error.numpy(),
             rms=rms,
             states=self.states.numpy() if states else np.zeros((B, 0, self.states.shape[2])),
+            outputs=self.outputs.numpy() if states else np.zeros((B, 0, len(data.present))),
             excitation=np.full(B, np.inf),  # told by the windows
             weighed=np.zeros(B, dtype=bool),
             cross=np.zeros((B, self.told, 0)),

@@ -26,6 +26,7 @@ from sprung.service.api import (
     recordings,
     signals,
     signin,
+    vehicle_model,
 )
 from sprung.service.api.description import PROBLEMS, describe
 from sprung.service.api.guard import Guard
@@ -81,6 +82,7 @@ def create_app(
         history,
         signals,
         actions,
+        vehicle_model,
         lists,
         events,
         recordings,

@@ -86,6 +86,8 @@ async def report_page(core: CoreOf, actor: ActorOf, id: str) -> Response:
     links |= {"/pages/work": "Reports", f"/reports/{row.id}": "JSON"}
     if path.with_name(IMPROVED).is_file():
         links |= {f"/reports/{row.id}/system": "System file with what was found"}
+        if row.vehicle_id is not None:  # the page itself may run nothing; the vehicle's asks once more
+            links |= {f"{vehicle_page('', row.vehicle_id)}#use={row.id}": f"Use this model for {row.vehicle_id}"}
     return HTMLResponse(with_links(page, links))
 
 

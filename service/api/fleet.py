@@ -12,6 +12,7 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import After, Id, Limit, with_cursor
 from sprung.service.core import Core
+from sprung.service.engines import Served
 from sprung.service.store import fleet, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.status import FleetRow, Sort, Wanted
@@ -73,11 +74,13 @@ def vehicle_answer(core: Core, connection: Connection, vehicle_id: str) -> dict[
     row = status.fleet_row(connection, vehicle_id)
     known_vehicle(row is not None, vehicle_id)
     assert row is not None
-    view = load_view(core, connection, vehicle_id)
+    served = core.pipeline.engines.of(connection, vehicle_id)
+    view = load_view(core, connection, vehicle_id, served)
     active = fleet.list_alarms(connection, WantedAlarms(vehicle_id, active=True), SHOWN_ALARMS)
-    reasons = status.reasons_of(connection, vehicle_id, core.pipeline.model_id)
+    reasons = status.reasons_of(connection, vehicle_id, served.model_id)
     return view.as_dict() | {
         "label": row.label,
+        "model_version": served.version,
         "retired": optional_iso(row.retired_ns),
         "health": row.health,
         "received": to_iso(row.received_ns),
@@ -113,12 +116,13 @@ def silent_before(core: Core) -> int:
     return now_ns() - round(core.settings.silent_seconds * NANOSECONDS)
 
 
-def load_view(core: Core, connection: Connection, vehicle_id: str) -> VehicleView:
-    """A vehicle's view from the store."""
-    row = fleet.load_tracker(connection, vehicle_id, core.pipeline.model_id)
-    state = core.engine.tracker.initial_state() if row is None else core.engine.load_state(row.state)
-    last = latest_window(connection, vehicle_id, core.pipeline.model_id)
-    return vehicle_view(core.engine, vehicle_id, state, last)
+def load_view(core: Core, connection: Connection, vehicle_id: str, served: Served | None = None) -> VehicleView:
+    """A vehicle's view from the store, under the model that it is followed with or under another one."""
+    served = served or core.pipeline.engines.of(connection, vehicle_id)
+    engine = served.engine
+    row = fleet.load_tracker(connection, vehicle_id, served.model_id)
+    state = engine.tracker.initial_state() if row is None else engine.load_state(row.state)
+    return vehicle_view(engine, vehicle_id, state, latest_window(connection, vehicle_id, served.model_id))
 
 
 def _next(sort: Sort, rows: list[FleetRow], limit: int) -> str | None:

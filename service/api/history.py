@@ -11,11 +11,15 @@ from fastapi.responses import Response
 from sqlalchemy import Connection
 
 from sprung.model.signals import FloatArray
+from sprung.model.system import System
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.fleet import load_view
 from sprung.service.api.queries import FOREVER, Id, Since, Until, resolution_of, time_of, wrong_query
 from sprung.service.core import Core
+from sprung.service.engine import Engine
+from sprung.service.engines import Served
+from sprung.service.errors import NotFound, UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.store import fleet
 from sprung.service.store import history as store_history
@@ -50,46 +54,53 @@ async def history(
         Query(max_length=20, description="seconds per point (30, 1m, 6h), `raw` for single windows; else it fits"),
     ] = None,
     format: Annotated[Format, Query(description="files hold all parameters unless some are named")] = "json",
+    model: Annotated[
+        int | None, Query(ge=0, le=2**31 - 1, description="a version of the vehicle's model; the one in use")
+    ] = None,
 ) -> Response:
     """The newest points of a parameter's posterior with since <= time < until, oldest first, at most 5000.
 
+    What was estimated while another version of the vehicle's model was in use stays there: `model` asks for it.
+
     One `parameter` gives one history, several give `histories`.
     """
-    chosen = _names(core, parameter, needed=format in ("json", "columns"))
     start, end = time_of("since", since, 0), time_of("until", until, FOREVER)
     width = resolution_of(resolution)
 
-    def query(connection: Connection) -> tuple[float, Series, VehicleView]:
+    def query(connection: Connection) -> tuple[Engine, list[str], float, Series, VehicleView]:
         known_vehicle(fleet.vehicle_exists(connection, id_), id_)
-        key = (id_, core.pipeline.model_id)
+        served = served_by(core, connection, id_, model)
+        chosen = _names(served.engine.system, parameter, needed=format in ("json", "columns"))
+        key = (id_, served.model_id)
         fit = width
         if fit is None:
             fit = store_history.fitting_resolution(connection, *key, start, end, AUTO_POINTS)
-        view = load_view(core, connection, id_)
-        older = store_history.older_windows(core.archive, id_, fleet.digest_of(connection, core.pipeline.model_id))
-        return fit, store_history.series(connection, *key, start, end, fit, MAX_POINTS, older), view
+        view = load_view(core, connection, id_, served)
+        older = store_history.older_windows(core.archive, id_, fleet.digest_of(connection, served.model_id))
+        found = store_history.series(connection, *key, start, end, fit, MAX_POINTS, older)
+        return served.engine, chosen, fit, found, view
 
-    step, found, view = await read(core, query)
+    engine, chosen, step, found, view = await read(core, query)
     if format == "columns":
-        return json_response(columns(core, id_, chosen, step, found, view))
+        return json_response(columns(engine, id_, chosen, step, found, view))
     if format in MEDIA_TYPES:
-        body = await run_in_threadpool(history_file, core.engine, id_, chosen, found, format)
+        body = await run_in_threadpool(history_file, engine, id_, chosen, found, format)
         name = f"{id_}-history.{format}".replace(":", "_")
         headers = {"Content-Disposition": f'attachment; filename="{name}"'}
         return Response(body, media_type=MEDIA_TYPES[format], headers=headers)
-    answers = [{"vehicle": id_, "parameter": name, "resolution": step} | points(core, name, found) for name in chosen]
+    answers = [{"vehicle": id_, "parameter": name, "resolution": step} | points(engine, name, found) for name in chosen]
     if len(answers) == 1:
         return json_response(answers[0])
     return json_response({"vehicle": id_, "resolution": step, "histories": answers})
 
 
-def points(core: Core, name: str, found: Series) -> dict[str, Any]:
+def points(engine: Engine, name: str, found: Series) -> dict[str, Any]:
     """JSON of one parameter's points; those where nothing but the prior was known are left out."""
-    index = [p.name for p in core.engine.system.tracked].index(name)
-    parameter = core.engine.system.tracked[index]
+    index = [p.name for p in engine.system.tracked].index(name)
+    parameter = engine.system.tracked[index]
     rows = []
     if len(found.time):
-        known = found.std[:, index] < known_limit(core.engine)
+        known = found.std[:, index] < known_limit(engine)
         ratio, low, high = (np.exp(a[:, index]).tolist() for a in (found.mean, found.low, found.high))
         spread = found.std[:, index].tolist()
         for i in np.flatnonzero(known).tolist():
@@ -112,7 +123,7 @@ def points(core: Core, name: str, found: Series) -> dict[str, Any]:
 
 
 def columns(
-    core: Core, vehicle: str, names: list[str], step: float, found: Series, view: VehicleView
+    engine: Engine, vehicle: str, names: list[str], step: float, found: Series, view: VehicleView
 ) -> dict[str, Any]:
     """JSON for plots: a list a parameter instead of an object a point."""
     by_name = {p.name: (i, p) for i, p in enumerate(view.parameters)}
@@ -121,7 +132,7 @@ def columns(
         index, parameter = by_name[name]
         value, std = [], []
         if len(found.time):
-            known = found.std[:, index] < known_limit(core.engine)
+            known = found.std[:, index] < known_limit(engine)
             values = parameter.nominal * np.exp(found.mean[:, index])
             value, std = _rounded(values, known), _rounded(values * found.std[:, index], known)
         answer[name] = {
@@ -149,14 +160,24 @@ def _rounded(values: FloatArray, known: Any) -> list[float | None]:
     return [value if ok else None for value, ok in zip(short.tolist(), known.tolist(), strict=True)]
 
 
-def _names(core: Core, asked: list[str] | None, needed: bool) -> list[str]:
+def served_by(core: Core, connection: Connection, vehicle: str, version: int | None) -> Served:
+    """What a vehicle is followed with, or another version of it; 404 where there is none."""
+    if version is None:
+        return core.pipeline.engines.of(connection, vehicle)
+    try:
+        return core.pipeline.engines.version(connection, vehicle, version)
+    except UserError as error:
+        raise NotFound(str(error)) from error
+
+
+def _names(system: System, asked: list[str] | None, needed: bool) -> list[str]:
     """The parameters asked for, all where none is needed; 422 for one that the system does not have."""
-    known = [p.name for p in core.engine.system.tracked]
+    known = [p.name for p in system.tracked]
     if not asked:
         if needed:
             raise wrong_query("parameter", "is needed; name one or more, as in parameter=ELEMENT.stiffness")
         return known
     for name in asked:
         if name not in known:
-            raise wrong_query("parameter", f"{name[:160]!r} is no parameter of {core.engine.system.name}")
+            raise wrong_query("parameter", f"{name[:160]!r} is no parameter of {system.name}")
     return list(dict.fromkeys(asked))

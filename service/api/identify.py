@@ -13,7 +13,7 @@ from fastapi.responses import Response
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
+from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle, read
 from sprung.service.api.bodies import WindowBody, read_window, start_of
 from sprung.service.api.problems import ApiProblem
 from sprung.service.engine import Engine
@@ -43,7 +43,11 @@ async def identify(
     is taken to end now where it does not).
     """
     head, values = await run_in_threadpool(read_window, await request.body(), core.engine)
-    engine = core.engine
+    served = core.pipeline.engines.shared
+    if head.vehicle is not None:
+        named = head.vehicle
+        served = await read(core, lambda connection: core.pipeline.engines.of(connection, named))
+    engine = served.engine
     if track and head.vehicle is None:
         detail = "is needed to track"
         raise ApiProblem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
@@ -52,14 +56,15 @@ async def identify(
     now = now_ns()
     start = start_of(head, now)
     try:
-        estimate = await asyncio.wrap_future(core.batcher.submit(values, states, (start or now) if track else None))
+        asked = core.batcher.submit(values, states, (start or now) if track else None, engine)
+        estimate = await asyncio.wrap_future(asked)
     except UnusableWindow as error:
         raise ApiProblem(422, str(error)) from error
     answer = _answer(engine, head.vehicle, estimate)
     if track and head.vehicle is not None:
         length = round(engine.system.window / engine.system.sample_rate * NANOSECONDS)
         window = Window(now - length if start is None else start, engine.system.sample_rate, values)
-        batch = await run_in_threadpool(core.pipeline.track, head.vehicle, window, estimate)
+        batch = await run_in_threadpool(core.pipeline.track, head.vehicle, window, estimate, served)
         posterior = batch.records[0].posterior
         answer["tracked"] = batch.records[0].tracked
         if posterior is not None:

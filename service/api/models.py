@@ -207,6 +207,7 @@ class VehicleAnswer(BaseModel):
     label: str | None
     retired: str | None
     model: str
+    model_version: int = Field(description="0: the service's system file; else one of the vehicle's own")
     health: Health
     last_window: str | None
     received: str | None
@@ -285,11 +286,45 @@ class AlarmPage(BaseModel):
     next: str | None
 
 
+class ModelVersionAnswer(BaseModel):
+    """One system file of a vehicle, and what was estimated with it."""
+
+    version: int = Field(description="0: the service's system file")
+    in_use: bool
+    report: str | None = Field(description="the diagnosis that it comes from")
+    created: str | None
+    by: str
+    windows: int = Field(description="that were identified with it")
+    fitting: int = Field(description="of these, those that fit it")
+    first_window: str | None
+    last_window: str | None
+    laws: list[str] = Field(description="beyond springs and dampers")
+    baselines: dict[str, float] = Field(description="as they were learned under it")
+    error: str | None = Field(description="why it cannot be used any more")
+
+
+class ModelUseAnswer(BaseModel):
+    """Since when a version was in use."""
+
+    version: int
+    since: str
+    by: str
+
+
+class VehicleModels(BaseModel):
+    """What a vehicle was and is followed with; before the first of `uses` it was the service's file."""
+
+    vehicle: str
+    in_use: int
+    versions: list[ModelVersionAnswer]
+    uses: list[ModelUseAnswer]
+
+
 class MarkAnswer(BaseModel):
-    """A note or a maintenance on a vehicle's time line."""
+    """A note, a maintenance or another model on a vehicle's time line."""
 
     id: int
-    kind: Literal["note", "maintenance"]
+    kind: Literal["note", "maintenance", "model"]
     time: str
     text: str
     parameters: list[str] | None = Field(description="baselines learned anew; empty: all; null: none")

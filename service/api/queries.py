@@ -17,6 +17,7 @@ UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 FOREVER = 2**63 - 1
 
 Id = Annotated[str, Path(alias="id", max_length=128, description="the vehicle, as recordings call it")]
+Version = Annotated[int, Path(ge=0, le=2**31 - 1, description="of the vehicle's model")]
 Limit = Annotated[int, Query(ge=1, le=1000, description="rows of one page")]
 After = Annotated[str | None, Query(max_length=200, description="`next` of the page before")]
 Since = Annotated[str | None, Query(max_length=40, description="RFC 3339, or seconds since the epoch; inclusive")]

@@ -16,6 +16,8 @@ from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import FOREVER, Id
 from sprung.service.compute import Priority
+from sprung.service.core import Core
+from sprung.service.engines import Served
 from sprung.service.export.bundle import BUNDLE_MEDIA, Bundle, bundle
 from sprung.service.simulated import Compared, compare, newest_window, whole_windows
 from sprung.service.store import fleet, history, marks
@@ -34,10 +36,10 @@ BUNDLE_POINTS = 5000
 )
 async def window(core: CoreOf, id_: Id) -> Response:
     """Every sensor of the newest window that is held in memory, with what the identified model makes of it."""
-    await read(core, lambda connection: known_vehicle(fleet.vehicle_exists(connection, id_), id_))
-    start, values = newest_window(core.engine, core.diagnoses.excerpt(id_), id_)
-    work = core.compute.submit(lambda: compare(core.engine, start, values), Priority.REQUEST)
-    return json_response(window_dict(core.engine.system, id_, await asyncio.wrap_future(work)))
+    served = await read(core, lambda connection: _served(core, connection, id_))
+    start, values = newest_window(served.engine, core.diagnoses.excerpt(id_), id_)
+    work = core.compute.submit(lambda: compare(served.engine, start, values), Priority.REQUEST)
+    return json_response(window_dict(served.engine.system, id_, await asyncio.wrap_future(work)))
 
 
 @router.get(
@@ -50,9 +52,10 @@ async def vehicle_bundle(core: CoreOf, id_: Id) -> Response:
     """One MCAP file with JSON schemas: the last minute of raw signals, simulation and residuals, the last hour of
     estimates, alarms and marks as `foxglove.Log`."""
 
+    served = await read(core, lambda connection: _served(core, connection, id_))
+
     def query(connection: Connection) -> Bundle:
-        known_vehicle(fleet.vehicle_exists(connection, id_), id_)
-        key = (id_, core.pipeline.model_id)
+        key = (id_, served.model_id)
         newest = history.series(connection, *key, 0, FOREVER, 0, 1)
         since = int(newest.time[-1]) - BUNDLE_SECONDS * NANOSECONDS if len(newest.time) else 0
         return Bundle(
@@ -64,15 +67,21 @@ async def vehicle_bundle(core: CoreOf, id_: Id) -> Response:
 
     found = await read(core, query)
     excerpt = core.diagnoses.excerpt(id_)
-    windows = list(whole_windows(core.engine, excerpt))
+    windows = list(whole_windows(served.engine, excerpt))
 
     def compared() -> Sequence[Compared]:
-        return [compare(core.engine, *held) for held in windows]
+        return [compare(served.engine, *held) for held in windows]
 
     work = core.compute.submit(compared, Priority.BATCH)
-    body = await run_in_threadpool(bundle, core.engine, found, excerpt, await asyncio.wrap_future(work))
+    body = await run_in_threadpool(bundle, served.engine, found, excerpt, await asyncio.wrap_future(work))
     headers = {"Content-Disposition": f'attachment; filename="{id_.replace(":", "_")}.mcap"'}
     return Response(body, media_type=BUNDLE_MEDIA, headers=headers)
+
+
+def _served(core: Core, connection: Connection, vehicle: str) -> Served:
+    """What a known vehicle is followed with; 404 for an unknown one."""
+    known_vehicle(fleet.vehicle_exists(connection, vehicle), vehicle)
+    return core.pipeline.engines.of(connection, vehicle)
 
 
 def window_dict(system: Any, vehicle: str, found: Compared) -> dict[str, Any]:

@@ -58,7 +58,8 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
         if not json_lines:
             print(f"{files.page}")
     if asked.write_system is not None:
-        write_improved(asked.write_system, system_file or MANCHESTER, system, report)
+        source = (system_file or MANCHESTER).read_text(encoding="utf-8")
+        write_improved(asked.write_system, source, system, report)
         print(f"sprung: {asked.write_system}: the system with what was found", file=sys.stderr)
     if json_lines:
         print(json.dumps(report.to_dict(), allow_nan=False), flush=True)

@@ -15,10 +15,11 @@ import numpy as np
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
+from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.pipeline import Folded, Pipeline
-from sprung.service.store import pending
+from sprung.service.store import pending, vehicle_models
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
 from sprung.service.store.windows import known_starts, newest_start
@@ -56,7 +57,6 @@ class Ingest:
         self._clock = clock
         self._stopping = threading.Event()
         self._sweeper = threading.Thread(target=self._sweep_on, name="sprung-sweep", daemon=True)
-        self._sizes = len(system.tracked), len(system.sensors), len(pipeline.engine.tracker.deviations)
 
     def take(self, messages: Sequence[Message]) -> list[Taken]:
         """Fold messages of any vehicles in one transaction; they are stored when this returns.
@@ -64,8 +64,11 @@ class Ingest:
         Raises UserError for a message that cannot be folded, before anything is stored.
         """
         now = self._clock()
+        with self._pipeline.store.read() as connection:
+            own = vehicle_models.with_own_models(connection, {message.vehicle for message in messages})
+            engines = {vehicle: self._pipeline.engines.of(connection, vehicle).engine for vehicle in own}
         for message in messages:
-            self._check(message, now)
+            self._check(message, engines.get(message.vehicle, self._pipeline.engine), now)
         prepare(self._pipeline.store, (w.start for message in messages for w in message.windows))
         by_vehicle: dict[str, list[int]] = {}
         for i, message in enumerate(messages):
@@ -100,7 +103,8 @@ class Ingest:
         """Fold what has waited for long enough though nothing came after it; how many windows."""
         now = self._clock()
         with self._pipeline.store.read() as connection:
-            overdue = pending.overdue(connection, self._pipeline.model_id, now - self._late)
+            models = self._pipeline.engines.models_in_use(connection)
+            overdue = pending.overdue(connection, models, now - self._late)
         count = 0
         for vehicle in overdue:
             folded: list[Folded] = []
@@ -116,11 +120,14 @@ class Ingest:
 
     def _fold_due(self, connection: Connection, message: Message, now: int, folded: list[Folded]) -> Taken:
         """Fold what is due of what waited and what came; keep the rest."""
-        vehicle, model = message.vehicle, self._pipeline.model_id
+        vehicle = message.vehicle
         if folded and folded[-1].batch.vehicle == vehicle:  # by a message before, in this transaction
             at = folded[-1].after
         else:
             at = self._pipeline.hold(connection, vehicle)
+        engine, model = at.served.engine, at.served.model_id
+        if message.windows:
+            _same_model(message, engine)  # the vehicle may have been given another one meanwhile
         waited = pending.waiting(connection, vehicle, model)
         starts = {row.start for row in waited} | {w.start for w in message.windows}
         known = known_starts(connection, vehicle, model, starts)
@@ -137,31 +144,25 @@ class Ingest:
             due = due_windows(received, last, self._hop, self._late, now)
         order = [came[start] if start in came else _restored(held[start]) for start in due]
         if order:
-            width = len(self._pipeline.engine.system.channels)
-            windows = [w.window(self._pipeline.engine.system.sample_rate, width) for w in order]
+            width = len(engine.system.channels)
+            windows = [w.window(engine.system.sample_rate, width) for w in order]
             estimates = [w.estimate for w in order]
             folded.append(self._pipeline.fold(connection, vehicle, windows, estimates, held=at))
         done = set(due) | known
         pending.release(connection, vehicle, model, [row.start for row in waited if row.start in done])
-        digest = self._pipeline.engine.digest
         rest = set(came) - set(due)
-        rows = [Waiting(s, now, encode(Message(vehicle, digest, (came[s],)), "exact")) for s in sorted(rest)]
+        rows = [Waiting(s, now, encode(Message(vehicle, engine.digest, (came[s],)), "exact")) for s in sorted(rest)]
         pending.keep(connection, vehicle, model, rows)
         waits = sum(w.start not in done for w in fresh)
         return Taken(vehicle, len(order), waits, len(message.windows) - len(fresh))
 
-    def _check(self, message: Message, now: int) -> None:
-        digest = self._pipeline.engine.digest
-        if message.model != digest:
-            raise OtherModel(
-                f"the estimates are of model {message.model[:80]!r}, this service has {digest!r}: give both the same "
-                "system file and weights"
-            )
-        P, S, H = self._sizes
+    def _check(self, message: Message, engine: Engine, now: int) -> None:
+        _same_model(message, engine)
+        P, S, H = len(engine.system.tracked), len(engine.system.sensors), len(engine.tracker.deviations)
         for window in message.windows:
             if not FIRST_TIME <= window.start <= now + AHEAD:
                 raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
-            beside = len(self._pipeline.engine.system.auxiliary)
+            beside = len(engine.system.auxiliary)
             if window.auxiliary is not None and window.auxiliary.shape != (beside,):
                 raise UserError(f"{window.auxiliary.size} measurements beside a window came; the system has {beside}")
             e = window.estimate
@@ -174,6 +175,14 @@ class Ingest:
                 raise UserError(f"an estimate of {d.point.size} deviations came; the model has {H}")
             if not (np.isfinite(e.log_ratio).all() and np.isfinite(e.covariance).all() and np.isfinite(e.chi_square)):
                 raise UserError(f"window {to_iso(window.start)}: numbers that are not finite")
+
+
+def _same_model(message: Message, engine: Engine) -> None:
+    if message.model != engine.digest:
+        raise OtherModel(
+            f"the estimates are of model {message.model[:80]!r}, this service follows the vehicle with "
+            f"{engine.digest!r}: give both the same system file and weights"
+        )
 
 
 def due_windows(received: dict[int, int], last: int, hop: float, late: int, now: int) -> list[int]:

@@ -15,6 +15,8 @@ from sprung.service.api.access import CoreOf, known_vehicle, read
 from sprung.service.api.actions import mark_dict
 from sprung.service.api.fleet import load_view, silent_before
 from sprung.service.api.lists import report_dict
+from sprung.service.api.vehicle_model import models_answer
+from sprung.service.diagnosing import IMPROVED
 from sprung.service.pages.drawing import Mark, plan_view, side_view
 from sprung.service.pages.render import percent, render
 from sprung.service.pages.routes import HEALTH
@@ -30,24 +32,29 @@ SHOWN = 50  # alarms, marks, reports
 @router.get("/pages/vehicles/{id}")
 async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
     """One vehicle: drawing, history, alarms, sensors, what was done to it."""
-    system = core.engine.system
 
     def query(connection: Connection) -> dict[str, Any]:
         row = status.fleet_row(connection, id)
         known_vehicle(row is not None, id)
         assert row is not None
+        served = core.pipeline.engines.of(connection, id)
         return {
             "row": row,
-            "view": load_view(core, connection, id),
+            "view": load_view(core, connection, id, served),
             "alarms": [alarm_dict(a) for a in fleet.list_alarms(connection, WantedAlarms(id), SHOWN)],
             "active": fleet.list_alarms(connection, WantedAlarms(id, active=True), SHOWN),
             "marks": [mark_dict(mark) for mark in marks.list_marks(connection, id, SHOWN)],
-            "reports": [report_dict(r) for r in lists.list_reports(connection, SHOWN, vehicle_id=id)],
-            "reasons": status.reasons_of(connection, id, core.pipeline.model_id),
+            "reports": [
+                report_dict(r) | {"usable": (core.settings.reports / r.id / IMPROVED).is_file()}
+                for r in lists.list_reports(connection, SHOWN, vehicle_id=id)
+            ],
+            "reasons": status.reasons_of(connection, id, served.model_id),
+            "models": models_answer(core, connection, id),
+            "system": served.engine.system,
         }
 
     values = await read(core, query)
-    view, row = values["view"], values["row"]
+    view, row, system = values["view"], values["row"], values.pop("system")
     silent = row.received_ns < silent_before(core)
     parameters = {p.name: parameter_mark(p) for p in view.parameters}
     sensors = sensor_marks(system, view)

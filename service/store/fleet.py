@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -285,6 +285,17 @@ def close_alarms_of_other_models(connection: Connection, vehicle: str, model_id:
     return closed.rowcount
 
 
+def close_misfits_of_other_models(connection: Connection, vehicle: str, model_id: int, now: int) -> int:
+    """That windows do not fit is said of a model: it ends with the model's use.  What was said of the vehicle stays."""
+    closed = connection.execute(
+        update(alarms)
+        .where(alarms.c.vehicle_id == vehicle, alarms.c.model_id != model_id)
+        .where(alarms.c.kind == "misfit", alarms.c.closed_ns.is_(None))
+        .values(closed_ns=now)
+    )
+    return closed.rowcount
+
+
 def attach_report(connection: Connection, vehicle: str, model_id: int, report_id: str) -> None:
     """Make a report part of the vehicle's active alarms that have none."""
     connection.execute(
@@ -299,12 +310,13 @@ def attach_report(connection: Connection, vehicle: str, model_id: int, report_id
     )
 
 
-def recent_vehicles(connection: Connection, model_id: int, limit: int) -> list[str]:
-    """Vehicles whose trackers were fed last, the newest first."""
+def recent_vehicles(connection: Connection, model_ids: Sequence[int], limit: int) -> list[str]:
+    """Vehicles whose trackers were fed last under any of the models, the newest first."""
     query = (
         select(tracker_states.c.vehicle_id)
-        .where(tracker_states.c.model_id == model_id)
-        .order_by(tracker_states.c.updated_ns.desc())
+        .where(tracker_states.c.model_id.in_(model_ids))
+        .group_by(tracker_states.c.vehicle_id)
+        .order_by(func.max(tracker_states.c.updated_ns).desc())
         .limit(limit)
     )
     return list(connection.execute(query).scalars())

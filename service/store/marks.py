@@ -17,6 +17,8 @@ from sprung.service.store.schema import (
     reports,
     rollups,
     tracker_states,
+    vehicle_model_uses,
+    vehicle_models,
     vehicles,
     window_reasons,
     windows,
@@ -79,7 +81,9 @@ def remove(connection: Connection, vehicle: str) -> Removed:
     own = recordings.c.vehicle_id == vehicle
     files = connection.execute(select(recordings.c.file).where(own, recordings.c.file.is_not(None))).scalars().all()
     pages = connection.execute(select(reports.c.id).where(reports.c.vehicle_id == vehicle)).scalars().all()
-    for table in (alarms, marks, fleet_status, window_reasons, tracker_states, rollups, pending, windows, reports):
+    own_models = (vehicle_model_uses, vehicle_models)
+    kept = (alarms, marks, fleet_status, window_reasons, tracker_states, rollups, pending, windows, reports)
+    for table in (*own_models, *kept):
         connection.execute(delete(table).where(table.c.vehicle_id == vehicle))
     ids = select(recordings.c.id).where(own)
     for table in (jobs, reports, windows):  # of other vehicles or none, from the same file

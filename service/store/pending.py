@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, select
@@ -45,11 +45,11 @@ def release(connection: Connection, vehicle: str, model_id: int, starts: Iterabl
         connection.execute(delete(pending).where(*mine, pending.c.start_ns.in_(chosen[first : first + 500])))
 
 
-def overdue(connection: Connection, model_id: int, before: int) -> list[str]:
+def overdue(connection: Connection, model_ids: Sequence[int], before: int) -> list[str]:
     """Vehicles of which something has waited since before a time, ns, in the order of their ids."""
     query = (
         select(pending.c.vehicle_id)
-        .where(pending.c.model_id == model_id, pending.c.received_ns < before)
+        .where(pending.c.model_id.in_(model_ids), pending.c.received_ns < before)
         .distinct()
         .order_by(pending.c.vehicle_id)
     )

@@ -20,6 +20,7 @@ from sqlalchemy import (
     MetaData,
     String,
     Table,
+    Text,
     UniqueConstraint,
 )
 
@@ -257,6 +258,29 @@ marks = Table(  # what people wrote on a vehicle's time line
     Column("author", String(128), nullable=False),
     Column("created_ns", BigInteger, nullable=False),
     Index("ix_marks_vehicle_id_time_ns", "vehicle_id", "time_ns"),
+)
+
+vehicle_models = Table(  # system files that single vehicles were given; version 0 is the service's and has no row
+    "vehicle_models",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("version", Integer, primary_key=True, autoincrement=False),
+    Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
+    Column("text", Text, nullable=False),  # YAML
+    Column("report_id", String(36), nullable=True),  # where it comes from; a report may be gone before it
+    Column("author", String(160), nullable=False),
+    Column("created_ns", BigInteger, nullable=False),
+)
+
+vehicle_model_uses = Table(  # the newest line says which version is in use
+    "vehicle_model_uses",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
+    Column("version", Integer, nullable=False),
+    Column("author", String(160), nullable=False),
+    Column("since_ns", BigInteger, nullable=False),
+    Index("ix_vehicle_model_uses_vehicle_id", "vehicle_id"),
 )
 
 deliveries = Table(  # notifications on their way; those that failed for good stay to be seen

@@ -163,12 +163,14 @@
     const names = chosen();
     const query = new URLSearchParams({ format: "columns" });
     names.forEach((name) => query.append("parameter", name));
+    if (at("under")) query.set("model", at("under").value);
     if (range) {
       query.set("since", Math.max(0, range[0]).toFixed(3));
       query.set("until", range[1].toFixed(3));
     }
     const answer = await fetch(`${base}/history?${query}`);
     if (number !== request) return;
+    if (answer.status === 422 && at("under")) { at("shown").textContent = "this model has no such parameter"; return; }
     if (!answer.ok) { at("shown").textContent = "the history could not be read"; return; }
     draw(names, await answer.json());
     document.querySelectorAll("a[data-element]").forEach((a) =>
@@ -199,6 +201,7 @@
     }
     const button = event.target.closest("button");
     if (!button) return;
+    if (button.dataset.use) { useModel(button.dataset.use); return; }
     const [first, last] = range || (plots[0] ? [plots[0].data[0][0], plots[0].data[0].at(-1)] : [0, 0]);
     if (button.dataset.range !== undefined) {
       const seconds = Number(button.dataset.range);
@@ -217,7 +220,12 @@
       load();
     } else if (button.id === "fetchwindow") newest();
   });
-  ["parameter", "overlay", "scale"].forEach((id) => at(id).addEventListener("change", load));
+  ["parameter", "overlay", "scale", "under"].forEach((id) => at(id)?.addEventListener("change", load));
+
+  function useModel(report) {
+    at("usereport").value = report;
+    at("usemodel").showModal();
+  }
 
   let pair = [];
   async function newest() {
@@ -270,5 +278,6 @@
   const wanted = decodeURIComponent(location.hash.slice(1));
   if (data.parameters[wanted]) at("parameter").value = wanted;
   else if (data.first) at("parameter").value = data.first;
+  if (wanted.startsWith("use=")) useModel(wanted.slice(4));
   load();
 })();

@@ -1,0 +1,121 @@
+"""Which model a vehicle's windows are identified with: the service's system file, or one of the vehicle's own."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+
+from sprung.model.system import System, parse_system
+from sprung.service.engine import Engine, engine_like
+from sprung.service.errors import UserError
+from sprung.service.store import vehicle_models
+from sprung.service.store.vehicle_models import SERVICE_FILE
+
+log = logging.getLogger("sprung.engine")
+KEPT = 16  # engines of single vehicles in memory; one that is asked for again is loaded in a second
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """What one vehicle's windows are identified with, and where they are stored."""
+
+    version: int  # 0: the service's own system file
+    engine: Engine
+    model_id: int  # row of `models`
+
+
+Make = Callable[[Engine, System], Engine]
+
+
+class Engines:
+    """Engines by vehicle, as many in memory as `kept`.  Safe to share between threads."""
+
+    def __init__(
+        self, shared: Engine, model_id: int, own: bool = True, kept: int = KEPT, make: Make = engine_like
+    ) -> None:
+        """shared: of the service's system file; own: whether vehicles may have another one (a back-fill's may not)."""
+        self._make = make
+        self.shared = Served(SERVICE_FILE, shared, model_id)
+        self._own = own
+        self._kept = kept
+        self._held: OrderedDict[tuple[str, int], Served] = OrderedDict()
+        self._broken: dict[tuple[str, int], str] = {}
+        self._lock = threading.Lock()
+
+    def of(self, connection: Connection, vehicle: str) -> Served:
+        """What the vehicle's windows are identified with now.
+
+        A version that cannot be used any more, since the service's system file has become another one, is logged and
+        the service's file takes its place.
+        """
+        version = vehicle_models.current_version(connection, vehicle) if self._own else SERVICE_FILE
+        try:
+            return self.version(connection, vehicle, version)
+        except UserError as error:
+            with self._lock:
+                if self._broken.get((vehicle, version)) != str(error):
+                    log.error("%s; the service's system file is used instead", error)
+                self._broken[vehicle, version] = str(error)
+            return self.shared
+
+    def version(self, connection: Connection, vehicle: str, version: int) -> Served:
+        """One version of a vehicle's.  Raises UserError where there is none, or it does not belong to this service."""
+        if version == SERVICE_FILE:
+            return self.shared
+        key = (vehicle, version)
+        with self._lock:
+            held = self._held.get(key)
+            if held is not None:
+                self._held.move_to_end(key)
+                return held
+        row = vehicle_models.get_version(connection, vehicle, version)
+        text = vehicle_models.text_of(connection, vehicle, version)
+        if row is None or text is None:
+            raise UserError(f"vehicle {vehicle} has no model {version}")
+        served = Served(version, self.made(text, f"model {version} of vehicle {vehicle}"), row.model_id)
+        self.remember(vehicle, served)
+        return served
+
+    def remember(self, vehicle: str, served: Served) -> None:
+        """Keep an engine for the next time."""
+        with self._lock:
+            self._held[vehicle, served.version] = served
+            while len(self._held) > self._kept:
+                self._held.popitem(last=False)
+
+    def made(self, text: str, what: str) -> Engine:
+        """The engine of a system file's text.  Raises UserError where it is not one of the same measurements."""
+        shared = self.shared.engine.system
+        try:
+            system = parse_system(text, what, shared.catalogue)
+        except ValueError as error:
+            raise UserError(str(error)) from error
+        differing = _differing(shared, system)
+        if differing:
+            raise UserError(f"{what}: {differing} of the service's system file are other ones")
+        try:
+            return self._make(self.shared.engine, system)
+        except ValueError as error:  # a law that windows cannot hold
+            raise UserError(f"{what}: {error}") from error
+
+    def models_in_use(self, connection: Connection) -> Sequence[int]:
+        """Rows of `models` under which windows of this service are stored, the shared one first."""
+        own = vehicle_models.own_model_ids(connection) if self._own else []
+        return list(dict.fromkeys([self.shared.model_id, *own]))
+
+
+def _differing(one: System, other: System) -> str | None:
+    """What is measured in another way; recordings are read, and samples held, by the service's system file."""
+    pairs = {
+        "channels": ([c.name for c in one.channels], [c.name for c in other.channels]),
+        "signals beside": ([c.name for c in one.auxiliary], [c.name for c in other.auxiliary]),
+        "sample rate": (one.sample_rate, other.sample_rate),
+        "window": (one.window, other.window),
+        "hop": (one.hop, other.hop),
+    }
+    return next((name for name, (a, b) in pairs.items() if a != b), None)
