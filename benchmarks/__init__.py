@@ -30,6 +30,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "vehicles with laws in their file: coverage, errors, windows per second, drift of a law",
     ),
     "exchange": ("sprung.benchmarks.exchange", "exports read by other programs, against our own free run"),
+    "experiment": ("sprung.benchmarks.experiment", "the next run for look-alikes: against chance and T-optimality"),
     "day": (
         "sprung.benchmarks.day",
         "months of service: weather, loads, clocks, drifting gains; false alarms, hidden faults",

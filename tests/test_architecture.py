@@ -36,6 +36,7 @@ ORDER = [
     "ambient",
     "comfort",
     "identification",
+    "experiment",
     "tracking",
 ]
 _BELOW = ORDER[: ORDER.index("identification")]

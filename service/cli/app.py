@@ -231,6 +231,27 @@ def compare(
 
 
 @app.command()
+def experiment(
+    models: Annotated[
+        list[Path],
+        typer.Argument(help="System files of the models, or a report of `sprung diagnose`.", metavar="MODEL..."),
+    ],
+    system: Annotated[
+        Path | None, typer.Option("--system", help="With a report: the system file with what it found.")
+    ] = None,
+    menu: Annotated[Path | None, typer.Option("--menu", help="Runs that can be done; some of its own without.")] = None,
+    known: Annotated[
+        float | None, typer.Option("--known", metavar="NUMBER", help="How well springs and dampers are known: 0.05.")
+    ] = None,
+    json_lines: Json = False,
+) -> int:
+    """Which run would tell look-alikes apart best, and the evidence to expect of it."""
+    from sprung.service.cli.experiment import run
+
+    return run(models, system, menu, known, json_lines)
+
+
+@app.command()
 def inspect(
     file: File,
     system: Annotated[Path | None, typer.Option("--system", help="Take `time:` from this system file.")] = None,
