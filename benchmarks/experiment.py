@@ -51,9 +51,9 @@ sensors:
 """
 TRUE = {  # law of the strut: its values; drawn within a factor
     "coulomb_friction": {"force": 20.0, "smoothing": 0.02},
-    "quadratic_damping": {"coefficient": 600.0},
-    "cubic_stiffness": {"coefficient": 4e6},
-    "damper_asymmetry": {"ratio": 1.2},
+    "quadratic_damping": {"c2": 600.0},
+    "cubic_stiffness": {"k3": 4e6},
+    "bump_stop": {"gap": 0.01, "stiffness": 10000.0},
 }
 MENU = Menu(
     runs={
@@ -82,7 +82,7 @@ def run(seed: int = 20261, count: int = 2, vehicles: int = 2) -> Iterator[dict[s
     told: dict[str, list[float]] = {name: [] for name in ("chosen", "t_optimal", "random", "best")}
     for _ in range(count):
         for name in TRUE:
-            first = _with_law(name, rng.uniform(0.7, 1.5))
+            first = with_law(name, rng.uniform(0.7, 1.5))
             law = next(one for one in first.catalogue if one.name == name)
             for other in law.confused_with:
                 try:
@@ -139,7 +139,7 @@ def _evidence(true: System, wrong: System, run: Run, values: np.ndarray) -> floa
     return fitted(loaded(wrong, run), values).misfit - fitted(loaded(true, run), values).misfit
 
 
-def _with_law(name: str, factor: float) -> System:
+def with_law(name: str, factor: float) -> System:
     """The vehicle with a law; widths of corners fixed, the first value times a factor."""
     system = parse_system(VEHICLE)
     law = next(one for one in system.catalogue if one.name == name)

@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 import yaml
 from pydantic import Field, ValidationError, model_validator
 
-from sprung.model.schema import Strict, SupportInput
+from sprung.model.address import Strict
+from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
 BUNDLED = Path(__file__).parents[1] / "systems" / "menu.yaml"

@@ -64,5 +64,5 @@ def _nearest(
         left = float(np.sum((force - columns @ factors) ** 2))
         if factors[0] > 0 and left < best:
             best = left
-            found = law.clip(law.scaled(trial, float(factors[0])) if law.strength is not None else trial)
+            found = law.clip(list(law.scaled(trial, float(factors[0])) if law.strength is not None else trial))
     return None if found is None else [float(value) for value in found]

@@ -21,6 +21,7 @@ from sprung.service.pages.render import STATIC
 from tests.served import served, worsen
 
 NO_JSON = {"/metrics", "/events", "/vehicles/{id}/bundle", "/reports/{id}/page", "/reports/{id}/system"}
+NO_JSON |= {"/vehicles/{id}/models/{version}"}  # a file
 EMPTY = {("/vehicles/{id}", "delete")}
 
 
