@@ -26,7 +26,7 @@ from sprung.model.address import LawSetting, LawValue
 from sprung.model.experiment.choose import rank_runs
 from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.evidence import STRONG, fitted, simulated
-from sprung.model.experiment.menu import Menu, Run
+from sprung.model.experiment.menu import Menu, MenuRun
 from sprung.model.experiment.rivals import NoRival, rival
 from sprung.model.system import System, parse_system
 
@@ -57,17 +57,17 @@ TRUE = {  # law of the strut: its values; drawn within a factor
 }
 MENU = Menu(
     runs={
-        "slow": Run.model_validate({"track": {"speed": 12.0}, "seconds": 8}),
-        "fast": Run.model_validate({"track": {"speed": 50.0}, "seconds": 8}),
-        "fast, bad track": Run.model_validate({"track": {"speed": 50.0, "level": 4.0}, "seconds": 8}),
-        "heavy": Run.model_validate({"track": {"speed": 25.0}, "seconds": 8, "load": {"car": 150.0}}),
-        "body mode": Run.model_validate(
+        "slow": MenuRun.model_validate({"track": {"speed": 12.0}, "seconds": 8}),
+        "fast": MenuRun.model_validate({"track": {"speed": 50.0}, "seconds": 8}),
+        "fast, bad track": MenuRun.model_validate({"track": {"speed": 50.0, "level": 4.0}, "seconds": 8}),
+        "heavy": MenuRun.model_validate({"track": {"speed": 25.0}, "seconds": 8, "load": {"car": 150.0}}),
+        "body mode": MenuRun.model_validate(
             {"signal": {"kind": "sine", "amplitude": 0.01, "frequency": 1.1}, "seconds": 8}
         ),
-        "wheel mode": Run.model_validate(
+        "wheel mode": MenuRun.model_validate(
             {"signal": {"kind": "sine", "amplitude": 0.001, "frequency": 10.0}, "seconds": 8}
         ),
-        "sweep": Run.model_validate(
+        "sweep": MenuRun.model_validate(
             {"signal": {"kind": "sweep", "amplitude": 0.002, "frequency": 0.5, "to": 15.0}, "seconds": 8}
         ),
     }
@@ -134,7 +134,7 @@ def _one(
     return figure, found
 
 
-def _evidence(true: System, wrong: System, run: Run, values: np.ndarray) -> float:
+def _evidence(true: System, wrong: System, run: MenuRun, values: np.ndarray) -> float:
     """Log-likelihood ratio for the truth."""
     return fitted(loaded(wrong, run), values).misfit - fitted(loaded(true, run), values).misfit
 

@@ -15,7 +15,7 @@ from sqlalchemy import Connection
 from sprung.model.system import MANCHESTER
 from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
 from sprung.service.durable import sync_folder, sync_tree
-from sprung.service.engines import Served
+from sprung.service.engines import ServedModel
 from sprung.service.errors import Busy, UserError
 from sprung.service.jobs import Jobs, Progress
 from sprung.service.pipeline import Batch, Pipeline
@@ -133,7 +133,7 @@ class DiagnosisJobs:
         return {"report": report_id, "verdict": found.verdict}
 
     def _diagnose(
-        self, path: Path, row: RecordingRow, report_id: str, progress: Progress, served: Served, text: str | None
+        self, path: Path, row: RecordingRow, report_id: str, progress: Progress, served: ServedModel, text: str | None
     ) -> DiagnosisResult:
         """Written beside, by one process only, and moved to its place when it is whole."""
         final = self._settings.reports / report_id

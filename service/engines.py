@@ -21,7 +21,7 @@ KEPT = 16  # engines of single vehicles in memory; one that is asked for again i
 
 
 @dataclass(frozen=True, slots=True)
-class Served:
+class ServedModel:
     """What one vehicle's windows are identified with, and where they are stored."""
 
     version: int  # 0: the service's own system file
@@ -40,14 +40,14 @@ class Engines:
     ) -> None:
         """shared: of the service's system file; own: whether vehicles may have another one (a back-fill's may not)."""
         self._make = make
-        self.shared = Served(SERVICE_FILE, shared, model_id)
+        self.shared = ServedModel(SERVICE_FILE, shared, model_id)
         self._own = own
         self._kept = kept
-        self._held: OrderedDict[tuple[str, int], Served] = OrderedDict()
+        self._held: OrderedDict[tuple[str, int], ServedModel] = OrderedDict()
         self._broken: dict[tuple[str, int], str] = {}
         self._lock = threading.Lock()
 
-    def of(self, connection: Connection, vehicle: str) -> Served:
+    def of(self, connection: Connection, vehicle: str) -> ServedModel:
         """What the vehicle's windows are identified with now.
 
         A version that cannot be used any more, since the service's system file has become another one, is logged and
@@ -63,7 +63,7 @@ class Engines:
                 self._broken[vehicle, version] = str(error)
             return self.shared
 
-    def version(self, connection: Connection, vehicle: str, version: int) -> Served:
+    def version(self, connection: Connection, vehicle: str, version: int) -> ServedModel:
         """One version of a vehicle's.  Raises UserError where there is none, or it does not belong to this service."""
         if version == SERVICE_FILE:
             return self.shared
@@ -77,11 +77,11 @@ class Engines:
         text = vehicle_models.text_of(connection, vehicle, version)
         if row is None or text is None:
             raise UserError(f"vehicle {vehicle} has no model {version}")
-        served = Served(version, self.made(text, f"model {version} of vehicle {vehicle}"), row.model_id)
+        served = ServedModel(version, self.made(text, f"model {version} of vehicle {vehicle}"), row.model_id)
         self.remember(vehicle, served)
         return served
 
-    def remember(self, vehicle: str, served: Served) -> None:
+    def remember(self, vehicle: str, served: ServedModel) -> None:
         """Keep an engine for the next time."""
         with self._lock:
             self._held[vehicle, served.version] = served

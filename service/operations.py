@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from sqlalchemy import Connection
 
 from sprung.service.board import Board
-from sprung.service.engines import Served
+from sprung.service.engines import ServedModel
 from sprung.service.errors import NotFound
 from sprung.service.pipeline import Batch, Pipeline
 from sprung.service.settings import Settings
@@ -99,7 +99,7 @@ class Operations:
             fleet.hold_vehicle(connection, vehicle)
             model = fleet.ensure_model(connection, engine.digest, engine.system.name, engine.description(), now)
             version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
-            engines.remember(vehicle, Served(version, engine, model))
+            engines.remember(vehicle, ServedModel(version, engine, model))
             batch = self._switch(connection, actor, vehicle, version, report, now)
         self._pipeline.tell(batch)
         return version

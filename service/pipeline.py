@@ -15,7 +15,7 @@ from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
-from sprung.service.engines import Engines, Served
+from sprung.service.engines import Engines, ServedModel
 from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.partitions import prepare
@@ -39,7 +39,7 @@ class Batch:
     fresh: list[Window]  # those that were not stored before
     late: int  # fresh, but older than what the tracker had seen: stored, not tracked
     state: TrackerState  # after the batch
-    served: Served  # with which the vehicle is followed
+    served: ServedModel  # with which the vehicle is followed
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
 
 
@@ -48,7 +48,7 @@ class Identified:
     """Windows on their way: identified, not yet tracked and stored."""
 
     vehicle: str
-    served: Served  # with which they were identified
+    served: ServedModel  # with which they were identified
     windows: Sequence[Window]
     known: dict[int, WindowRecord]  # those that are stored already, by start
     fresh: list[Window]
@@ -74,7 +74,7 @@ def _outcome(window: Window, estimate: Estimate | None) -> tuple[str, str | None
 class HeldVehicle:
     """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
 
-    served: Served
+    served: ServedModel
     revision: int
     last_window_ns: int  # start of the newest window that it has seen; -1 before the first
     state: TrackerState
@@ -173,7 +173,7 @@ class Pipeline:
             listener(batch)
         return batch
 
-    def track(self, vehicle: str, window: Window, estimate: Estimate, served: Served) -> Batch:
+    def track(self, vehicle: str, window: Window, estimate: Estimate, served: ServedModel) -> Batch:
         """Track and store one window that was identified elsewhere, with what the vehicle was `served` by."""
         with self.store.read() as connection:
             known = known_windows(connection, vehicle, served.model_id, [window.start])
@@ -210,7 +210,7 @@ class Pipeline:
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         recording_id: str | None,
-        served: Served,
+        served: ServedModel,
     ) -> Batch:
         prepare(self.store, (window.start for window in windows))
         with self.store.write() as connection:
@@ -228,7 +228,7 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
         held: HeldVehicle | None = None,
-        served: Served | None = None,
+        served: ServedModel | None = None,
     ) -> Folded:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
 
@@ -324,7 +324,7 @@ class Pipeline:
             return HeldVehicle(served, 0, -1, new)
         return HeldVehicle(served, row.revision, row.last_window_ns, served.engine.load_state(row.state))
 
-    def _newcomer(self, connection: Connection, served: Served) -> TrackerState:
+    def _newcomer(self, connection: Connection, served: ServedModel) -> TrackerState:
         """State of a vehicle never seen: what weather does to springs, others of its fleet have learned.
 
         Reading what they have learned takes as long as folding ten windows, and changes over days: it is kept until

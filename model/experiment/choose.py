@@ -12,7 +12,7 @@ from sprung.model.system import System
 
 
 @dataclass(frozen=True, slots=True)
-class Ranked:
+class RankedRun:
     """One run and what it promises."""
 
     run: str
@@ -28,7 +28,7 @@ def rank_runs(
     known: float = KNOWN,
     seed: int = 0,
     tell: Callable[[str], None] = lambda line: None,
-) -> list[Ranked]:
+) -> list[RankedRun]:
     """Every run of the menu, the one that tells most for its cost first.
 
     Either of two models may be true: a run counts by the mean of both, and among several models by its worst pair.
@@ -39,7 +39,7 @@ def rank_runs(
         promises = {(a, b): promise(models[a], models[b], run, known, seed) for a, b in permutations(models, 2)}
         worst = min(_pairs(promises), key=lambda pair: _mean([p.evidence for p in pair]))
         evidence = _mean([p.evidence for p in worst])
-        found.append(Ranked(name, evidence, _mean([p.chance for p in worst]), evidence / run.cost, promises))
+        found.append(RankedRun(name, evidence, _mean([p.chance for p in worst]), evidence / run.cost, promises))
     return sorted(found, key=lambda ranked: -ranked.per_cost)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sprung.model.experiment.menu import Run, Signal
+from sprung.model.experiment.menu import BenchSignal, MenuRun
 from sprung.model.identification.excitation import ERRI_LOW, simulate_runs
 from sprung.model.identification.with_laws import without_laws
 from sprung.model.signals import FloatArray
@@ -17,7 +17,7 @@ _RAMP = 1.0  # s, in which a signal grows from nothing
 _LINES = 200  # of noise
 
 
-def loaded(system: System, run: Run) -> System:
+def loaded(system: System, run: MenuRun) -> System:
     """The system with the run's load in its bodies."""
     bodies = dict(system.file.bodies)
     for name, more in run.load.items():
@@ -31,7 +31,7 @@ def loaded(system: System, run: Run) -> System:
     return System(system.file.model_copy(update={"bodies": bodies}), system.catalogue)
 
 
-def run_inputs(system: System, run: Run, seed: int = 0) -> FloatArray:
+def run_inputs(system: System, run: MenuRun, seed: int = 0) -> FloatArray:
     """Samples (T, I) of the measured inputs, without their noise; seed: of track and noise."""
     rng = np.random.default_rng(seed)
     samples = round(run.seconds * system.sample_rate)
@@ -53,7 +53,7 @@ def run_inputs(system: System, run: Run, seed: int = 0) -> FloatArray:
     return values
 
 
-def _shape(signal: Signal, t: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArray:
+def _shape(signal: BenchSignal, t: FloatArray, seconds: float, rng: np.random.Generator) -> FloatArray:
     ramp = np.sin(0.5 * np.pi * np.clip(t / _RAMP, 0, 1)) ** 2
     low, high = signal.frequency, signal.to or signal.frequency
     if signal.kind == "sine":

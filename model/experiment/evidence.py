@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.experiment.drives import loaded, run_inputs
-from sprung.model.experiment.menu import Run
+from sprung.model.experiment.menu import MenuRun
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
@@ -32,7 +32,7 @@ KNOWN = 0.05  # by which springs and dampers are known from the recording before
 
 
 @dataclass(frozen=True, slots=True)
-class Fitted:
+class FittedRun:
     """A model on a run's samples."""
 
     misfit: float  # half the whitened squares, with what was known before
@@ -54,7 +54,7 @@ class Promise:
         return 0.5 * math.erfc((STRONG - self.evidence) / (spread * math.sqrt(2)))
 
 
-def simulated(system: System, run: Run, seed: int = 0, noise: np.random.Generator | None = None) -> FloatArray:
+def simulated(system: System, run: MenuRun, seed: int = 0, noise: np.random.Generator | None = None) -> FloatArray:
     """What would be recorded of a run, (T, C); with the noise of sensors and inputs where a generator is given."""
     driven = run_inputs(system, run, seed)
     sensors = simulate_ride(loaded(system, run), driven, noise=noise).sensors
@@ -63,14 +63,14 @@ def simulated(system: System, run: Run, seed: int = 0, noise: np.random.Generato
     return np.concatenate([driven, sensors], axis=1)
 
 
-def promise(truth: System, other: System, run: Run, known: float = KNOWN, seed: int = 0) -> Promise:
+def promise(truth: System, other: System, run: MenuRun, known: float = KNOWN, seed: int = 0) -> Promise:
     """What a run tells against `other` where `truth` is true."""
     values = simulated(truth, run, seed)
     wrong, right = fitted(loaded(other, run), values, known), fitted(loaded(truth, run), values, known)
     return Promise(max(0.0, wrong.misfit - right.misfit), max(0.0, wrong.unwhitened - right.unwhitened))
 
 
-def fitted(system: System, values: FloatArray, known: float = KNOWN) -> Fitted:
+def fitted(system: System, values: FloatArray, known: float = KNOWN) -> FittedRun:
     """A model fitted to samples (T, C); known: standard deviation of log-ratios of springs, dampers and masses."""
     length = system.window
     starts = range(length, len(values) - length + 1, length)  # the first window swings in
@@ -86,7 +86,7 @@ def fitted(system: System, values: FloatArray, known: float = KNOWN) -> Fitted:
     cost = float((refined.chi_square * refined.freedom).sum() + spread + theta @ before @ theta)
     noise = np.array([channel.noise for channel in system.channels[len(system.inputs) :]])
     white = float(np.nansum((refined.error / noise) ** 2) * length + spread + theta @ before @ theta)
-    return Fitted(0.5 * cost, 0.5 * white, theta)
+    return FittedRun(0.5 * cost, 0.5 * white, theta)
 
 
 def _refined(system: System, windows: FloatArray) -> Refined:

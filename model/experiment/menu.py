@@ -21,14 +21,14 @@ class MenuError(ValueError):
     """A menu that cannot be used; one line."""
 
 
-class Track(Strict):
+class TrackRun(Strict):
     """Running on a track of the ERRI B176 spectrum."""
 
     speed: Positive  # m/s
     level: Positive = 1.0  # times the power of the low-level track
 
 
-class Signal(Strict):
+class BenchSignal(Strict):
     """What a test bench does at the supports, m, or to forces, N."""
 
     kind: Literal["sine", "sweep", "noise"]
@@ -38,23 +38,23 @@ class Signal(Strict):
     inputs: tuple[str, ...] = ()  # that move, all alike; empty: all
 
     @model_validator(mode="after")
-    def _has_a_band(self) -> Signal:
+    def _has_a_band(self) -> BenchSignal:
         if self.kind != "sine" and (self.to is None or self.to <= self.frequency):
             raise ValueError(f"a {self.kind} goes from `frequency` up `to` a higher one")
         return self
 
 
-class Run(Strict):
+class MenuRun(Strict):
     """One run of the menu."""
 
-    track: Track | None = None
-    signal: Signal | None = None
+    track: TrackRun | None = None
+    signal: BenchSignal | None = None
     seconds: Annotated[float, Field(gt=0, le=600)] = 10.0
     load: dict[str, float] = Field(default_factory=dict)  # kg more in a body, its inertias in proportion
     cost: Positive = 1.0  # in any unit; runs are compared by what they tell for it
 
     @model_validator(mode="after")
-    def _is_one_thing(self) -> Run:
+    def _is_one_thing(self) -> MenuRun:
         if (self.track is None) == (self.signal is None):
             raise ValueError("give either `track` or `signal`")
         return self
@@ -63,7 +63,7 @@ class Run(Strict):
 class Menu(Strict):
     """Runs by name."""
 
-    runs: Annotated[dict[str, Run], Field(min_length=1, max_length=200)]
+    runs: Annotated[dict[str, MenuRun], Field(min_length=1, max_length=200)]
 
 
 def read_menu(path: Path) -> Menu:

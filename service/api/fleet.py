@@ -12,7 +12,7 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import After, Id, Limit, with_cursor
 from sprung.service.core import Core
-from sprung.service.engines import Served
+from sprung.service.engines import ServedModel
 from sprung.service.store import fleet, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.status import FleetRow, Sort, Wanted
@@ -116,7 +116,7 @@ def silent_before(core: Core) -> int:
     return now_ns() - round(core.settings.silent_seconds * NANOSECONDS)
 
 
-def load_view(core: Core, connection: Connection, vehicle_id: str, served: Served | None = None) -> VehicleView:
+def load_view(core: Core, connection: Connection, vehicle_id: str, served: ServedModel | None = None) -> VehicleView:
     """A vehicle's view from the store, under the model that it is followed with or under another one."""
     served = served or core.pipeline.engines.of(connection, vehicle_id)
     engine = served.engine

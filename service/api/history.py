@@ -18,7 +18,7 @@ from sprung.service.api.fleet import load_view
 from sprung.service.api.queries import FOREVER, Id, Since, Until, resolution_of, time_of, wrong_query
 from sprung.service.core import Core
 from sprung.service.engine import Engine
-from sprung.service.engines import Served
+from sprung.service.engines import ServedModel
 from sprung.service.errors import NotFound, UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.store import fleet
@@ -160,7 +160,7 @@ def _rounded(values: FloatArray, known: Any) -> list[float | None]:
     return [value if ok else None for value, ok in zip(short.tolist(), known.tolist(), strict=True)]
 
 
-def served_by(core: Core, connection: Connection, vehicle: str, version: int | None) -> Served:
+def served_by(core: Core, connection: Connection, vehicle: str, version: int | None) -> ServedModel:
     """What a vehicle is followed with, or another version of it; 404 where there is none."""
     if version is None:
         return core.pipeline.engines.of(connection, vehicle)

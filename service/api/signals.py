@@ -17,7 +17,7 @@ from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import FOREVER, Id
 from sprung.service.compute import Priority
 from sprung.service.core import Core
-from sprung.service.engines import Served
+from sprung.service.engines import ServedModel
 from sprung.service.export.bundle import BUNDLE_MEDIA, Bundle, bundle
 from sprung.service.simulated import Compared, compare, newest_window, whole_windows
 from sprung.service.store import fleet, history, marks
@@ -78,7 +78,7 @@ async def vehicle_bundle(core: CoreOf, id_: Id) -> Response:
     return Response(body, media_type=BUNDLE_MEDIA, headers=headers)
 
 
-def _served(core: Core, connection: Connection, vehicle: str) -> Served:
+def _served(core: Core, connection: Connection, vehicle: str) -> ServedModel:
     """What a known vehicle is followed with; 404 for an unknown one."""
     known_vehicle(fleet.vehicle_exists(connection, vehicle), vehicle)
     return core.pipeline.engines.of(connection, vehicle)

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from sprung.model.experiment.choose import Ranked, rank_runs
+from sprung.model.experiment.choose import RankedRun, rank_runs
 from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.evidence import KNOWN
 from sprung.model.experiment.menu import BUNDLED, Menu, check_menu, read_menu
@@ -99,7 +99,7 @@ def _nearest(finding: dict[str, Any]) -> list[str]:
     return names[:MOST_RIVALS]
 
 
-def _as_dict(found: Ranked) -> dict[str, Any]:
+def _as_dict(found: RankedRun) -> dict[str, Any]:
     return {
         "run": found.run,
         "evidence": round(found.evidence, 2),
@@ -112,7 +112,7 @@ def _as_dict(found: Ranked) -> dict[str, Any]:
     }
 
 
-def _show(found: list[Ranked], names: list[str]) -> None:
+def _show(found: list[RankedRun], names: list[str]) -> None:
     print(f"told apart: {', '.join(names)}")
     print(f"{'run':<28}{'evidence':>10}{'per cost':>10}  chance that it is strong")
     for one in found:

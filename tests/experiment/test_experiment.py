@@ -12,12 +12,12 @@ from sprung.benchmarks.experiment import MENU, VEHICLE, with_law
 from sprung.model.experiment.choose import rank_runs
 from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.evidence import fitted, promise, simulated
-from sprung.model.experiment.menu import BUNDLED, Menu, MenuError, Run, check_menu, read_menu
+from sprung.model.experiment.menu import BUNDLED, Menu, MenuError, MenuRun, check_menu, read_menu
 from sprung.model.experiment.rivals import NoRival, rival
 from sprung.model.system import load_system, parse_system
 from sprung.service.cli import main
 
-SWEEP = Run.model_validate(
+SWEEP = MenuRun.model_validate(
     {"signal": {"kind": "sweep", "amplitude": 0.002, "frequency": 0.5, "to": 15.0}, "seconds": 4}
 )
 
@@ -57,7 +57,7 @@ def test_inputs_of_a_bench_are_their_own_derivatives() -> None:
 
 def test_a_load_changes_mass_and_inertia_alike() -> None:
     system = load_system()
-    run = Run.model_validate({"track": {"speed": 30.0}, "load": {"car": 3200.0}})
+    run = MenuRun.model_validate({"track": {"speed": 30.0}, "load": {"car": 3200.0}})
     before, after = system.file.bodies["car"], loaded(system, run).file.bodies["car"]
     factor = after.mass.value / before.mass.value
     assert after.mass.value == before.mass.value + 3200
