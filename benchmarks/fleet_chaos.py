@@ -30,6 +30,7 @@ from sqlalchemy import func, select
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.benchmarks.fleet_compare import differences
+from sprung.benchmarks.fleet_processes import descendants
 from sprung.model.identification.excitation import simulate_runs
 from sprung.service.compute import Compute
 from sprung.service.errors import UserError
@@ -292,23 +293,7 @@ def _kill_replica(head: KilledPart) -> None:
 
 def _below(process: subprocess.Popen[bytes] | None, text: str) -> list[int]:
     """Processes that descend from one and have a text in their command."""
-    parents: dict[int, int] = {}
-    commands: dict[int, str] = {}
-    for place in Path("/proc").glob("[0-9]*"):
-        try:
-            parents[int(place.name)] = int((place / "stat").read_text().rsplit(")", 1)[1].split()[1])
-            commands[int(place.name)] = (place / "cmdline").read_text(errors="replace")
-        except OSError:
-            continue
-
-    def descends(pid: int) -> bool:
-        while pid in parents:
-            pid = parents[pid]
-            if process is not None and pid == process.pid:
-                return True
-        return False
-
-    return [pid for pid, command in commands.items() if text in command and descends(pid)]
+    return [] if process is None else [one.pid for one in descendants(process.pid) if text in one.command]
 
 
 def _end_part(part: KilledPart) -> None:
