@@ -127,7 +127,8 @@ def pendulum_length(frames: FloatArray, frame_rate: float) -> SwingFit | None:
     size = float(np.abs(path).max())
 
     def error(x: FloatArray) -> FloatArray:
-        return _swinging(np.asarray(x)[None], len(path), frame_rate)[0] - path
+        found: FloatArray = _swinging(np.asarray(x)[None], len(path), frame_rate)[0] - path
+        return found
 
     def jacobian(x: FloatArray) -> FloatArray:
         step = 1e-6 * np.maximum(np.abs(x), 1e-2)

@@ -132,7 +132,7 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
     placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
     told = [recording.stamped and _taken_at_stamps(block, offset, channel) for channel in range(len(channels))]
-    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | told):
+    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | np.array(told)):
         own = block.channel == channel
         values[:, channel], between = _resample_long(
             offset[own], block.value[own], rows, recording.stamped, told[channel]

@@ -53,8 +53,8 @@ def _mode_shape(mechanics: Mechanics, rows: FloatArray, body: int, variant: str)
         found: FloatArray = sign * x / span_x
         return found
     if variant == "torsion":
-        found: FloatArray = sign * x * y / (span_x * span_y)
-        return found
+        twisted: FloatArray = sign * x * y / (span_x * span_y)
+        return twisted
     return sign  # "local": all attachments of the body move together against it
 
 

@@ -122,7 +122,8 @@ DAMPER_BLOWOFF = replace(
 
 def _asymmetry(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (a,) = p
-    return a * element.damping * np.abs(motion.rate)  # c (1 + a) v for v > 0, c (1 - a) v for v < 0
+    found: FloatArray = a * element.damping * np.abs(motion.rate)  # c (1 + a) v for v > 0, c (1 - a) v for v < 0
+    return found
 
 
 DAMPER_ASYMMETRY = ElementLaw(
@@ -145,7 +146,8 @@ def _typical_quadratic(seen: Observed) -> float:
 
 def _quadratic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (c2,) = p
-    return c2 * motion.rate * np.abs(motion.rate)
+    found: FloatArray = c2 * motion.rate * np.abs(motion.rate)
+    return found
 
 
 QUADRATIC_DAMPING = ElementLaw(

@@ -141,13 +141,15 @@ class LatentForce:
         """Standard deviation of the force, N, at points of any shape."""
         basis = self.surface.forces(np.ravel(d), np.ravel(v))
         variance = np.einsum("tk,kl,tl->t", basis, self.covariance, basis, optimize=True)
-        return np.sqrt(np.maximum(variance, 0)).reshape(np.shape(d))
+        found: FloatArray = np.sqrt(np.maximum(variance, 0)).reshape(np.shape(d))
+        return found
 
     def law(self, name: str = "unknown") -> SurfaceLaw:
         """The surface as a law of one parameter, its share: 1 is the surface as estimated."""
 
         def force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
-            return p[0] * self.force(np.asarray(motion.deflection), np.asarray(motion.rate))
+            found: FloatArray = p[0] * self.force(np.asarray(motion.deflection), np.asarray(motion.rate))
+            return found
 
         return SurfaceLaw(
             latent=self,

@@ -35,7 +35,8 @@ CUBIC_STIFFNESS = ElementLaw(
 def _bump_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     gap, stiffness = p
     d = motion.deflection
-    return stiffness * (d - np.minimum(np.maximum(d, -gap), gap))  # = kb max(|d| - gap, 0) sign d
+    found: FloatArray = stiffness * (d - np.minimum(np.maximum(d, -gap), gap))  # = kb max(|d| - gap, 0) sign d
+    return found
 
 
 BUMP_STOP = ElementLaw(
@@ -60,7 +61,8 @@ BUMP_STOP = ElementLaw(
 
 def _clearance(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     (gap,) = p
-    return -element.stiffness * np.minimum(np.maximum(motion.deflection, -gap), gap)
+    found: FloatArray = -element.stiffness * np.minimum(np.maximum(motion.deflection, -gap), gap)
+    return found
 
 
 CLEARANCE = ElementLaw(

@@ -36,8 +36,8 @@ def solve(
     if adjoint:
         if not isinstance(rate, torch.nn.Module):
             raise TypeError("adjoint gradients need a torch module that owns the parameters")
-        found: Tensor = odeint_adjoint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
-        return found
+        adjoined: Tensor = odeint_adjoint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
+        return adjoined
     found: Tensor = odeint(rate, x0, time, rtol=rtol, atol=atol, method=method, options=options)
     return found
 
