@@ -27,6 +27,7 @@ def loops(report: Report, name: str, folder: Path) -> Path:
         axes[at].plot(x, measured, lw=1.6, color=ink.NOISE)
         axes[at].plot(x, modelled, lw=0.9, color=ink.AFTER)
         axes[at].set_xlabel(f"{key}, {unit}")
+        axes[at].locator_params(axis="x", nbins=5)
     axes[0].set_ylabel("force, N")
     axes[2].plot(time, measured, lw=1.6, color=ink.NOISE, label="measured")
     axes[2].plot(time, nominal, lw=0.8, color=ink.BEFORE, label="spring and damper")
