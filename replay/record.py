@@ -143,7 +143,7 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
             reason = "its samples were taken at uneven times" if told[channel] else "its time stamps fit no even clock"
             recording.account.note(
                 f"{channels[channel].name}: {reason} (steps of {low:.3g} to {high:.3g} ms) in "
-                f"{100 * between / rows:.2g} % of the record: interpolated between them (cubic spline)"
+                f"{100 * between / rows:.3g} % of the record: interpolated between them (cubic spline)"
             )
     return start, values
 

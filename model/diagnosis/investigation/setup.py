@@ -116,7 +116,7 @@ def _best(
     """The hypothesis that explains most, fitted, if one explains enough."""
     rules = problem.rules.setup
     total = float(np.sum(present))
-    best: _Accepted | None = None
+    accepted: list[_Accepted] = []
     for ranked in _ranked(system, signals, problem, fit, total):
         for hypothesis in ranked:
             changed, mended = hypothesis.undo(system, signals)
@@ -126,8 +126,12 @@ def _best(
             except (ValueError, FloatingPointError):
                 continue
             left = float(np.sum(misfit(again)))
-            if left < rules.explains * total and (best is None or left < best[0].after):
-                best = _fault(hypothesis, total, left), changed, mended, other, again
+            if left < rules.explains * total:
+                if hypothesis.by_mass:  # told apart from all stiffnesses, which others only bend to their needs
+                    fault = _fault(hypothesis, total, left), changed, mended, other, again
+                    return _sharpened(fault, declared, fitted)
+                accepted.append((_fault(hypothesis, total, left), changed, mended, other, again))
+        best = min(accepted, key=lambda one: one[0].after, default=None)
         if best is not None and best[0].effect not in ORDINARY:
             return _sharpened(best, declared, fitted_samples(signals, best[2], split))
     return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
@@ -137,20 +141,22 @@ def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total:
     """Hypotheses worth fitting, the most promising first: of channels, then of the system file."""
     rules = problem.rules.setup
     nominal = Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta)))
-    promising: dict[tuple[str, str], Hypothesis] = {}
+    promising: dict[tuple[str, str, bool], Hypothesis] = {}
     for one in (ModelResponse.of(problem, fit.forward), ModelResponse.of(problem, nominal)):
         whole = one.left(one.shown)
         for hypothesis in hypotheses(one, system, signals, rules):
-            key = (hypothesis.effect, hypothesis.location)
+            key = (hypothesis.effect, hypothesis.location, hypothesis.by_mass)
             share = replace(hypothesis, left=hypothesis.left / whole)
             # under a measured force spectra at wrong resonances say nothing of its sign
             always = problem.process_noise and hypothesis.effect == "sign_reversed" and "|" not in hypothesis.location
-            good = always or share.left < rules.promising
+            good = always or hypothesis.by_mass or share.left < rules.promising
             if good and (key not in promising or share.left < promising[key].left):
                 promising[key] = share
     by_left = sorted(promising.values(), key=lambda h: h.left)
-    forced = [h for h in by_left if h.left >= rules.promising] if len(promising) <= _FEW else []
-    ranked = [h for h in by_left if h.effect not in ORDINARY and h not in forced][: rules.tried] + forced
+    few = len(promising) <= _FEW
+    forced = [h for h in by_left if few and h.left >= rules.promising and not h.by_mass]
+    ranked = [h for h in by_left if h.by_mass]
+    ranked += [h for h in by_left if h.effect not in ORDINARY and h not in (*forced, *ranked)][: rules.tried] + forced
     if ranked:
         yield ranked + [h for h in by_left if h.effect in ORDINARY][: rules.beside]
     of_file: dict[tuple[str, str, str], Hypothesis] = {}
@@ -210,9 +216,9 @@ def _undo(fault: SetupFault, system: System, change: float) -> changes.Undo:
     """Undoes a little more of a fault."""
     group = fault.group
     if fault.effect == "node_delay":
-        return changes.advance(group.sensors, group.supports, change)
+        return changes.advance(group.sensors, group.supports, change, group.forces)
     if fault.effect == "wrong_scale":
-        return changes.scale(group.sensors, group.supports, group.supports, 1 + change)
+        return changes.scale(group.sensors, group.supports, group.supports, 1 + change, group.forces)
     if fault.location in system.elements:
         return moves_element(fault.location, fault.axis, change)
     return moves_sensor(fault.location, fault.axis, change)

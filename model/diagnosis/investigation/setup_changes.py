@@ -60,14 +60,19 @@ def exchange(sensors: Sequence[tuple[int, int]] = (), supports: Sequence[tuple[i
     return undo
 
 
-def advance(sensors: Sequence[int], supports: Sequence[int], late: float) -> Undo:
+def advance(sensors: Sequence[int], supports: Sequence[int], late: float, forces: Sequence[int] = ()) -> Undo:
     """Earlier by a delay; what they no longer have at the ends is cut off of all signals."""
 
     def undo(system: System, signals: Signals) -> tuple[System, Signals]:
         rate, samples = signals.sample_rate, signals.samples
         time, omega = np.arange(samples) / rate, 2 * np.pi * np.fft.rfftfreq(samples, 1 / rate)
         copies = {}
-        for key, at in (("sensors", sensors), ("displacement", supports), ("velocity", supports)):
+        for key, at in (
+            ("sensors", sensors),
+            ("displacement", supports),
+            ("velocity", supports),
+            ("force", forces),
+        ):
             series = getattr(signals, key).copy()
             chosen = [i for i in at if np.isfinite(series[0, i])]
             line = series[:1, chosen] + (series[-1:, chosen] - series[:1, chosen]) * (time / time[-1])[:, None]

@@ -18,6 +18,9 @@ from sprung.model.system import System
 
 ORDINARY = (SENSOR_GAIN.name, SENSOR_LAG.name)  # that screening seeks; they only have to be beaten
 _ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
+_ABOVE = 1.3  # times the fastest mode, from where masses alone are told
+_LATE, _TELLS = 0.75, 0.5  # samples of a delay; of the misfit there that an explanation may leave
+_UNIT, STANDARD_GRAVITY = 0.1, 9.80665  # of a log ratio that is a unit; m/s^2
 _ALIKE = 1e-6  # m, of positions that mirror each other
 
 
@@ -28,6 +31,8 @@ def hypotheses(one: ModelResponse, system: System, signals: Signals, rules: Setu
     yield from _exchanges(one, system, signals, wired)
     yield from _delays(one, wired, rules)
     yield from _scales(one, wired, rules)
+    if signals.force_names and not signals.support_names:
+        yield from _against_forces(one, wired, rules)
     yield from _positions(one, system, signals, rules)
     yield from _ordinary(one, signals, rules)
 
@@ -58,7 +63,7 @@ class Wiring:
             for quantity in ("displacement", "velocity"):
                 if f"{support}.{quantity}" in {channel.name for channel in self.system.inputs}:
                     names.append(f"{support}.{quantity}")
-        return "|".join(names)
+        return "|".join([*names, *(self.signals.force_names[k] for k in group.forces)])
 
     def groups(self) -> list[Group]:
         """Single channels, and what may share a node, a kind or a scale."""
@@ -180,6 +185,39 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
             undo = changes.scale(group.sensors, group.supports, group.supports, ratio)
             yield Hypothesis("wrong_scale", wired.name(group), ratio, one.left(one.scaled(group, ratio)), undo, group)
+
+
+def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
+    """All sensors late, or in another unit, against the measured forces, or these against them.
+
+    Resonances a tenth off leave nothing to compare spectra by; above all modes the masses alone tell what a force
+    does, whatever the stiffnesses are.  Standard gravity in the ratio is said of the sensors, any other of the forces,
+    which are fewer.
+    """
+    if len(wired.sensors) < 2:
+        return
+    inert = one.above(_ABOVE * one.highest_mode)
+    before = inert.left(inert.shown)
+    sensors, forces = (
+        Group(tuple(range(len(wired.sensors)))),
+        Group((), (), tuple(range(len(wired.signals.force_names)))),
+    )
+    late = inert.delay(sensors, rules.latest)
+    group = sensors if late > 0 else forces
+    late = late if late > 0 else inert.delay(forces, rules.latest)
+    if late > _LATE * one.step and inert.left(inert.late(group, late)) < _TELLS * before:
+        undo = changes.advance(group.sensors, (), late, group.forces)
+        left = one.left(one.late(group, late))
+        yield Hypothesis("node_delay", wired.name(group), late, left, undo, group, by_mass=True)
+    ratio = inert.ratio(sensors)
+    if not (np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale)):
+        return
+    group = sensors if abs(abs(np.log(ratio)) - np.log(STANDARD_GRAVITY)) < _UNIT else forces
+    ratio = ratio if group is sensors else 1 / ratio
+    if inert.left(inert.scaled(group, ratio)) < _TELLS * before:
+        undo = changes.scale(group.sensors, (), (), ratio, group.forces)
+        left = one.left(one.scaled(group, ratio))
+        yield Hypothesis("wrong_scale", wired.name(group), ratio, left, undo, group, by_mass=True)
 
 
 def _positions(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:

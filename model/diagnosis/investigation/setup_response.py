@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -21,6 +20,7 @@ class Group:
 
     sensors: tuple[int, ...] = ()
     supports: tuple[int, ...] = ()
+    forces: tuple[int, ...] = ()
 
 
 NOTHING = Group()
@@ -38,6 +38,7 @@ class Hypothesis:
     group: Group = NOTHING
     axis: int = 0  # of a position
     detail: str = ""  # in words
+    by_mass: bool = False  # told above all modes: to be fitted whatever spectra at wrong resonances say
 
 
 def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:
@@ -58,6 +59,7 @@ class ModelResponse:
     omega: FloatArray
     step: float  # s, of the samples
     samples: int
+    of_raw_force: ComplexArray  # as `of_force`, of the force as it was measured: a fit may bend it to its needs
 
     @classmethod
     def of(cls, problem: Problem, forward: Forward) -> ModelResponse:
@@ -73,6 +75,7 @@ class ModelResponse:
             omega=part.grid.omega[band],
             step=part.grid.step,
             samples=part.grid.samples,
+            of_raw_force=plant.sensor_of_measured_force[band] * problem.part.force[band][:, None, :],
         )
 
     @property
@@ -87,14 +90,14 @@ class ModelResponse:
 
     def turned(self, group: Group) -> ComplexArray:
         """Shown if a group has the other sign."""
-        shown = self.shown - 2 * self._of(group.supports)
+        shown = self.shown - 2 * self._of(group)
         shown[:, list(group.sensors)] *= -1
         return shown
 
     def late(self, group: Group, late: float) -> ComplexArray:
         """Shown if a group is late: sensors show later, what late inputs drive comes earlier."""
         turn = np.exp(-1j * self.omega * late)[:, None]
-        driven = self._of(group.supports)
+        driven = self._of(group)
         shown = self.shown - driven + driven / turn
         at = list(group.sensors)
         shown[:, at] *= turn
@@ -103,18 +106,36 @@ class ModelResponse:
 
     def scaled(self, group: Group, ratio: float) -> ComplexArray:
         """Shown if a group is too large by a ratio."""
-        driven = self._of(group.supports)
+        driven = self._of(group)
         shown = self.shown - driven + driven / ratio
         shown[:, list(group.sensors)] *= ratio
         return shown
 
-    def _of(self, supports: Sequence[int]) -> ComplexArray:
-        return np.asarray(self.of_support[:, :, list(supports)].sum(axis=2))
+    def _of(self, group: Group) -> ComplexArray:
+        """Shown of the inputs of a group, (F, S)."""
+        moved = self.of_support[:, :, list(group.supports)].sum(axis=2)
+        return np.asarray(moved + self.of_force[:, :, list(group.forces)].sum(axis=2))
+
+    def above(self, frequency: float) -> ModelResponse:
+        """The same of the measured force, of the bins from an angular frequency on; the others are empty."""
+        keep = (self.omega >= frequency)[:, None]
+        return replace(
+            self,
+            measured=self.measured * keep,
+            of_support=self.of_support * keep[:, :, None],
+            of_force=self.of_raw_force * keep[:, :, None],
+        )
+
+    @property
+    def highest_mode(self) -> float:
+        """Angular frequency of the fastest mode of the model, rad/s: above it masses alone tell what a force does."""
+        s = self.forward.plant.structure
+        return float(np.sqrt(np.max(np.abs(np.linalg.eigvals((s.H.T * s.stiffness) @ s.H / s.mass[:, None])))))
 
     def delay(self, group: Group, latest: float) -> float:
         """The delay of a group that leaves the least misfit, s: the best of all whole samples, then between them."""
         weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(self.measured) ** 2, axis=0), 1e-300))
-        driven, shown, at = self._of(group.supports), self.shown, list(group.sensors)
+        driven, shown, at = self._of(group), self.shown, list(group.sensors)
         own = np.zeros(len(weight), dtype=bool)
         own[at] = True
         # later sensors: (rest) e^-jwt + driven against Y;   earlier drive: rest + driven e^jwt against Y
@@ -144,7 +165,7 @@ class ModelResponse:
         if at:
             shown, measured, weight = self.shown[:, at], self.measured[:, at], weight[at]
         else:
-            shown = self._of(group.supports)
+            shown = self._of(group)
             measured = self.measured - self.shown + shown
         product = np.sum(np.real(shown.conj() * measured) * weight)
         found = float(product / max(np.sum(np.abs(shown) ** 2 * weight), 1e-300))
