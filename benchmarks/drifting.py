@@ -102,7 +102,8 @@ def _alps(settings: PaperSettings, data: TrainData, drift: float, many: Tensor, 
     assert isinstance(model, StateEstimator)
     with torch.no_grad():
         log_ratio, _ = model(windows(data.measured, at, many), windows(data.known, at, many))
-    return log_ratio
+    found: Tensor = log_ratio
+    return found
 
 
 def _refined(data: TrainData, many: Tensor, at: Tensor, length: int) -> Tensor:

@@ -197,9 +197,10 @@ def _findings(one: Judged) -> list[Finding]:
         findings.append(
             finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names))
         )
-    step = one.surface or (None if one.named else next(iter(one.found.steps), None))
-    if step is not None:
-        findings.append(unknown_finding(one.record.element, step, one.found.steps, mapped=one.surface is not None))
+    first = None if one.named else next(iter(one.found.steps), None)
+    unnamed = one.surface or first
+    if unnamed is not None:
+        findings.append(unknown_finding(one.record.element, unnamed, one.found.steps, mapped=one.surface is not None))
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     sign = -1.0 if one.reversed else 1.0
     if abs(one.final.preload) > 5 * max(deviation, one.floor / np.sqrt(one.record.task.split)):
