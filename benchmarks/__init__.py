@@ -39,6 +39,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
     "ambient": ("sprung.benchmarks.ambient", "nothing measured below: error over the Cramer-Rao bound, coverage"),
     "comfort": ("sprung.benchmarks.comfort", "what a failing element costs in comfort: foreseen and simulated"),
     "concealed": ("sprung.benchmarks.concealed", "missing physics: found, placed and named, against PySINDy"),
+    "open-catalogue": (
+        "sprung.benchmarks.open_catalogue",
+        "concealed laws that no catalogue has: formulas, their error on held-out motion and at 1.5 times the amplitude",
+    ),
     "structure": (
         "sprung.benchmarks.structure",
         "parts that the file does not state: connections, hanging masses, lever arms; named, and none invented",
