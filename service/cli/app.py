@@ -299,6 +299,23 @@ def system(
     return run(file, json_lines, schema, export)
 
 
+@app.command("import")
+def import_model(
+    file: Annotated[
+        Path, typer.Argument(help=".mat file with M, C, K and sensor rows, or A, B, C, D.", metavar="MODEL")
+    ],
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="System file to write.")],
+    rate: Annotated[
+        float | None, typer.Option("--rate", metavar="NUMBER", help="Hz, of the recordings; else `sample_rate` in it.")
+    ] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Of the system; default: the file's.")] = None,
+) -> int:
+    """A system file from a linear model's matrices: a baseline to identify and to look for what it leaves out."""
+    from sprung.service.cli.system import import_matrices
+
+    return import_matrices(file, out, rate, name)
+
+
 @app.command()
 def export(
     vehicle: Annotated[str, typer.Argument(help="As recordings call it.", metavar="VEHICLE")],

@@ -11,15 +11,29 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from sprung.model.exchange.matrices import read_matrices
 from sprung.model.identification.identify import identifiability
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.schema import SystemFileError
-from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
 from sprung.service.cli.export import export
 from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
+
+
+def import_matrices(file: Path, out: Path, rate: float | None, name: str | None) -> int:
+    """Write the system file of a model that comes as matrices, and say what became of it."""
+    text = read_matrices(file, name, rate)
+    system = parse_system(text, str(out))
+    out.write_text(text, encoding="utf-8")
+    print(
+        f"{out}: {len(system.bodies)} bodies, {len(system.elements)} elements, {len(system.sensors)} sensors; "
+        "set noises and columns to those of your recordings",
+        file=sys.stderr,
+    )
+    return 0
 
 
 def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = None) -> int:

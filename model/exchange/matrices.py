@@ -1,0 +1,259 @@
+"""A baseline system from matrices in a .mat file: M, C, K with sensor rows, or A, B, C, D.
+
+Every coordinate becomes a body that heaves, every coupling a spring and damper between two bodies or to a moving
+support, so that its values can be identified and laws sought in it.  That is possible where the matrices are those of
+such a network: M diagonal, K and C symmetric with no positive coupling.  Anything else is refused in one line; what
+was read is assembled again and must give the same matrices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse
+import yaml
+
+from sprung.model.exchange.statespace import ExchangeError
+from sprung.model.signals import FloatArray
+from sprung.model.system import USUAL_NOISE, System, parse_system
+
+_KEYS = ("M", "C", "K", "Kb", "Cb", "S", "A", "B", "mass", "sample_rate")
+_SAME = 1e-8  # relative to the largest entry of a matrix
+_UNITS = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "deflection": "m"}
+
+
+@dataclass(frozen=True, slots=True)
+class SpringNetwork:
+    """Coordinates, what couples them to each other and to supports, and sensors."""
+
+    mass: FloatArray  # kg, (n,)
+    K: FloatArray  # N/m, (n, n)
+    C: FloatArray  # N s/m, (n, n)
+    Kb: FloatArray  # by the displacements of the supports, (n, s)
+    Cb: FloatArray  # by their velocities, (n, s)
+    sensors: tuple[
+        tuple[str, int, int], ...
+    ]  # kind, coordinate, the coordinate that a deflection is counted from or -1
+
+
+def read_matrices(path: Path, name: str | None = None, rate: float | None = None) -> str:
+    """The text of a system file from a .mat file.
+
+    M, C, K: M (n, n) or its diagonal; Kb, Cb (n, s): forces by the supports' motions, left out: what the rows of K and
+    C leave over leads to one support; S (p, n): sensor rows, +1 for the acceleration of a coordinate, +1 and -1 for the
+    deflection between two; left out: every acceleration.
+    A, B, C, D: states are displacements, then velocities; columns of B are displacement and velocity of one support
+    after the other, as `--export` writes them; rows of C are displacements, velocities, accelerations or deflections.
+    `mass` (n,) says the scale, or its first
+    entry; left out: the first coordinate weighs 1 kg, which no sensor of motion can tell.
+    rate: Hz, of the recordings; else `sample_rate` of the file.
+    Errors: `ExchangeError`, OSError.
+    """
+    try:
+        data = scipy.io.loadmat(path)
+    except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
+        raise ExchangeError(f"{path}: no .mat file of version 4 to 7: {' '.join(str(error).split())[:150]}") from error
+    given = {key: _matrix(path, key, data[key]) for key in _KEYS if key in data}
+    sampled = rate if rate is not None else _number(given, "sample_rate")
+    if sampled is None or not sampled > 0:
+        raise ExchangeError(f"{path}: no sample_rate; say at how many Hz the recordings are by --rate")
+    found = _from_state_space(path, given) if "A" in given else _from_mck(path, given)
+    text = _text(found, name or path.stem, sampled)
+    _same_again(path, found, parse_system(text, str(path)))
+    return text
+
+
+def _matrix(path: Path, name: str, value: Any) -> FloatArray:
+    try:
+        found = np.atleast_2d(np.asarray(value.toarray() if scipy.sparse.issparse(value) else value, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise ExchangeError(f"{path}: {name}: is no matrix of numbers") from error
+    if found.ndim != 2:
+        raise ExchangeError(f"{path}: {name}: is no matrix")
+    if not np.isfinite(found).all():
+        raise ExchangeError(f"{path}: {name}: numbers that are not finite")
+    return found
+
+
+def _number(given: Mapping[str, FloatArray], name: str) -> float | None:
+    return float(given[name].ravel()[0]) if name in given and given[name].size else None
+
+
+def _from_mck(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
+    missing = [name for name in ("M", "K") if name not in given]
+    if missing:
+        raise ExchangeError(f"{path}: neither A, B, C, D nor M, C, K are in it: {missing[0]} is missing")
+    K = given["K"]
+    n = len(K)
+    C = given.get("C", np.zeros((n, n)))
+    M = given["M"]
+    mass = M.ravel() if M.size == n and n > 1 else np.diag(M)
+    if K.shape != (n, n) or C.shape != (n, n) or mass.shape != (n,):
+        raise ExchangeError(f"{path}: M {M.shape}, C {C.shape} and K {K.shape} are not of the same size")
+    if M.shape == (n, n) and np.abs(M - np.diag(mass)).max() > _SAME * np.abs(M).max():
+        raise ExchangeError(f"{path}: M is not diagonal: its coordinates are not those of single bodies")
+    Kb, Cb = given.get("Kb"), given.get("Cb")
+    if Kb is None and Cb is None:
+        Kb, Cb = K.sum(axis=1, keepdims=True), C.sum(axis=1, keepdims=True)
+    Kb = np.zeros_like(Cb) if Kb is None else Kb
+    Cb = np.zeros_like(Kb) if Cb is None else Cb
+    if Kb.shape != Cb.shape or len(Kb) != n:
+        raise ExchangeError(f"{path}: Kb {Kb.shape} and Cb {Cb.shape}: a row for each of {n} coordinates is needed")
+    rows = given.get("S", np.eye(n))
+    sensors = tuple(_sensor_of_row(path, i, row) for i, row in enumerate(rows))
+    return _checked(path, SpringNetwork(mass, K, C, Kb, Cb, sensors))
+
+
+def _sensor_of_row(path: Path, number: int, row: FloatArray) -> tuple[str, int, int]:
+    at = np.flatnonzero(row)
+    if len(at) == 1 and row[at[0]] == 1:
+        return "acceleration", int(at[0]), -1
+    if len(at) == 2 and sorted(row[at]) == [-1, 1]:
+        return "deflection", int(at[row[at] == 1][0]), int(at[row[at] == -1][0])
+    raise ExchangeError(f"{path}: S: row {number + 1} is neither one coordinate (1) nor a difference of two (1, -1)")
+
+
+def _from_state_space(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
+    missing = [name for name in ("B", "C") if name not in given]
+    if missing:
+        raise ExchangeError(f"{path}: A without {missing[0]}")
+    A, B, rows = given["A"], given["B"], given["C"]
+    n = len(A) // 2
+    if A.shape != (2 * n, 2 * n) or n == 0 or len(B) != 2 * n or rows.shape[1] != 2 * n or B.shape[1] % 2:
+        raise ExchangeError(
+            f"{path}: A {A.shape}, B {B.shape}, C {rows.shape} do not go together; B needs two columns a support"
+        )
+    if np.abs(A[:n] - np.eye(n, 2 * n, n)).max() > _SAME or np.abs(B[:n]).max() > _SAME * np.abs(B).max():
+        raise ExchangeError(f"{path}: A: states are not displacements, then their velocities")
+    X, Y = -A[n:, :n], -A[n:, n:]
+    mass = _masses(path, X, given.get("mass"))
+    scale = mass[:, None]
+    sensors = tuple(_sensor_of_output(path, i, row, A) for i, row in enumerate(rows))
+    return _checked(path, SpringNetwork(mass, scale * X, scale * Y, scale * B[n:, 0::2], scale * B[n:, 1::2], sensors))
+
+
+def _masses(path: Path, X: FloatArray, given: FloatArray | None) -> FloatArray:
+    """Masses that make M X symmetric: known up to one factor for coordinates that hang together."""
+    n = len(X)
+    if given is not None and given.size == n:
+        return given.ravel()
+    mass = np.full(n, np.nan)
+    mass[0] = 1.0 if given is None or not given.size else given.ravel()[0]
+    waiting = [0]
+    while waiting:
+        i = waiting.pop()
+        for j in np.flatnonzero(np.isnan(mass)):
+            if X[i, j] and X[j, i]:
+                mass[j] = mass[i] * X[i, j] / X[j, i]
+                waiting.append(int(j))
+    if np.isnan(mass).any():
+        raise ExchangeError(f"{path}: A: its coordinates do not hang together; give the masses as `mass`")
+    return mass
+
+
+def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray) -> tuple[str, int, int]:
+    n = len(A) // 2
+    for i in range(n):
+        if np.allclose(row, A[n + i], rtol=1e-9, atol=_SAME * np.abs(A[n + i]).max()):
+            return "acceleration", i, -1
+    at = np.flatnonzero(row)
+    if len(at) == 1 and row[at[0]] == 1:
+        return ("displacement", int(at[0]), -1) if at[0] < n else ("velocity", int(at[0] - n), -1)
+    if len(at) == 2 and at.max() < n and sorted(row[at]) == [-1, 1]:
+        return "deflection", int(at[row[at] == 1][0]), int(at[row[at] == -1][0])
+    raise ExchangeError(f"{path}: C: row {number + 1} is no displacement, velocity, acceleration or deflection")
+
+
+def _checked(path: Path, found: SpringNetwork) -> SpringNetwork:
+    if not (found.mass > 0).all():
+        raise ExchangeError(f"{path}: a mass is not greater than 0")
+    for name, matrix in (("K", found.K), ("C", found.C)):
+        size = np.abs(matrix).max() or 1.0
+        if np.abs(matrix - matrix.T).max() > _SAME * size:
+            raise ExchangeError(f"{path}: {name} is not symmetric: no network of springs and dampers has it")
+        if (matrix - np.diag(np.diag(matrix))).max(initial=0.0) > _SAME * size:
+            i, j = np.argwhere(np.triu(matrix, 1) > _SAME * size)[0]
+            raise ExchangeError(f"{path}: {name}({i + 1}, {j + 1}) is positive: no spring between two bodies pushes so")
+    for name, matrix in (("Kb", found.Kb), ("Cb", found.Cb)):
+        if matrix.min(initial=0.0) < -_SAME * (np.abs(matrix).max() or 1.0):
+            raise ExchangeError(f"{path}: {name}: a support is coupled by a negative value")
+    for name, inner, outer in (("K", found.K, found.Kb), ("C", found.C, found.Cb)):
+        over = inner.sum(axis=1) - outer.sum(axis=1)
+        if np.abs(over).max() > _SAME * (np.abs(inner).max() or 1.0):
+            i = int(np.abs(over).argmax())
+            raise ExchangeError(
+                f"{path}: {name}: row {i + 1} leaves {over[i]:.4g} that no support takes: springs to a fixed ground "
+                "need a support that stands still among the columns of Kb"
+            )
+    return found
+
+
+def _text(found: SpringNetwork, name: str, rate: float) -> str:
+    n, supports = len(found.mass), found.Kb.shape[1]
+    body = [f"body{i + 1}" for i in range(n)]
+    support = [f"support{i + 1}" for i in range(supports)]
+    elements: dict[str, Any] = {}
+    for i in range(n):
+        for j in range(i + 1, n):
+            _add(elements, body[i], body[j], -found.K[i, j], -found.C[i, j])
+        for j in range(supports):
+            _add(elements, body[i], support[j], found.Kb[i, j], found.Cb[i, j])
+    sensors = dict(_sensor(kind, i, j, body, elements) for kind, i, j in found.sensors)
+    inputs = {
+        one: {
+            "kind": "displacement",
+            "displacement": {"csv": f"{one}.displacement", "noise": USUAL_NOISE["m"]},
+            "velocity": {"csv": f"{one}.velocity", "noise": USUAL_NOISE["m/s"]},
+        }
+        for one in support
+    }
+    file = {
+        "name": name,
+        "sample_rate": rate,
+        "window": max(20, round(rate)),
+        "bodies": {one: {"mass": float(mass)} for one, mass in zip(body, found.mass, strict=True)},
+        "inputs": inputs,
+        "elements": elements,
+        "sensors": sensors,
+    }
+    head = "# From matrices: set the noises of sensors and inputs to those of your instruments, and their columns.\n"
+    return head + yaml.safe_dump(file, sort_keys=False, width=110)
+
+
+def _add(elements: dict[str, Any], upper: str, lower: str, k: float, c: float) -> None:
+    if k or c:
+        values = {key: float(value) for key, value in (("stiffness", k), ("damping", c)) if value}
+        elements[f"{upper}_{lower}"] = {"upper": upper, "lower": lower} | values
+
+
+def _sensor(kind: str, i: int, j: int, body: list[str], elements: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    noise = USUAL_NOISE[_UNITS[kind]]
+    if kind != "deflection":
+        name = f"{body[i]}_{kind}"
+        return name, {"kind": kind, "body": body[i], "csv": name, "noise": noise}
+    first, second = sorted((i, j))
+    element = f"{body[first]}_{body[second]}"
+    if element not in elements:
+        raise ExchangeError(f"a deflection is measured between {body[i]} and {body[j]}, which nothing connects")
+    name = f"{element}_deflection"
+    entry = {"kind": kind, "element": element, "csv": name, "noise": noise}
+    return name, entry | ({"sign": -1} if i > j else {})
+
+
+def _same_again(path: Path, found: SpringNetwork, system: System) -> None:
+    n, scale = len(found.mass), found.mass[:, None]
+    A, B, *_ = system.mechanics.matrices()
+    pairs = ((-A[n:, :n] * scale, found.K), (-A[n:, n:] * scale, found.C))
+    pairs += ((B[n:, 0::2] * scale, found.Kb), (B[n:, 1::2] * scale, found.Cb))
+    if any(
+        np.abs(ours - theirs).max(initial=0.0) > _SAME * (np.abs(theirs).max(initial=0.0) or 1.0)
+        for ours, theirs in pairs
+    ):
+        raise ExchangeError(
+            f"{path}: the system that was made of it has other matrices; this is an error of the program"
+        )

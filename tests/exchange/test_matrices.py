@@ -1,0 +1,78 @@
+"""Matrices of other programs as a baseline system: the same motion again, or one line that says what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from sprung.model.exchange.matrices import read_matrices
+from sprung.model.exchange.statespace import ExchangeError, state_space, write_mat
+from sprung.model.system import load_system, parse_system
+from sprung.service.cli import main
+
+K = np.array([[220e3, -20e3, 0], [-20e3, 50e3, -30e3], [0, -30e3, 30e3]])  # to the road 200e3
+C = np.array([[1550.0, -1500, 0], [-1500, 1700, -200], [0, -200, 200]])
+MASS = np.array([45.0, 400, 80])
+ROWS = np.array([[0, 1.0, 0], [0, 0, 1], [-1, 1, 0]])
+
+
+def written(path: Path, **matrices: object) -> Path:
+    scipy.io.savemat(path, {"sample_rate": 200.0} | matrices)
+    return path
+
+
+def test_m_c_k_with_sensor_rows_become_the_same_system(tmp_path: Path) -> None:
+    system = parse_system(read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=ROWS)))
+    A, B, out, _ = system.mechanics.matrices()
+    np.testing.assert_allclose(A[3:, :3], -K / MASS[:, None], atol=1e-9)
+    np.testing.assert_allclose(A[3:, 3:], -C / MASS[:, None], atol=1e-9)
+    np.testing.assert_allclose(B[3:, 0] * MASS, [200e3, 0, 0], atol=1e-6)
+    np.testing.assert_allclose(out[0], A[4])
+    np.testing.assert_allclose(out[2], [1, -1, 0, 0, 0, 0])
+    assert system.file.sensors["body1_body2_deflection"].sign == -1  # the row counts it the other way
+    assert {p.name for p in system.parameters} >= {"body1_body2.stiffness", "body2_body3.damping"}
+
+
+def test_state_space_of_an_export_comes_back(tmp_path: Path) -> None:
+    first = parse_system(read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=ROWS)))
+    write_mat(tmp_path / "b.mat", state_space(first))
+    data = scipy.io.loadmat(tmp_path / "b.mat")
+    again = parse_system(read_matrices(written(tmp_path / "c.mat", mass=45.0, **{k: data[k] for k in "ABCD"})))
+    for ours, theirs in zip(again.mechanics.matrices(), first.mechanics.matrices(), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_the_command_writes_a_file_that_the_others_take(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = written(tmp_path / "a.mat", M=MASS, C=C, K=K)
+    assert main(["import", str(source), "--out", str(tmp_path / "car.yaml")]) == 0
+    assert "3 bodies" in capsys.readouterr().err
+    assert load_system(tmp_path / "car.yaml").sensors == (
+        "body1_acceleration",
+        "body2_acceleration",
+        "body3_acceleration",
+    )
+    assert main(["import", str(tmp_path / "car.yaml"), "--out", str(tmp_path / "x.yaml")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"K": K + np.triu(np.full((3, 3), 10.0), 1)}, "symmetric"),
+        ({"K": np.abs(K)}, "positive"),
+        ({"M": np.diag(MASS) + 1}, "diagonal"),
+        ({"M": -MASS}, "mass"),
+        ({"K": np.full((3, 3), np.nan)}, "finite"),
+        ({"S": np.array([[1.0, 1, 0]])}, "row 1"),
+        ({"S": np.array([[-1.0, 0, 1]])}, "nothing connects"),
+        ({"Kb": np.array([[150e3], [0], [0]])}, "row 1 leaves"),
+        ({"sample_rate": 0.0}, "sample_rate"),
+    ],
+)
+def test_what_is_no_network_is_refused_in_one_line(tmp_path: Path, change: dict[str, object], said: str) -> None:
+    with pytest.raises(ExchangeError, match=said) as refused:
+        read_matrices(written(tmp_path / "a.mat", **({"M": MASS, "C": C, "K": K, "S": ROWS} | change)))
+    assert "\n" not in str(refused.value)
