@@ -18,10 +18,11 @@ from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
 from sprung.service.following import Followed
 from sprung.service.store import Store, fleet, history, status
+from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.partitions import prepare
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.views import vehicle_view
+from sprung.service.views import body_loads, running, vehicle_view
 
 LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
 FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after which they are asked again
@@ -248,12 +249,14 @@ class Pipeline:
         raced: dict[int, WindowRecord] = {}
         if held is None:  # another process may have stored some of them while this one was identifying
             raced = known_windows(connection, vehicle, model_id, [w.start for w in windows])
-        records, after = self._follow(at, windows, estimates, set(raced), now)
+        records, after, ran = self._follow(at, windows, estimates, set(raced), now)
         new = [record for record in records if record.start not in raced]
         tracked = time.perf_counter()
         if new:
             add_windows(connection, vehicle, model_id, new, now, recording_id)
             history.add_to_rollups(connection, vehicle, model_id, new, now)
+            if self._shown:
+                add_circumstances(connection, vehicle, ran, now)
             after = replace(after, revision=at.revision + 1)
             self._save(connection, vehicle, after, now, new)
         done = time.perf_counter()
@@ -285,11 +288,11 @@ class Pipeline:
         estimates: Sequence[Estimate | None],
         skip: set[int],
         now: int,
-    ) -> tuple[list[WindowRecord], HeldVehicle]:
+    ) -> tuple[list[WindowRecord], HeldVehicle, list[Ran]]:
         """Feed the windows that are not skipped, in order."""
         tracker, system = at.served.engine.tracker, at.served.engine.system
         followed = Followed(at.state, at.last_window_ns)
-        records = []
+        records, ran = [], []
         for window, estimate in zip(windows, estimates, strict=True):
             posterior, before = None, followed
             if window.start not in skip:
@@ -297,6 +300,9 @@ class Pipeline:
             fed = estimate is not None and followed.last == window.start and followed is not before
             if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
                 posterior = Posterior(*tracker.posterior(followed.state))
+            if window.start not in skip:
+                loads = body_loads(at.served.engine, followed.state) if fed else {}
+                ran.append(Ran(window.start, running(system, window, loads)))
             records.append(
                 WindowRecord(
                     window.start,
@@ -307,7 +313,7 @@ class Pipeline:
                     posterior,
                 )
             )
-        return records, replace(at, state=followed.state, last_window_ns=followed.last)
+        return records, replace(at, state=followed.state, last_window_ns=followed.last), ran
 
     def _current(self, connection: Connection, vehicle: str) -> HeldVehicle:
         """The vehicle's tracker: from memory when that is still what is stored, else read anew."""

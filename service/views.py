@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from sprung.model.signals import FloatArray, MeasurementFault
+from sprung.model.signals import FloatArray, MeasurementFault, Window
+from sprung.model.system import System
 from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.tracker import Alarm, TrackerState
 from sprung.service.engine import Engine
@@ -181,7 +182,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         state.time,
         per_sensor,
         engine.tracker.sensors(state),
-        _loads(engine, state),
+        body_loads(engine, state),
     )
 
 
@@ -201,11 +202,23 @@ def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
     )
 
 
-def _loads(engine: Engine, state: TrackerState) -> dict[str, tuple[float, float]]:
+def body_loads(engine: Engine, state: TrackerState) -> dict[str, tuple[float, float]]:
     """(kg, standard deviation) of what every loaded body carries, by body."""
     empty = {load.body: load.empty for load in engine.system.loads}
     known = engine.tracker.loads(state)
     return {b: (empty[b] * math.expm1(x), empty[b] * math.exp(x) * s) for b, (x, s) in known.items()}
+
+
+UNITS = {"load": "kg", "temperature": "degC", "speed": "m/s", "pressure": "Pa", "lateral_acceleration": "m/s^2"}
+UNITS |= {"yaw_rate": "rad/s"}  # of how a vehicle runs, by the last part of the name
+
+
+def running(system: System, window: Window, loads: Mapping[str, tuple[float, float]]) -> dict[str, float]:
+    """How a vehicle ran during a window: what was measured beside it, and what its bodies carry, kg."""
+    measured = [] if window.auxiliary is None else window.auxiliary.tolist()
+    found = {channel.name: value for channel, value in zip(system.auxiliary, measured, strict=False)}
+    found |= {f"{body}.load": value for body, (value, _) in loads.items()}
+    return {name: value for name, value in found.items() if math.isfinite(value)}
 
 
 def load_parameters(engine: Engine, view: VehicleView) -> list[dict[str, Any]]:

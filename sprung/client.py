@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel
 
 from sprung.service.api import job_models, models
+from sprung.service.api.circumstance_models import CircumstancesAnswer
 
 M = TypeVar("M", bound=BaseModel)
 PAGE = 500
@@ -65,6 +66,10 @@ class Client:
         """Parameters over time, as columns; `since`, `until`, `resolution` as in the API."""
         wanted = {"parameter": list(parameters), "format": "columns"} | query
         return self._get(f"/vehicles/{_quoted(vehicle)}/history", models.ColumnsAnswer, wanted)
+
+    def circumstances(self, vehicle: str, **query: Any) -> CircumstancesAnswer:
+        """How a vehicle ran: loads, temperature, speed; `since`, `until` as in the API."""
+        return self._get(f"/vehicles/{_quoted(vehicle)}/circumstances", CircumstancesAnswer, query)
 
     def export(self, vehicle: str, kind: str = "csv", **query: Any) -> bytes:
         """The history of every parameter as a file: csv, parquet or mcap."""

@@ -12,6 +12,7 @@ from sprung import __version__
 from sprung.service.api import (
     actions,
     admin,
+    circumstances,
     diagnose,
     docs,
     events,
@@ -80,6 +81,7 @@ def create_app(
         fleet,
         fleet_knowledge,
         history,
+        circumstances,
         signals,
         actions,
         vehicle_model,

@@ -24,6 +24,7 @@ ERRORS = {
     409: ("Conflict", "A request with this Idempotency-Key is being worked on, or was another one.", "it is at work"),
     405: ("Method Not Allowed", "The path takes other methods.", "Method Not Allowed"),
     429: ("Too Many Requests", "More than the limit of one client; `Retry-After` says when.", "too many requests"),
+    431: ("Request Header Fields Too Large", "More headers than any client needs.", "more than 100 headers"),
     507: ("Insufficient Storage", "No room is left for uploads or on the disk.", "no room for this upload"),
     422: ("Unprocessable Content", "The body or the query is wrong; the fields are named.", "parameter: is needed"),
     503: ("Service Unavailable", "A queue is full, or the service stops; `Retry-After` says when.", "try again"),
@@ -37,7 +38,9 @@ def _problem(status: int) -> dict[str, Any]:
     return {"description": text, "content": {MEDIA: {"schema": schema, "example": example}}}
 
 
-PROBLEMS: dict[int | str, dict[str, Any]] = {status: _problem(status) for status in (401, 403, 415, 421, 422, 429, 503)}
+PROBLEMS: dict[int | str, dict[str, Any]] = {
+    status: _problem(status) for status in (401, 403, 415, 421, 422, 429, 431, 503)
+}
 
 
 def describe(app: FastAPI) -> None:

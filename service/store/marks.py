@@ -9,6 +9,7 @@ from sqlalchemy import Connection, delete, insert, select, update
 
 from sprung.service.store.schema import (
     alarms,
+    circumstances,
     fleet_status,
     jobs,
     marks,
@@ -82,7 +83,18 @@ def remove(connection: Connection, vehicle: str) -> Removed:
     files = connection.execute(select(recordings.c.file).where(own, recordings.c.file.is_not(None))).scalars().all()
     pages = connection.execute(select(reports.c.id).where(reports.c.vehicle_id == vehicle)).scalars().all()
     own_models = (vehicle_model_uses, vehicle_models)
-    kept = (alarms, marks, fleet_status, window_reasons, tracker_states, rollups, pending, windows, reports)
+    kept = (
+        alarms,
+        circumstances,
+        marks,
+        fleet_status,
+        window_reasons,
+        tracker_states,
+        rollups,
+        pending,
+        windows,
+        reports,
+    )
     for table in (*own_models, *kept):
         connection.execute(delete(table).where(table.c.vehicle_id == vehicle))
     ids = select(recordings.c.id).where(own)

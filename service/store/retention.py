@@ -17,7 +17,7 @@ from typing import Any
 from sqlalchemy import Connection, delete, func, select, text, update
 
 from sprung.service.store import partitions
-from sprung.service.store.schema import jobs, recordings, rollups, windows
+from sprung.service.store.schema import circumstances, jobs, recordings, rollups, windows
 from sprung.service.store.work import UNFINISHED
 
 CLOCK_WAS_SET_NS = 1_577_836_800_000_000_000  # 2020: before it, a clock was not set, and says nothing about age
@@ -62,6 +62,14 @@ def forget(connection: Connection, limits: RetentionLimits, keep: Keep = lambda 
         rollups.c.bucket_ns < limits.minutes_before,
     )
     removed_minutes = connection.execute(minutes).rowcount
+    connection.execute(
+        delete(circumstances).where(
+            circumstances.c.resolution_s == 60,
+            circumstances.c.updated_ns < limits.minutes_before,
+            circumstances.c.updated_ns >= CLOCK_WAS_SET_NS,
+            circumstances.c.bucket_ns < limits.minutes_before,
+        )
+    )
     files = _old_uploads(connection, limits.uploads_before)
     if limits.upload_bytes is not None:
         files += _surplus_uploads(connection, limits.upload_bytes)

@@ -160,6 +160,16 @@ rollups = Table(  # posteriors over long ranges
     Column("updated_ns", BigInteger, nullable=False),
 )
 
+circumstances = Table(  # how vehicles ran, beside histories: means of minutes and hours
+    "circumstances",
+    metadata,
+    Column("vehicle_id", String(128), ForeignKey("vehicles.id"), primary_key=True),
+    Column("resolution_s", Integer, primary_key=True),
+    Column("bucket_ns", BigInteger, primary_key=True),
+    Column("means", JSON, nullable=False),  # {"car.load": [windows, kg], "temperature": [windows, degC], ...}
+    Column("updated_ns", BigInteger, nullable=False),
+)
+
 tracker_states = Table(
     "tracker_states",
     metadata,

@@ -20,7 +20,8 @@ from sprung.service.api.app import create_app
 from sprung.service.core import build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
-from tests.service_fakes import make_window
+from sprung.service.store.circumstances import Ran, add_circumstances
+from tests.service_fakes import START, make_window
 
 CHROMIUM = shutil.which("chromium")
 PAGES = {"fleet": "/", "vehicle": "/pages/vehicles/car-17", "work": "/pages/work", "signin": "/signin"}
@@ -45,6 +46,9 @@ def address(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterato
     core.pipeline.process("car-17", [make_window(system, i) for i in range(80)])
     core.pipeline.process("car-17", [make_window(system, 80 + i, 0.3) for i in range(60)])
     core.pipeline.process("car-18", [make_window(system, i) for i in range(80)])
+    ran = [Ran(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40}) for i in range(140)]
+    with core.store.write() as connection:
+        add_circumstances(connection, "car-17", ran, START)
     yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
     server.should_exit = True
     thread.join(20)
@@ -83,6 +87,19 @@ def test_pages_stay_at_home_fit_their_screen_and_say_no_error(
     if folder := os.environ.get("SPRUNG_SHOTS"):
         page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png")
     context.close()
+
+
+def test_load_and_temperature_are_drawn_below_the_history(address: str, browser: Any) -> None:
+    page = browser.new_page()
+    page.goto(address + PAGES["vehicle"])
+    page.wait_for_timeout(1500)
+    assert page.locator("#ran canvas").count() == 1
+    told = page.inner_text("#ran")
+    assert "car.load" in told and "temperature" in told
+    page.goto(address + "/pages/vehicles/car-18")
+    page.wait_for_timeout(1500)
+    assert not page.locator("#ran").is_visible()
+    page.close()
 
 
 def test_the_first_load_of_a_vehicle_is_light(address: str, browser: Any) -> None:

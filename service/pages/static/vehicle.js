@@ -48,6 +48,12 @@
     return [xs, ...out];
   }
 
+  // an alarm may be of one parameter, or of all of a kind, as *.damping and primary_*.stiffness
+  function covers(pattern, name) {
+    const [head, tail] = pattern.split("*");
+    return tail === undefined ? pattern === name : name.startsWith(head) && name.endsWith(tail);
+  }
+
   function lines(u, levels) {
     const { ctx } = u;
     ctx.save();
@@ -66,7 +72,7 @@
     }
     const name = at("parameter").value;
     const moments = [
-      ...data.alarms.filter((a) => a.parameter === name || a.parameter === null)
+      ...data.alarms.filter((a) => a.parameter === null || covers(a.parameter, name))
         .map((a) => ({ time: a.onset, text: a.parameter ? a.severity : a.kind, colour: style("--alarm") })),
       ...data.marks.map((m) => ({ time: m.time, text: m.kind, colour: style("--good") })),
     ];
@@ -137,6 +143,34 @@
     table(shown, answer);
   }
 
+  // below: what the bodies carried, on the left, and the temperature (or the speed), on the right
+  function drawRan(answer, first, last) {
+    const known = Object.keys(answer.series);
+    const names = known.filter((name) => name.endsWith(".load"));
+    const other = ["temperature", "speed"].find((name) => known.includes(name));
+    if (other) names.push(other);
+    at("ran").hidden = !names.length;
+    if (!names.length) return;
+    const middle = (t) => Math.min(Math.max(t / 1e3 + answer.resolution / 2, first), last);
+    const time = answer.time.map(middle);
+    const columns = withGaps(time, answer.resolution, names.map((name) => answer.series[name].value));
+    const sync = { key: "history" };
+    const units = [...new Set(names.map((name) => answer.series[name].unit))];
+    const written = (unit) => (unit === "degC" ? "°C" : unit);
+    const series = names.map((name, i) => {
+      const { unit } = answer.series[name];
+      const value = (_, v) => (v === null || v === undefined ? "–" : `${Number(v).toPrecision(4)} ${written(unit)}`);
+      const colour = style(COLOURS[i % COLOURS.length]);
+      return { label: name, scale: unit, stroke: colour, width: 2, value, dash: i ? [6, 3] : [], points: { show: time.length < 60 } };
+    });
+    const [across, up] = axes();
+    const beside = units.map((unit, i) => ({ ...up, scale: unit, side: i ? 1 : 3, label: written(unit), labelSize: 18, grid: { show: !i } }));
+    const clock = { label: "time", value: (_, v) => (v === null ? "–" : new Date(v * 1e3).toISOString().slice(0, 16).replace("T", " ")) };
+    const options = { width: at("plot").clientWidth, height: 170, series: [clock, ...series], axes: [across, ...beside], tzDate: utc };
+    const cursor = { sync, drag: { x: false, y: false } };
+    plots.push(new uPlot({ ...options, cursor, scales: { x: { min: first, max: last } } }, columns, at("ran")));
+  }
+
   function table(shown, answer) {
     const made = document.createElement("table");
     const head = made.createTHead().insertRow();
@@ -168,11 +202,17 @@
       query.set("since", Math.max(0, range[0]).toFixed(3));
       query.set("until", range[1].toFixed(3));
     }
-    const answer = await fetch(`${base}/history?${query}`);
+    const asked = new URLSearchParams([...query].filter(([key]) => key === "since" || key === "until"));
+    const [answer, ran] = await Promise.all([fetch(`${base}/history?${query}`), fetch(`${base}/circumstances?${asked}`)]);
     if (number !== request) return;
     if (answer.status === 422 && at("under")) { at("shown").textContent = "this model has no such parameter"; return; }
     if (!answer.ok) { at("shown").textContent = "the history could not be read"; return; }
-    draw(names, await answer.json());
+    const found = await answer.json();
+    draw(names, found);
+    if (ran.ok && found.time.length) {
+      const ends = range || [found.time[0] / 1e3, found.time.at(-1) / 1e3 + data.hop];
+      drawRan(await ran.json(), ...ends);
+    }
     document.querySelectorAll("a[data-element]").forEach((a) =>
       a.classList.toggle("current", at("parameter").value.startsWith(`${a.dataset.element}.`)));
   }
