@@ -17,7 +17,7 @@ import uvicorn
 
 from sprung.model.system import System
 from sprung.service.api.app import create_app
-from sprung.service.core import build_core
+from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import Ran, add_circumstances
@@ -30,7 +30,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chr
 
 
 @pytest.fixture(scope="module")
-def address(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterator[str]:
+def served(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterator[tuple[str, Core]]:
     """A running service with an alarmed vehicle and a good one."""
     from sprung.model.system import MANCHESTER_DBC
     from sprung.service.engine import make_tracker
@@ -49,9 +49,14 @@ def address(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterato
     ran = [Ran(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40}) for i in range(140)]
     with core.store.write() as connection:
         add_circumstances(connection, "car-17", ran, START)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", core
     server.should_exit = True
     thread.join(20)
+
+
+@pytest.fixture(scope="module")
+def address(served: tuple[str, Core]) -> str:
+    return served[0]
 
 
 @pytest.fixture(scope="module")
@@ -161,4 +166,48 @@ def test_an_alarm_is_acknowledged_by_keys(address: str, browser: Any) -> None:
         page.wait_for_timeout(1500)
     page.goto(address + PAGES["vehicle"])
     assert "acknowledged" in page.inner_text("main")
+    page.close()
+
+
+def kept(page: Any, name: str) -> None:
+    if folder := os.environ.get("SPRUNG_SHOTS"):
+        page.wait_for_timeout(900)
+        page.screenshot(path=Path(folder) / f"{name}.png", full_page=True)
+
+
+def test_a_morning_on_screen(served: tuple[str, Core], browser: Any, system: System) -> None:
+    """From learning to alarm to acknowledged to repaired and relearned, by hand."""
+    address, core = served
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+
+    def ride(first: int, count: int, level: float = 0.0) -> None:
+        core.pipeline.process("car-19", [make_window(system, first + i, level) for i in range(count)])
+        with core.store.write() as connection:
+            ran = [Ran(START + i * 10**9, {"car.load": 5e3 + 9.0 * i}) for i in range(first, first + count)]
+            add_circumstances(connection, "car-19", ran, START)
+        page.goto(f"{address}/pages/vehicles/car-19")
+        page.wait_for_timeout(900)
+
+    ride(0, 20)
+    assert "learning" in page.inner_text("main").lower()
+    kept(page, "morning-1-learning")
+    ride(20, 60)
+    ride(80, 60, 0.3)
+    assert "out of specification" in page.inner_text("h1")
+    kept(page, "morning-2-alarm")
+    page.get_by_role("button", name="Acknowledge").first.click()
+    page.wait_for_timeout(400)
+    page.locator("dialog[open] button.first").click()
+    page.wait_for_timeout(1500)
+    page.reload()
+    assert "acknowledged" in page.inner_text("main")
+    kept(page, "morning-3-acknowledged")
+    page.get_by_role("button", name="Mark maintenance").click()
+    page.fill("dialog[open] textarea", "dampers exchanged on track 4")
+    kept(page, "morning-4-maintenance")
+    page.locator("dialog[open] button.first").click()
+    page.wait_for_timeout(1500)
+    ride(140, 90, 0.3)
+    assert "dampers exchanged" in page.inner_text("main") and "out of specification" not in page.inner_text("h1")
+    kept(page, "morning-5-relearned")
     page.close()
