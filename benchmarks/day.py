@@ -78,13 +78,15 @@ def pool(window: Estimate, cargo: int) -> Pool:
     """cargo: how many of the deviations, the last ones, describe the load."""
     like = window.deviating
     assert like is not None
-    information, given = POOLED * 0.5 * (like.information + like.information.T), like.given / POOLED
+    information: FloatArray = POOLED * 0.5 * (like.information + like.information.T)
+    given: FloatArray = like.given / POOLED
     values, vectors = np.linalg.eigh(information)
-    spread = np.linalg.inv(information[-cargo:, -cargo:])
+    root = np.asarray(vectors * np.sqrt(values.clip(0)), dtype=np.float64)
+    error = np.asarray(np.linalg.cholesky(given), dtype=np.float64)
+    spread: FloatArray = np.linalg.inv(information[-cargo:, -cargo:])
     of_cargo = like.cross[:, -cargo:]
     return Pool(
-        window, like, information, vectors * np.sqrt(values.clip(0)), np.linalg.cholesky(given), given, spread,
-        given + of_cargo @ spread @ of_cargo.T,
+        window, like, information, root, error, given, spread, given + of_cargo @ spread @ of_cargo.T,
     )  # fmt: skip
 
 

@@ -58,7 +58,8 @@ class ElementValues:
             return forces / self.mass[:, :, None]
         root = self.mass.sqrt().unsqueeze(2)
         whole = torch.eye(self.mass.shape[1], dtype=self.mass.dtype, device=self.mass.device) + self.coupling
-        return torch.linalg.solve(whole, forces / root) / root
+        accelerations: Tensor = torch.linalg.solve(whole, forces / root) / root
+        return accelerations
 
 
 @dataclass(frozen=True, slots=True)

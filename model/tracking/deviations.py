@@ -123,9 +123,9 @@ def grown(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tup
     wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
     longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved")}
     zeros = np.zeros(H + groups)
-    evidence = {"slope": zeros, "curvature": zeros, "since": zeros.astype(np.int64)}
+    without_evidence = replace(record, slope=zeros, curvature=zeros, since=zeros.astype(np.int64))
     return (
-        replace(record, **wider, **longer, **evidence),
+        replace(without_evidence, **wider, **longer),
         Belief(np.pad(belief.mean, (0, more)), covariance, H),
     )
 

@@ -160,7 +160,8 @@ def _nonnegative(projector: Projector, columns: FloatArray, forms: FloatArray) -
 
     def of(matrix: FloatArray) -> FloatArray:
         blocks = matrix.reshape(2, count, 2, count)
-        return np.einsum("mp,apbq,mq->mab", forms, blocks, forms)
+        sums: FloatArray = np.einsum("mp,apbq,mq->mab", forms, blocks, forms)
+        return sums
 
     gram, size = of(left), of(whole)
     b = np.einsum("mp,ap->ma", forms, product.reshape(2, count))
