@@ -83,7 +83,7 @@ def pool(window: Estimate, cargo: int) -> Pool:
     values, vectors = np.linalg.eigh(information)
     root = np.asarray(vectors * np.sqrt(values.clip(0)), dtype=np.float64)
     error = np.asarray(np.linalg.cholesky(given), dtype=np.float64)
-    spread: FloatArray = np.linalg.inv(information[-cargo:, -cargo:])
+    spread = np.asarray(np.linalg.inv(information[-cargo:, -cargo:]), dtype=np.float64)
     of_cargo = like.cross[:, -cargo:]
     return Pool(
         window, like, information, root, error, given, spread, given + of_cargo @ spread @ of_cargo.T,
