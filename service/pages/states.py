@@ -64,13 +64,15 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
         level = "alarm" if any(a.severity == "alarm" for a in changed) else "warning"
         size = "" if worst.change is None else f" by {100 * worst.change:+.1f} %"
         together = "*" in (worst.parameter or "")
-        text = (
-            "All of them together: weather, load, speed or a scale more often than wear. Compare with other vehicles. "
-            "Acknowledge the alarm so that others see that somebody looks into it."
+        waiting = [a for a in changed if a.acknowledged is None]
+        seen = f"Acknowledged by {worst.acknowledged_by or 'somebody'}."
+        ask = seen if not waiting else "Acknowledge the alarm so that others see that somebody looks into it."
+        what = (
+            "All of them together: weather, load, speed or a scale more often than wear. Compare with other vehicles."
             if together
-            else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew. "
-            "Acknowledge the alarm so that others see that it is being worked on."
+            else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
+        text = f"{what} {ask}"
         found.append(Hint(level, f"{spoken(worst.parameter or '')} has changed{size}{many}", text))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."

@@ -200,7 +200,7 @@ def test_a_morning_on_screen(served: tuple[str, Core], browser: Any, system: Sys
     page.locator("dialog[open] button.first").click()
     page.wait_for_timeout(1500)
     page.reload()
-    assert "acknowledged" in page.inner_text("main")
+    assert "Acknowledged by local" in page.inner_text("#summary")
     kept(page, "morning-3-acknowledged")
     page.get_by_role("button", name="Mark maintenance").click()
     page.fill("dialog[open] textarea", "dampers exchanged on track 4")
