@@ -97,11 +97,11 @@ def _from_mck(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
         raise ExchangeError(f"{path}: M {M.shape}, C {C.shape} and K {K.shape} are not of the same size")
     if M.shape == (n, n) and np.abs(M - np.diag(mass)).max() > _SAME * np.abs(M).max():
         raise ExchangeError(f"{path}: M is not diagonal: its coordinates are not those of single bodies")
-    Kb, Cb = given.get("Kb"), given.get("Cb")
-    if Kb is None and Cb is None:
+    if "Kb" in given or "Cb" in given:
+        Kb = given["Kb"] if "Kb" in given else np.zeros_like(given["Cb"])
+        Cb = given["Cb"] if "Cb" in given else np.zeros_like(given["Kb"])
+    else:
         Kb, Cb = K.sum(axis=1, keepdims=True), C.sum(axis=1, keepdims=True)
-    Kb = np.zeros_like(Cb) if Kb is None else Kb
-    Cb = np.zeros_like(Kb) if Cb is None else Cb
     if Kb.shape != Cb.shape or len(Kb) != n:
         raise ExchangeError(f"{path}: Kb {Kb.shape} and Cb {Cb.shape}: a row for each of {n} coordinates is needed")
     rows = given.get("S", np.eye(n))
