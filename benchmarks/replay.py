@@ -80,7 +80,8 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
     from sprung.service import feed, reading
     from sprung.service.compute import Compute
     from sprung.service.engine import load_engine
-    from sprung.service.pipeline import Batch, Pipeline
+    from sprung.service.pipeline import Pipeline
+    from sprung.service.processed import Batch
     from sprung.service.settings import Settings
     from sprung.service.store import open_store
 

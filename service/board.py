@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from sprung.service.engine import Engine
-from sprung.service.pipeline import Batch
+from sprung.service.processed import Batch
 from sprung.service.store.status import HEALTHS, without_numbers
 from sprung.service.times import now_ns
 from sprung.service.views import VehicleView, vehicle_view

@@ -31,7 +31,8 @@ from sprung.service.metrics import Metrics
 from sprung.service.notify.notices import Notices
 from sprung.service.oidc import Provider, provider_of
 from sprung.service.operations import Operations
-from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch
 from sprung.service.recordings import RecordingJobs
 from sprung.service.ring import Rings
 from sprung.service.settings import Settings

@@ -18,7 +18,8 @@ from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.engines import ServedModel
 from sprung.service.errors import Busy, UserError
 from sprung.service.jobs import Jobs, Progress
-from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch
 from sprung.service.recordings import stored_file
 from sprung.service.ring import Excerpt, Rings
 from sprung.service.settings import Settings

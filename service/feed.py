@@ -16,7 +16,8 @@ from sprung.model import comfort
 from sprung.model.signals import Tally
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.compute import Priority
-from sprung.service.pipeline import Batch, Identified, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch, Identified
 from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
 from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.worker import ProcessLimits

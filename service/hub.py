@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from sprung.service.errors import Busy
-from sprung.service.pipeline import Batch
+from sprung.service.processed import Batch
 
 MOST_LISTENERS = 200
 MOST_WAITING = 1000  # vehicles with news that a slow listener has not fetched; older ones are forgotten

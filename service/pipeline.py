@@ -6,7 +6,7 @@ import threading
 import time
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from sqlalchemy import Connection
@@ -17,6 +17,7 @@ from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
 from sprung.service.following import Followed
+from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, outcome_of
 from sprung.service.store import Store, fleet, history, status
 from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.partitions import prepare
@@ -29,73 +30,6 @@ FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after whic
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
 
 OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
-
-
-@dataclass(slots=True)
-class Batch:
-    """What became of a batch of windows."""
-
-    vehicle: str
-    records: list[WindowRecord]  # one per window, in order of time
-    fresh: list[Window]  # those that were not stored before
-    late: int  # fresh, but older than what the tracker had seen: stored, not tracked
-    state: TrackerState  # after the batch
-    served: ServedModel  # with which the vehicle is followed
-    seconds: dict[str, float] = field(default_factory=dict)  # by stage
-
-
-@dataclass(frozen=True, slots=True)
-class Identified:
-    """Windows on their way: identified, not yet tracked and stored."""
-
-    vehicle: str
-    served: ServedModel  # with which they were identified
-    windows: Sequence[Window]
-    known: dict[int, WindowRecord]  # those that are stored already, by start
-    fresh: list[Window]
-    estimates: list[Estimate | None]  # one per fresh window, None where dropped
-    seconds: dict[str, float]  # by stage
-
-
-class ModelChanged(RuntimeError):
-    """While windows were identified the vehicle was given another model."""
-
-
-NO_EXCITATION = "no excitation: standstill, or too slow to tell anything"
-
-
-def _outcome(window: Window, estimate: Estimate | None) -> tuple[str, str | None]:
-    """A window's outcome with the reason for it, once it is known what it tells."""
-    if estimate is not None and not estimate.informative:
-        return "uninformative", NO_EXCITATION
-    return window.outcome, window.reason
-
-
-@dataclass(frozen=True, slots=True)
-class HeldVehicle:
-    """A vehicle's tracker in memory; trusted only while the stored revision is the same."""
-
-    served: ServedModel
-    revision: int
-    last_window_ns: int  # start of the newest window that it has seen; -1 before the first
-    state: TrackerState
-
-
-@dataclass(frozen=True, slots=True)
-class _Newcomer:
-    """What a new vehicle was told last."""
-
-    vehicles: int  # there were then
-    at: int  # ns
-    state: TrackerState
-
-
-@dataclass(frozen=True, slots=True)
-class Folded:
-    """Windows that are tracked and stored in a transaction which may not be committed yet."""
-
-    batch: Batch
-    after: HeldVehicle
 
 
 class Pipeline:
@@ -128,7 +62,7 @@ class Pipeline:
         self._on_alarms = on_alarms
         self._shown = staging is None
         self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
-        self._told: _Newcomer | None = None
+        self._told: Newcomer | None = None
         self._lock = threading.Lock()
         with store.write() as connection:
             self.model_id = fleet.ensure_model(
@@ -306,7 +240,7 @@ class Pipeline:
             records.append(
                 WindowRecord(
                     window.start,
-                    *_outcome(window, estimate),
+                    *outcome_of(window, estimate),
                     window.repaired_samples,
                     fed,
                     None if estimate is None else Solved.of(estimate),
@@ -343,7 +277,7 @@ class Pipeline:
         if held is None or count >= FRESH_GROWTH * held.vehicles or not 0 <= now - held.at < FRESH_NS:
             rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
             state = self.engine.tracker.newcomer([self.engine.load_state(row.state) for row in rows])
-            self._told = held = _Newcomer(count, now, state)
+            self._told = held = Newcomer(count, now, state)
         return held.state
 
     def relearn(self, vehicle: str, names: Sequence[str] | None, connection: Connection) -> Batch:

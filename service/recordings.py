@@ -10,7 +10,8 @@ from sprung.replay import UnreadableRecording
 from sprung.service.errors import UserError
 from sprung.service.feed import Fed, OnTally, feed_file
 from sprung.service.jobs import Progress
-from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from sprung.service.feed import OnBatch
 from sprung.service.pages.render import percent, quantity
-from sprung.service.pipeline import Batch
+from sprung.service.processed import Batch
 from sprung.service.views import VehicleView
 
 PLAIN_SECONDS = 2.0  # between lines where there is no terminal

@@ -18,7 +18,8 @@ from sprung.service.cli.stdin import spooled
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.feed import Fed, comfort_dict, feed_file
-from sprung.service.pipeline import Batch, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work

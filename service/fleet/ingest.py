@@ -18,7 +18,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
-from sprung.service.pipeline import Folded, Pipeline
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Folded
 from sprung.service.store import pending, vehicle_models
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
