@@ -124,6 +124,7 @@ class AcceptanceRules:
     minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)
     minor_elsewhere: float = rule(0.002, "of an earlier finding elsewhere; chosen", 0.0005, 0.01)
     minor_followed: float = rule(0.01, "of logarithmic gains; chosen: laws are simulated no better", 0.003, 0.03)
+    idle: float = rule(0.05, "of what a finding explained at first, beside later ones; chosen", 0.01, 0.2)
     better_than_promised: float = rule(4.0, "times that a fit may exceed its first step's promise; chosen", 2.0, 8.0)
     most_left: float = rule(0.5, "of the unmeasured forces that earlier findings left; chosen", 0.3, 0.8)
     astray: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)

@@ -21,6 +21,7 @@ from sprung.model.diagnosis.investigation.course import (
 )
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of
+from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
@@ -57,6 +58,7 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
         state = _next_finding(state, number, tell)
         if len(state.found) == count:
             break
+        state = without_idle(state)
     return state
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
-from diagnosis_cases import SYSTEM, quarter_car, simulate
+from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
+from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import parse_system
 from sprung.service.improved import improved_text
@@ -45,3 +47,15 @@ def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop():
 def test_a_law_of_the_catalogue_stays_one():
     record = simulate(lambda d, v: 2e4 * v * abs(v), seconds=15.0, seed=4)
     assert {f.effect for f in diagnose(quarter_car(), record, Options()).findings} <= {"quadratic_damping"}
+
+
+@pytest.mark.slow
+def test_what_a_later_formula_explains_is_no_finding_of_its_own():
+    """A hidden state that swings is first taken for a hanging mass; beside its formula that is idle, and goes."""
+    law = OpenLaw("", lambda d, v, z: -65.0 * (z / 2.5e-3) ** 3, 0.12)
+    values = {"stiffness": np.array([2.4e6, 4.3e5]), "damping": np.array([1.0e4, 2.0e4])}
+    clean, _ = simulated(law, values, 30.0, 7, 1.0)
+    noise = np.array([1e-5, 5e-4, 4e-3, 4e-3, 3e-2, 3e-2])
+    record = MadeRecord(clean + noise * np.random.default_rng(8).standard_normal(clean.shape))
+    report = diagnose(quarter_car(), record, Options())
+    assert [(f.location, f.effect, f.formula) for f in report.findings] == [("secondary", "formula", "a * z**3")]

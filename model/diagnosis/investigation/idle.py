@@ -1,0 +1,45 @@
+"""Findings that a later one has made idle: what they explained at first, it explains too."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import is_waveform
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.evidence import profile_gain
+
+_STEPS = 8  # of a fit without one finding
+
+
+def without_idle(state: Investigation) -> Investigation:
+    """An investigation without earlier findings that explain next to nothing beside the last one."""
+    rules = state.options.rules
+    if state.problem.process_noise:
+        return state
+    for index, found in enumerate(state.found[:-1]):
+        fit = _without(state, state.given + index)
+        if fit is None:
+            continue
+        sensors = len(state.problem.sensors)
+        gain = profile_gain(fit.residual, state.fit.residual, sensors, rules.evidence.quiet, rules.evidence)
+        if gain < rules.acceptance.idle * found.trial.gain:
+            kept = (*state.found[:index], *state.found[index + 1 :])
+            last = screen(state.problem, fit, state.options.catalogue, state.options.project)
+            return without_idle(replace(state, fit=fit, found=kept, last=last))
+    return state
+
+
+def _without(state: Investigation, index: int) -> Fit | None:
+    """The model without one of its terms, fitted again with the same weights; None where that diverges."""
+    point, forces = state.fit.point, list(state.fit.point.warm_start)
+    near = [forces.pop(0) if is_waveform(term) and forces else None for term in point.terms]
+    terms = (*point.terms[:index], *point.terms[index + 1 :])
+    start = tuple(force for i, force in enumerate(near) if i != index and force is not None)
+    bare = Point(point.theta, terms, np.zeros(0), start)
+    bare = replace(bare, state=np.zeros(state.problem.forward(bare).plant.structure.states))
+    return try_optimise(state.problem, bare, _STEPS, state.fit.whitener)
