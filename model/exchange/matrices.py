@@ -248,8 +248,12 @@ def _sensor(kind: str, i: int, j: int, body: list[str], elements: Mapping[str, A
 def _same_again(path: Path, found: SpringNetwork, system: System) -> None:
     n, scale = len(found.mass), found.mass[:, None]
     A, B, *_ = system.mechanics.matrices()
-    pairs = ((-A[n:, :n] * scale, found.K), (-A[n:, n:] * scale, found.C))
-    pairs += ((B[n:, 0::2] * scale, found.Kb), (B[n:, 1::2] * scale, found.Cb))
+    pairs = (
+        (-A[n:, :n] * scale, found.K),
+        (-A[n:, n:] * scale, found.C),
+        (B[n:, 0::2] * scale, found.Kb),
+        (B[n:, 1::2] * scale, found.Cb),
+    )
     if any(
         np.abs(ours - theirs).max(initial=0.0) > _SAME * (np.abs(theirs).max(initial=0.0) or 1.0)
         for ours, theirs in pairs
