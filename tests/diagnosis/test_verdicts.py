@@ -147,11 +147,13 @@ def test_valve_that_takes_nearly_all_of_the_damping_is_no_friction():
         assert abs(parameter.value - truth) < max(4 * parameter.std, 0.03 * truth)
 
 
-def test_force_without_a_name_is_mapped_and_widens_its_spring():
+def test_a_force_that_no_law_explains_is_told_as_a_formula_with_its_values():
     report = _diagnose(simulate(lambda d, v: 120 * np.sin(d / 6e-4), seed=29))
     assert report.verdict == "unknown_physics"
-    assert [f.location for f in report.findings] == ["secondary"]
-    assert report.explained is not None and report.explained > 0.9
-    assert {"finding.0.map_force", "finding.0.map_std"} <= set(report.evidence)
+    assert [(f.location, f.effect, f.formula) for f in report.findings] == [("secondary", "formula", "a * sin(d / L)")]
+    assert report.explained is not None and report.explained > 0.99
+    for parameter, truth in zip(report.findings[0].parameters, (120.0, 6e-4), strict=True):
+        assert abs(parameter.value - truth) < 3 * parameter.std
+    assert {"finding.0.curve_mean", "finding.0.curve_law"} <= set(report.evidence)
     spring = next(p for p in report.augmented if p.name == "secondary.stiffness")
     assert abs(spring.value - STIFFNESS["secondary"]) < 3 * spring.std

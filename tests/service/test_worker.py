@@ -110,7 +110,8 @@ def test_a_slow_start_is_no_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def ended_by(end: Callable[[int], None], note: Path, program: str = service_tasks.__file__) -> int:
     """The worker of a parent that is ended while it works."""
-    parent = subprocess.Popen([sys.executable, program, str(note)], env=os.environ.copy())
+    root = str(Path(__file__).parents[2])  # a program finds the packages of its own folder alone
+    parent = subprocess.Popen([sys.executable, program, str(note)], env=os.environ | {"PYTHONPATH": root})
     deadline = time.monotonic() + 60
     while not (note.exists() and note.read_text()):
         assert time.monotonic() < deadline and parent.poll() is None
