@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from sprung.model.diagnosis.investigation.verdict import UNLISTED
+
 Truth = Mapping[str, Any]
 Verdict = Mapping[str, Any]  # the JSON of a report
 
@@ -55,9 +57,10 @@ def explained(report: Verdict) -> float | None:
 
 
 def _matches(said: Mapping[str, Any], true: Mapping[str, Any], named_laws: Iterable[str]) -> bool:
-    """The right name: the law's own, or `unknown` for a law that no catalogue holds."""
-    wanted = true["effect"] if true["effect"] in set(named_laws) else "unknown"
-    return bool(said["effect"] == wanted)
+    """The right name: the law's own; for a law that no catalogue holds `unknown`, or a formula."""
+    if true["effect"] in set(named_laws):
+        return bool(said["effect"] == true["effect"])
+    return said["effect"] in UNLISTED
 
 
 def _z(said: Mapping[str, Any], true: Mapping[str, Any]) -> list[float]:

@@ -256,6 +256,12 @@ def fit_dict(nrmse: float, per_sensor: Mapping[str, float]) -> dict[str, Any]:
     return {"nrmse": finite(nrmse), "per_sensor": dict(per_sensor)}
 
 
+def suspected(alarm: Alarm | AlarmRow) -> tuple[tuple[str, ...], str]:
+    """Channels that an alarm of kind sensor names, and the fault: "car_1l|car_1r.delay" is one of both together."""
+    channels, _, fault = (alarm.parameter or "").rpartition(".")
+    return tuple(channels.split("|")), fault
+
+
 def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
     """JSON of one alarm."""
     found: dict[str, Any] = {

@@ -31,7 +31,7 @@ def hints(
     sensors: Mapping[str, Mark],
 ) -> list[Hint]:
     """The most urgent first; empty for a vehicle that is well."""
-    found = [*_alarms(row, active), *_sensors(sensors)]
+    found = [*_alarms(row, view, active), *_sensors(sensors)]
     whole = row.windows["used"] + row.windows["repaired"]
     every = whole + row.windows["dropped"] + row.windows["uninformative"]
     if silent:
@@ -55,7 +55,7 @@ def hints(
     return found + _parameters(row, view, whole)
 
 
-def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
+def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> list[Hint]:
     found = []
     changed = [a for a in active if a.kind == "change" and a.parameter]
     if changed:
@@ -72,7 +72,9 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
             if together
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
-        text = f"{what} {ask}"
+        rivals = next((a.alternatives for a in view.active if a.parameter == worst.parameter), ())
+        unclear = f"The measurements do not tell it from {' or '.join(rivals)}. " if rivals else ""
+        text = f"{unclear}{what} {ask}"
         found.append(Hint(level, f"{spoken(worst.parameter or '')} has changed{size}{many}", text))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."

@@ -23,7 +23,7 @@ from sprung.service.pages.routes import HEALTH
 from sprung.service.pages.states import hints
 from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
-from sprung.service.views import ParameterView, VehicleView, alarm_dict
+from sprung.service.views import ParameterView, VehicleView, alarm_dict, suspected
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50  # alarms, marks, reports
@@ -81,7 +81,7 @@ def parameter_mark(p: ParameterView) -> Mark:
 
 def sensor_marks(system: System, view: VehicleView) -> dict[str, Mark]:
     """How sensors are shown: suspect where an alarm says so, absent where the newest window had no samples."""
-    suspects = {getattr(a, "channel", None) or a.parameter for a in view.active if a.kind == "sensor"}
+    suspects = {channel for alarm in view.active if alarm.kind == "sensor" for channel in suspected(alarm)[0]}
     found = {}
     for name in system.sensors:
         if name in suspects:
@@ -90,7 +90,7 @@ def sensor_marks(system: System, view: VehicleView) -> dict[str, Mark]:
             found[name] = Mark("ok")
         else:
             found[name] = Mark("absent" if view.per_sensor else "learning")
-    return found
+    return found | {name: Mark("suspect") for name in sorted(suspects - found.keys())}  # measured inputs
 
 
 def page_data(

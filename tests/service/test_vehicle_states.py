@@ -1,0 +1,51 @@
+"""What a vehicle's page says of its sensors, and of alarms whose cause the evidence leaves open."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from sprung.model.system import load_system
+from sprung.model.tracking.state import Alarm
+from sprung.service.pages.drawing import Mark
+from sprung.service.pages.states import hints
+from sprung.service.pages.vehicle import sensor_marks
+from sprung.service.store.fleet import AlarmRow
+from sprung.service.store.status import FleetRow
+from sprung.service.views import VehicleView, suspected
+
+SYSTEM = load_system()
+GAIN = Alarm("sensor", "bogie1_1l.gain", 0, 1, "warning", 0.05, 0.003)
+LATE = Alarm("sensor", "car_1l|car_1r.delay", 0, 1, "warning", 0.002, 0.0001)
+INPUT = Alarm("sensor", "wheel_11l.displacement.gain", 0, 1, "warning", 0.05, 0.003)
+DAMPER = Alarm("change", "primary_11l.damping", 0, 1, "warning", -0.1, 0.02, alternatives=("bogie1_1l.gain",))
+WINDOWS = dict.fromkeys(("used", "repaired", "dropped", "uninformative", "unfitting"), 0)
+ROW = FleetRow(
+    "v", None, None, "check_function", 1, 0, 1, 1, 0, None, None, None, None, 1.0, "", 1, 1, WINDOWS | {"used": 9}
+)  # fmt: skip
+VIEW = VehicleView("v", "m", "check_function", (), (GAIN, LATE, INPUT), None, 1, dict.fromkeys(SYSTEM.sensors, 0.1))
+
+
+def test_channels_and_fault_of_a_sensor_alarm() -> None:
+    assert suspected(GAIN) == (("bogie1_1l",), "gain")
+    assert suspected(LATE) == (("car_1l", "car_1r"), "delay")
+    assert suspected(INPUT) == (("wheel_11l.displacement",), "gain")
+
+
+def test_every_channel_that_an_alarm_names_is_suspect_and_no_other() -> None:
+    marks = sensor_marks(SYSTEM, VIEW)
+    suspects = {name for name, mark in marks.items() if mark.state == "suspect"}
+    assert suspects == {"bogie1_1l", "car_1l", "car_1r", "wheel_11l.displacement"}
+    assert set(SYSTEM.sensors) <= marks.keys() and marks["car_2l"] == Mark("ok")
+
+
+def test_a_closed_alarm_accuses_nobody() -> None:
+    closed = replace(VIEW, alarms=(replace(GAIN, closed=2),))
+    assert all(mark.state == "ok" for mark in sensor_marks(SYSTEM, closed).values())
+
+
+def test_what_an_alarm_cannot_be_told_from_is_said() -> None:
+    view = replace(VIEW, alarms=(DAMPER,))
+    active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None)]
+    said = hints(ROW, view, active, [], False, sensor_marks(SYSTEM, view))
+    assert "do not tell it from bogie1_1l.gain" in said[0].text
+    assert not any("Sensor suspect" in hint.title for hint in said)
