@@ -50,7 +50,8 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """One dict per row: task, method, figures, the paper's values, settings.
 
-    task: one of `TASKS`, all by default; method: one of the task's, or "core": the paper's and the untrained ones;
+    task: one of `TASKS`, all by default; method: one of the task's or several between commas, "core": the paper's and
+    the untrained ones;
     seeds: how many, from `seed` on, each with data, frames and networks of its own;
     out: folder of checkpoints and pictures; minutes: stop after this long, to be resumed by the same command.
     """
@@ -102,7 +103,7 @@ def _check(task: str | None, method: str | None, budget: str, device: str) -> No
         raise UserError(f"bench paper: no budget {budget!r}; known are {', '.join(get_args(Budget))}")
     if method is not None:
         known = TASKS[task][1] if task else tuple({m for _, methods in TASKS.values() for m in methods})
-        if method not in (*known, paper_settings.CORE):
-            raise UserError(f"bench paper: no method {method!r}; known are {', '.join(known) or 'none'}")
+        if wrong := [name for name in method.split(",") if name not in (*known, paper_settings.CORE)]:
+            raise UserError(f"bench paper: no method {wrong[0]!r}; known are {', '.join(known) or 'none'}")
     if device != "cpu" and not (device.startswith("cuda") and torch.cuda.is_available()):
         raise UserError(f"bench paper: no device {device!r} here; leave --device out for the CPU")

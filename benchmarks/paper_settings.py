@@ -35,7 +35,7 @@ class PaperSettings:
     """One task, one seed."""
 
     task: str
-    method: str | None  # None: every method
+    method: str | None  # one, several between commas, or "core"; None: every method
     budget: Budget
     seed: int
     out: Path
@@ -59,7 +59,8 @@ class PaperSettings:
         return TimeLimit() if self.until is None else TimeLimit(self.until)
 
     def wants(self, method: str) -> bool:
-        """Whether a row was asked for: all of them, the paper's own and the untrained ones, or one."""
-        if self.method == CORE:
-            return method not in EXTRA
-        return self.method in (None, method)
+        """Whether a row was asked for: all of them, the paper's own and the untrained ones, or those that are named."""
+        if self.method is None:
+            return True
+        named = self.method.split(",")
+        return method in named or (CORE in named and method not in EXTRA)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from sprung.benchmarks import paper, paper_report, paper_settings
 from sprung.model.alps import mass_spring_damper, metrics, output_error, pendulum, two_body
 from sprung.model.alps.fit import Split
 from sprung.model.alps.task import WINDOW, Task
+from sprung.service.errors import UserError
 
 EMBEDDING = 8
 
@@ -92,6 +94,16 @@ def test_rows_of_other_code_are_refused(tmp_path: Path) -> None:
     (folder / "b.json").write_text(json.dumps(row | {"method": "cdm", "sources": "older"}))
     with pytest.raises(ValueError, match="pendulum cdm"):
         paper_report.read_rows(tmp_path)
+
+
+def test_several_methods_may_be_asked_for_at_once(tmp_path: Path) -> None:
+    asked = partial(paper_settings.PaperSettings, "pendulum", budget="quick", seed=0, out=tmp_path, device="cpu")
+    two = asked(method="cdm,alps", until=None)
+    assert two.wants("cdm") and two.wants("alps") and not two.wants("zero")
+    core = asked(method="core,hamiltonian", until=None)
+    assert core.wants("zero") and core.wants("hamiltonian") and not core.wants("alps_plain")
+    with pytest.raises(UserError, match="no method 'clever'"):
+        next(paper.run("pendulum", method="alps,clever", out=tmp_path))
 
 
 def test_rows_say_what_made_them() -> None:
