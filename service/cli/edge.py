@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from sprung.service.errors import UserError
 from sprung.service.feed import vehicle_of
 from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
-from sprung.service.fleet.sending import HttpLink, Sending
+from sprung.service.fleet.sending import HttpLink, Link, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool
 from sprung.service.live import LiveFeed
 from sprung.service.logs import set_up
@@ -32,12 +33,32 @@ log = logging.getLogger("sprung.edge")
 LAST_SECONDS = 20.0  # to send what is left when it stops
 
 
+@dataclass(frozen=True, slots=True)
+class Destination:
+    """Where what is made on board goes."""
+
+    server: str  # http(s)://, or nats:// for estimates only
+    recordings: str | None  # raw samples; None: to the server, too
+    token: str | None
+
+    @property
+    def broker(self) -> bool:
+        """Whether estimates go to a broker."""
+        return self.server.startswith("nats://")
+
+    def link(self, vehicle: str) -> Link:
+        """The way there.  Raises UserError for an address that is none."""
+        link: Link = NatsLink(self.server, vehicle) if self.broker else HttpLink(self.server, self.token, vehicle)
+        if self.recordings is None:
+            return link
+        return LinksByKind(link, HttpLink(self.recordings, self.token, vehicle, "--recordings"))
+
+
 def run(
     options: dict[str, Any],
     files: list[Path],
     bus: str | None,
-    server: str,
-    token: str | None,
+    destination: Destination,
     vehicle: str | None,
     spool_file: Path | None,
     spool_bytes: int,
@@ -50,6 +71,8 @@ def run(
         raise UserError("give recordings or --can, one of both")
     for path in files:
         readable(path)
+    if destination.broker and destination.recordings is None:
+        rates = replace(rates, raw_seconds=0.0)  # a broker takes estimates only
     settings = settings_with(options)
     set_up(settings.log_format, settings.log_level)
     engine = load_engine(settings)
@@ -58,9 +81,7 @@ def run(
     with ExitStack() as stack:
         spool = Spool(spool_file or settings.data_dir / "edge.db", spool_bytes)
         stack.callback(spool.close)
-        link: HttpLink | NatsLink = (
-            NatsLink(server, name) if server.startswith("nats://") else HttpLink(server, token, name)
-        )
+        link = destination.link(name)
         stack.callback(link.close)
         sending = Sending(spool, link)
         onboard = Onboard(engine, name, spool, rates)
@@ -77,6 +98,7 @@ def run(
         "windows": onboard.counts.windows,
         "alarms": onboard.counts.alarms,
         "messages": onboard.counts.messages,
+        "recordings": onboard.counts.raw_files,
         "sent": sending.sent,
         "refused": sending.refused,
         "given_up": onboard.counts.made_room,
@@ -97,8 +119,9 @@ def spool_left(sending: Sending, empty: bool) -> str:
 
 def _line(told: dict[str, Any]) -> str:
     left = f"; some wait in the spool: {told['waiting']}" if told["waiting"] else ""
+    made = told["messages"] + told["recordings"]
     return (
-        f"{told['vehicle']}: {told['windows']} windows, {told['sent']} of {told['messages']} messages sent, "
+        f"{told['vehicle']}: {told['windows']} windows, {told['sent']} of {made} messages sent, "
         f"{told['estimate_bytes_per_second'] or 0:.0f} B/s of estimates, "
         f"{told['raw_bytes'] / 1e3:.0f} kB of raw samples, {100 * (told['cpu_share'] or 0):.1f} % of a core{left}"
     )

@@ -25,6 +25,10 @@ def edge(
         list[Path] | None, typer.Argument(help="Recordings, instead of a bus.", metavar="[FILE...]")
     ] = None,
     can: Annotated[str | None, typer.Option("--can", metavar="INTERFACE:CHANNEL", help="The bus to follow.")] = None,
+    recordings: Annotated[
+        str | None,
+        typer.Option("--recordings", metavar="URL", help="Where raw samples go, if not there: the pages' address."),
+    ] = None,
     token: Annotated[
         str | None, typer.Option("--token", envvar="SPRUNG_TOKEN", help="With scope ingest; better in SPRUNG_TOKEN.")
     ] = None,
@@ -56,15 +60,18 @@ def edge(
 ) -> int:
     """On board: identify, send estimates, keep what cannot be sent.
 
-    Estimates with covariance go to a service's POST /ingest/estimates, raw samples around alarms to POST /recordings.
+    Estimates with covariance go to a service's POST /ingest/estimates, raw samples around alarms to POST /recordings,
+    which Ray's ingest and a broker do not take: there, --recordings names the server of the pages, and without it no
+    raw samples are kept for a broker.
     """
     one_thread_each()
-    from sprung.service.cli.edge import run
+    from sprung.service.cli.edge import Destination, run
     from sprung.service.fleet.onboard import OnboardSettings
 
     rates = OnboardSettings(message_seconds=message_seconds, weigh_seconds=weigh_seconds, raw_seconds=raw_seconds)
     options: dict[str, Any] = {"system": system, "dbc": dbc, "weights": weights}
-    return run(options, files or [], can, server, token, vehicle, spool, spool_bytes, speed, rates, json_lines)
+    destination = Destination(server, recordings, token)
+    return run(options, files or [], can, destination, vehicle, spool, spool_bytes, speed, rates, json_lines)
 
 
 @fleet.command("backfill")

@@ -35,17 +35,20 @@ def run(vehicles: int, port: int) -> int:
         stack.callback(_end, started)
 
         def start(*arguments: str) -> None:
-            started.append(subprocess.Popen([sys.executable, "-m", "sprung", *arguments], env=environment))
+            command = [sys.executable, "-m", "sprung", *arguments]
+            # out of this terminal's reach: Ctrl-C ends them once, in order, and not twice and all at once
+            started.append(subprocess.Popen(command, env=environment, start_new_session=True))
 
         start("serve", "--port", str(port))
-        server = f"http://127.0.0.1:{port}"
+        pages = server = f"http://127.0.0.1:{port}"
         if not reason and ray_installed():
             start("fleet", "serve", "--port", str(port + 100), "--workers", "2", "--cores", "0.5")
             server = f"http://127.0.0.1:{port + 100}"
         for number in range(vehicles):
             name = f"demo-{number + 1:04d}"
             where = f"{folder}/{name}.db"
-            start("edge", str(RECORDING), "--vehicle", name, "--server", server, "--speed", SPEED, "--spool", where)
+            ways = ("--server", server, "--recordings", pages)
+            start("edge", str(RECORDING), "--vehicle", name, *ways, "--speed", SPEED, "--spool", where)
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
         try:
             while started[0].poll() is None:

@@ -214,11 +214,14 @@ def start(
 
 
 def stop() -> None:
-    """Leave the cluster, or end the one that was started here."""
+    """Let what is asked be answered, then leave the cluster, or end the one that was started here.
+
+    Only the application goes: a cluster may serve others, and Serve itself ends with its Ray.
+    """
     import ray
     from ray import serve
 
-    serve.shutdown()
+    serve.delete(APPLICATION)
     ray.shutdown()
 
 

@@ -37,15 +37,18 @@ class Link(Protocol):
     def send(self, entry: SpoolEntry) -> Answer:
         """One attempt; never raises for what a network does."""
 
+    def close(self) -> None:
+        """Give back what it holds open."""
+
 
 class HttpLink:
     """`POST /ingest/estimates` and `POST /recordings` with a bearer token, the connection kept open."""
 
-    def __init__(self, url: str, token: str | None, vehicle: str) -> None:
-        """Raises UserError for an address that is none."""
+    def __init__(self, url: str, token: str | None, vehicle: str, option: str = "--server") -> None:
+        """option: where the address was given.  Raises UserError for an address that is none."""
         parts = urlsplit(url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise UserError(f"--server {url}: give an address as in https://sprung.example.org")
+            raise UserError(f"{option} {url}: give an address as in https://sprung.example.org")
         self._parts = parts
         self._vehicle = vehicle
         self._headers = {} if token is None else {"Authorization": f"Bearer {token}"}
@@ -62,6 +65,8 @@ class HttpLink:
         if status < 300:
             return Answer(True)
         said = f"{status} {text}"
+        if status == 404 and entry.kind == "recording":
+            said += "; raw samples are for the server of the pages: name it with --recordings"
         if status in (401, 403, 408, 425, 429) or status >= 500:  # the token may be renewed, the server started anew
             return Answer(False, trouble=said, wait=wait)
         return Answer(False, refused=said)
@@ -97,6 +102,22 @@ class HttpLink:
         if self._open is not None:
             self._open.close()
             self._open = None
+
+
+class LinksByKind:
+    """Estimates one way, raw recordings another: to the ingest or a broker, and to the server that diagnoses them."""
+
+    def __init__(self, estimates: Link, recordings: Link) -> None:
+        self._estimates, self._recordings = estimates, recordings
+
+    def send(self, entry: SpoolEntry) -> Answer:
+        """One attempt, by the way of its kind."""
+        return (self._estimates if entry.kind == "estimates" else self._recordings).send(entry)
+
+    def close(self) -> None:
+        """Close both."""
+        self._estimates.close()
+        self._recordings.close()
 
 
 class Sending:

@@ -18,7 +18,7 @@ from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import decode
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
-from sprung.service.fleet.sending import Answer, HttpLink, Sending
+from sprung.service.fleet.sending import Answer, HttpLink, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool, SpoolEntry
 from tests.service_fakes import make_window
 
@@ -76,6 +76,9 @@ class Unsteady:
     def send(self, entry: SpoolEntry) -> Answer:
         self.seen.append(entry.body)
         return self.answers.pop(0) if self.answers else Answer(True)
+
+    def close(self) -> None:
+        """Nothing is open."""
 
 
 def test_the_sender_tries_until_it_is_taken_and_gives_up_what_never_will_be(spool: Spool) -> None:
@@ -135,6 +138,28 @@ def test_statuses_say_whether_to_try_again() -> None:
     assert path == "/base/recordings" and b'name="vehicle"\r\n\r\nnorth-1' in body and b"\x89MCAP" in body
     dead = HttpLink(f"http://127.0.0.1:{receiver.server_port}", None, "x").send(SpoolEntry(1, "estimates", "", b""))
     assert not dead.stored and dead.trouble and not dead.refused
+
+
+def test_raw_samples_go_to_the_server_that_takes_them() -> None:
+    """The ingest takes estimates only; what it says of a recording names the option."""
+    ingest, pages = EdgeReceiver([200, 404]), EdgeReceiver([])
+    for receiver in (ingest, pages):
+        threading.Thread(target=receiver.serve_forever, daemon=True).start()
+    urls = [f"http://127.0.0.1:{receiver.server_port}" for receiver in (ingest, pages)]
+    estimates, recording = SpoolEntry(1, "estimates", "", b"body"), SpoolEntry(2, "recording", "a.mcap", b"\x89MCAP")
+    link = LinksByKind(HttpLink(urls[0], None, "a"), HttpLink(urls[1], None, "a", "--recordings"))
+    assert link.send(estimates).stored and link.send(recording).stored
+    link.close()
+    alone = HttpLink(urls[0], None, "a")
+    assert "--recordings" in alone.send(recording).refused
+    alone.close()
+    for receiver in (ingest, pages):
+        receiver.shutdown()
+        receiver.server_close()
+    assert [path for path, _, _ in ingest.requests] == ["/ingest/estimates", "/recordings"]
+    assert [path for path, _, _ in pages.requests] == ["/recordings"]
+    with pytest.raises(UserError, match="--recordings nowhere"):
+        HttpLink("nowhere", None, "a", "--recordings")
 
 
 def test_messages_hold_every_window_and_a_restart_goes_on(engine: Engine, system: System, spool: Spool) -> None:
