@@ -11,12 +11,14 @@ from pydantic_core import from_json
 from sprung.model.signals import FloatArray
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.engine import Engine
+from sprung.service.fleet.message import SentWindows
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
 LARGEST = 1e12  # of a sample, in SI units
 MOST_CHANNELS = 1000
+MOST_WINDOWS = 30  # of one request
 MOST_KEYS = 20  # beside the channels
 FUTURE_SECONDS = 300  # by which a client's clock may be ahead
 RATE_TOLERANCE = 1e-3  # relative; a clock that is off by more would shift stiffnesses by more than their bound
@@ -73,6 +75,48 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
     Costs milliseconds for any body within the limit, right or wrong: the first errors are told, then it stops.
     Raises a 422 ApiProblem that names the fields: unknown channel, missing input, wrong length, wrong rate, no number.
     """
+    raw = _object(content)
+    wrong: list[dict[str, str]] = []
+    values = _samples(raw.pop("channels", None), engine, wrong)
+    head = _head(raw, engine, wrong)
+    if head is None or wrong:
+        raise _refused(wrong)
+    return head, values
+
+
+def read_windows(content: bytes, engine: Engine, now: int) -> SentWindows:
+    """One window, as `read_window` takes it, or several of a vehicle: `windows`, each with `start` and `channels`.
+
+    Vehicle and starts are needed.  now: ns since epoch.  Raises a 422 ApiProblem that names the fields.
+    """
+    raw = _object(content)
+    several = raw.pop("windows", None)
+    if several is None:
+        several = [{key: raw.pop(key) for key in ("start", "channels") if key in raw}]
+    wrong: list[dict[str, str]] = []
+    head = _head(raw, engine, wrong)
+    if not isinstance(several, list) or not 0 < len(several) <= MOST_WINDOWS:
+        wrong.append(_wrong("windows", f"should be a list of 1 to {MOST_WINDOWS} windows"))
+        raise _refused(wrong)
+    starts, values = [], []
+    for i, one in enumerate(several):
+        place = f"windows.{i}." if len(several) > 1 else ""
+        if not isinstance(one, dict) or one.keys() != {"start", "channels"} or not isinstance(one["start"], str):
+            wrong.append(_wrong(f"{place}start", "is needed beside channels, and nothing else"))
+            break
+        starts.append(_time(one["start"], now, place))
+        values.append(_samples(one["channels"], engine, wrong, place))
+        if len(wrong) >= SHOWN_ERRORS:
+            break
+    if head is not None and head.vehicle is None:
+        wrong.append(_wrong("vehicle", "is needed"))
+    if head is None or head.vehicle is None or wrong:
+        raise _refused(wrong)
+    return SentWindows(head.vehicle, starts, np.stack(values))
+
+
+def _object(content: bytes) -> dict[str, object]:
+    """The body as an object of JSON."""
     # counted before they are made into anything
     if max(content.count(mark) for mark in (b'"', b"[", b"{")) > 4 * MOST_CHANNELS:
         detail = "holds too many strings or lists: a window has a list of plain numbers a channel"
@@ -83,58 +127,58 @@ def read_window(content: bytes, engine: Engine) -> tuple[WindowHead, FloatArray]
         raise ApiProblem(422, f"body: {error}", [_wrong("body", str(error))]) from None
     if not isinstance(raw, dict):
         raise ApiProblem(422, "body: should be an object", [_wrong("body", "should be an object")])
-    channels = raw.pop("channels", None)
-    wrong: list[dict[str, str]] = []
-    head = _head(raw, wrong)
-    system = engine.system
-    if head is not None and abs(head.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
-        detail = f"is {head.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz"
-        wrong.append(_wrong("sample_rate", detail))
-    values = _samples(channels, engine, wrong)
-    if wrong or head is None:
-        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
-        raise ApiProblem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
-    return head, values
+    return raw
 
 
-def _head(raw: dict[str, object], wrong: list[dict[str, str]]) -> WindowHead | None:
+def _refused(wrong: list[dict[str, str]]) -> ApiProblem:
+    more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+    return ApiProblem(422, f"{wrong[0]['field']} {wrong[0]['detail']}{more}", wrong[:SHOWN_ERRORS])
+
+
+def _head(raw: dict[str, object], engine: Engine, wrong: list[dict[str, str]]) -> WindowHead | None:
+    """What stands beside the samples; adds to `wrong` where it is none, or of another rate."""
     if len(raw) > MOST_KEYS:
         wrong.append(_wrong("body", f"has {len(raw) + 1} keys; a window has four"))
         return None
     try:
-        return WindowHead.model_validate(raw)
+        head = WindowHead.model_validate(raw)
     except ValidationError as error:
         wrong += [dict(fault) for fault in from_validation(error).errors]
         return None
+    system = engine.system
+    if abs(head.sample_rate / system.sample_rate - 1) > RATE_TOLERANCE:
+        detail = f"is {head.sample_rate:g} Hz, {system.name} needs {system.sample_rate:g} Hz"
+        wrong.append(_wrong("sample_rate", detail))
+    return head
 
 
-def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]]) -> FloatArray:
+def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], place: str = "") -> FloatArray:
     """Samples of all channels, shape (T, C); adds to `wrong`, at most a few more than are shown."""
     system = engine.system
     values = np.full((system.window, len(system.channels)), np.nan)
     if not isinstance(channels, dict):
-        wrong.append(_wrong("channels", "should be an object of samples by channel"))
+        wrong.append(_wrong(f"{place}channels", "should be an object of samples by channel"))
         return values
     if len(channels) > MOST_CHANNELS:
-        wrong.append(_wrong("channels", f"are {len(channels)}; more than {MOST_CHANNELS} are not looked at"))
+        wrong.append(_wrong(f"{place}channels", f"are {len(channels)}; more than {MOST_CHANNELS} are not looked at"))
         return values
     names = {channel.name: i for i, channel in enumerate(system.channels)}
     for name, samples in channels.items():
         if len(wrong) >= SHOWN_ERRORS:
             return values
         if name not in names:
-            wrong.append(_wrong(f"channels.{name[:160]}", f"is no channel of {system.name}"))
+            wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {system.name}"))
         elif fault := _not_numbers(samples, system.window):
-            wrong.append(_wrong(f"channels.{name}{fault[0]}", fault[1]))
+            wrong.append(_wrong(f"{place}channels.{name}{fault[0]}", fault[1]))
         else:
             values[:, names[name]] = samples
     wrong += [
-        _wrong(f"channels.{channel.name}", "is missing; without every input nothing can be identified")
+        _wrong(f"{place}channels.{channel.name}", "is missing; without every input nothing can be identified")
         for channel in system.inputs
         if channel.name not in channels
     ][:SHOWN_ERRORS]
     if not any(sensor in channels for sensor in system.sensors):
-        wrong.append(_wrong("channels", "hold no sensor; without any nothing can be identified"))
+        wrong.append(_wrong(f"{place}channels", "hold no sensor; without any nothing can be identified"))
     return values
 
 
@@ -158,17 +202,19 @@ def start_of(head: WindowHead, now: int) -> int | None:
     A 422 ApiProblem when it is no time, or one that is still to come: the vehicle's tracker would take nothing that
     comes before it any more.
     """
-    if head.start is None:
-        return None
+    return None if head.start is None else _time(head.start, now)
+
+
+def _time(text: str, now: int, place: str = "") -> int:
     try:
-        start = from_iso(head.start)
+        start = from_iso(text)
     except ValueError:
         start = -1
     if not 0 <= start < 2**63:
-        raise ApiProblem(422, "start is no RFC 3339 time", [_wrong("start", "is no RFC 3339 time")])
+        raise _refused([_wrong(f"{place}start", "is no RFC 3339 time")])
     if start > now + FUTURE_SECONDS * NANOSECONDS:
         detail = f"is more than {FUTURE_SECONDS // 60} minutes after {to_iso(now)}, the service's time"
-        raise ApiProblem(422, f"start {detail}", [_wrong("start", detail)])
+        raise _refused([_wrong(f"{place}start", detail)])
     return start
 
 

@@ -15,16 +15,16 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung import __version__
-from sprung.model.signals import FloatArray
 from sprung.service.api import models, problems
 from sprung.service.api.access import ActorOf, json_response, own_vehicle
-from sprung.service.api.bodies import VehicleId, read_window, start_of
+from sprung.service.api.bodies import VehicleId, read_windows
 from sprung.service.api.guard import Guard
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.problems import ApiProblem
 from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.fleet.ingest import OtherModel, Taken, read_messages
+from sprung.service.fleet.message import SentWindows
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 from sprung.service.times import now_ns
@@ -39,8 +39,8 @@ class Behind(Protocol):
     async def fold(self, body: bytes) -> Taken:
         """Fold a message of estimates; it is stored when this returns."""
 
-    async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
-        """Identify a window, values (T, C), and fold what it tells."""
+    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+        """Identify windows and fold what they tell."""
 
 
 def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind) -> FastAPI:
@@ -64,14 +64,11 @@ def ingest_app(settings: Settings, engine: Engine, store: Store, behind: Behind)
 
     @app.post("/ingest/windows", response_model=models.IngestAnswer)
     async def windows(request: Request, actor: ActorOf) -> Response:
-        """One window, as `POST /identify` takes it, with vehicle and start."""
-        head, values = await run_in_threadpool(read_window, await request.body(), engine)
-        start = start_of(head, now_ns())
-        if head.vehicle is None or start is None:
-            raise ApiProblem(422, "vehicle and start are needed")
-        own_vehicle(actor, head.vehicle)
+        """Windows of a vehicle: one as `POST /identify` takes it, with vehicle and start, or a list `windows`."""
+        sent = await run_in_threadpool(read_windows, await request.body(), engine, now_ns())
+        own_vehicle(actor, sent.vehicle)
         try:
-            return _answer(await behind.identify_and_fold(head.vehicle, start, values))
+            return _answer(await behind.identify_and_fold(sent))
         except Busy as error:
             raise _too_many(error) from error
 

@@ -85,6 +85,15 @@ class WindowEstimate:
 
 
 @dataclass(frozen=True, slots=True)
+class SentWindows:
+    """Windows of one vehicle that are to be identified where they arrive."""
+
+    vehicle: str
+    starts: list[int]  # ns since epoch
+    values: FloatArray  # (B, T, C), NaN for absent sensors
+
+
+@dataclass(frozen=True, slots=True)
 class Message:
     """Windows of one vehicle under one model, in the order in which they were cut."""
 

@@ -22,7 +22,7 @@ from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.errors import Busy, UserError
 from sprung.service.fleet.ingest import Ingest, Taken, read_messages
-from sprung.service.fleet.message import Message, WindowEstimate
+from sprung.service.fleet.message import Message, SentWindows, WindowEstimate
 from sprung.service.fleet.tasks import OBJECT_STORE_BYTES
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings, settings_with
@@ -102,12 +102,14 @@ class RayBehind:
         with self._place():
             return await self._fold_one((await asyncio.to_thread(read_messages, [body]))[0])
 
-    async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
-        """Identify a window, values (T, C), and fold it."""
+    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+        """Identify windows, together with those of others, and fold them together."""
         with self._place():
-            estimate: Estimate = await self._identified((start, values))
-            window = WindowEstimate(start, "used", None, 0, False, estimate)
-            return await self._fold_one(Message(vehicle, self._digest, (window,)))
+            ways = [self._identified(one) for one in zip(sent.starts, sent.values, strict=True)]
+            estimates: list[Estimate] = await asyncio.gather(*ways)
+            found = zip(sent.starts, estimates, strict=True)
+            windows = tuple(WindowEstimate(start, "used", None, 0, False, estimate) for start, estimate in found)
+            return await self._fold_one(Message(sent.vehicle, self._digest, windows))
 
     @contextmanager
     def _place(self) -> Iterator[None]:

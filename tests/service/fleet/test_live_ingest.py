@@ -10,13 +10,12 @@ from typing import Any
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.model.signals import FloatArray
 from sprung.model.system import System
 from sprung.service.api.live_ingest import ingest_app
 from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.fleet.ingest import Ingest, Taken, read_messages
-from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
+from sprung.service.fleet.message import MEDIA_TYPE, Message, SentWindows, WindowEstimate, encode
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import Store
@@ -36,10 +35,10 @@ class AtOnce:
             raise Busy("too many requests wait; try again in a second")
         return (await asyncio.to_thread(self.ingest.take, read_messages([body])))[0]
 
-    async def identify_and_fold(self, vehicle: str, start: int, values: FloatArray) -> Taken:
-        estimate = self.engine.identify(values[None], starts=[start])[0][0]
-        window = WindowEstimate(start, "used", None, 0, False, estimate)
-        return await self.fold(encode(Message(vehicle, self.engine.digest, (window,)), "exact"))
+    async def identify_and_fold(self, sent: SentWindows) -> Taken:
+        found = self.engine.identify(sent.values, starts=sent.starts)[0]
+        windows = [WindowEstimate(s, "used", None, 0, False, e) for s, e in zip(sent.starts, found, strict=True)]
+        return await self.fold(encode(Message(sent.vehicle, self.engine.digest, tuple(windows)), "exact"))
 
 
 @pytest.fixture
@@ -82,3 +81,28 @@ def test_windows_without_vehicle_start_or_the_right_rate_are_refused(
 ) -> None:
     more = {"start": "2026-09-21T14:13:25Z"} if change else {}
     assert client.post("/ingest/windows", json=window(system, **more) | change).status_code == status
+
+
+def test_several_windows_of_a_vehicle_travel_in_one_request(client: TestClient, system: System) -> None:
+    whole = window(system)
+    parts = [{"start": f"2026-09-21T14:13:{20 + i}Z", "channels": whole["channels"]} for i in range(3)]
+    body = {"vehicle": "north-1", "sample_rate": 100.0, "windows": parts}
+    answer = client.post("/ingest/windows", json=body)
+    assert (answer.status_code, answer.json()["folded"]) == (200, 3)
+    again = client.post("/ingest/windows", json=body | {"windows": parts[1:]})
+    assert (again.json()["folded"], again.json()["known"]) == (0, 2)
+
+
+def test_what_is_wrong_with_several_windows_names_the_one(client: TestClient, system: System) -> None:
+    good = {"start": "2026-09-21T14:13:20Z", "channels": window(system)["channels"]}
+    short = good | {"channels": good["channels"] | {system.channels[0].name: [0.0]}}  # type: ignore[dict-item]
+    cases = {
+        "windows.1.channels": [good, short],
+        "windows.1.start is no": [good, good | {"start": "yesterday"}],
+        "windows.1.start is more than": [good, good | {"start": "2099-09-21T14:13:20Z"}],
+        "windows.1.start is needed": [good, {"channels": good["channels"]}],
+        "windows should be": [],
+    }
+    for said, parts in cases.items():
+        answer = client.post("/ingest/windows", json={"vehicle": "north-1", "sample_rate": 100.0, "windows": parts})
+        assert answer.status_code == 422 and said in answer.text, (said, answer.text)

@@ -10,7 +10,7 @@ import pytest
 
 from sprung.service.errors import Busy, UserError
 from sprung.service.fleet.ingest import Taken
-from sprung.service.fleet.message import Message
+from sprung.service.fleet.message import Message, SentWindows
 from sprung.service.fleet.ray_serving import RayBehind, ServingSizes
 
 pytest.importorskip("ray")
@@ -56,8 +56,12 @@ def batch(max_batch_size: int, batch_wait_timeout_s: float, **_: Any) -> Any:
     return decorate
 
 
+def window(vehicle: str, start: int, count: int = 1) -> SentWindows:
+    return SentWindows(vehicle, [start + i for i in range(count)], np.zeros((count, 2, 3)))
+
+
 def taken(message: Message) -> Taken | UserError:
-    return UserError("not this one") if message.vehicle == "v-3" else Taken(message.vehicle, 1, 0, 0)
+    return UserError("not this one") if message.vehicle == "v-3" else Taken(message.vehicle, len(message.windows), 0, 0)
 
 
 def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
@@ -68,7 +72,7 @@ def behind(**sizes: Any) -> tuple[RayBehind, Remote, Remote]:
 def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
     async def asked() -> list[Any]:
         ray, identify, fold = behind(replicas=1, batch_windows=8, batch_wait_seconds=0.05)
-        calls = [ray.identify_and_fold(f"v-{i}", i, np.zeros((2, 3))) for i in range(8)]
+        calls = [ray.identify_and_fold(window(f"v-{i}", i)) for i in range(8)]
         found = await asyncio.gather(*calls, return_exceptions=True)
         assert identify.sizes == [8]
         assert sum(fold.sizes) == 8 and len(fold.sizes) <= 2
@@ -82,9 +86,21 @@ def test_windows_of_many_travel_together_and_each_hears_of_its_own() -> None:
 def test_too_many_at_once_are_told_so_and_places_come_free() -> None:
     async def asked() -> None:
         ray, _, _ = behind(replicas=1, queued=2)
-        calls = [ray.identify_and_fold(f"v-{10 + i}", i, np.zeros((2, 3))) for i in range(3)]
+        calls = [ray.identify_and_fold(window(f"v-{10 + i}", i)) for i in range(3)]
         found = await asyncio.gather(*calls, return_exceptions=True)
         assert [isinstance(one, Busy) for one in found] == [False, False, True]
-        assert (await ray.identify_and_fold("v-1", 0, np.zeros((2, 3)))).folded == 1
+        assert (await ray.identify_and_fold(window("v-1", 0))).folded == 1
+
+    asyncio.run(asked())
+
+
+def test_windows_of_one_request_are_identified_and_folded_together() -> None:
+    async def asked() -> None:
+        ray, identify, fold = behind(replicas=1, batch_windows=32, batch_wait_seconds=0.05)
+        found = await asyncio.gather(
+            ray.identify_and_fold(window("v-1", 0, 10)), ray.identify_and_fold(window("v-2", 0, 5))
+        )
+        assert [one.folded for one in found] == [10, 5]
+        assert identify.sizes == [15] and sum(fold.sizes) == 2
 
     asyncio.run(asked())
