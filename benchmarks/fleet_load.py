@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from sprung.benchmarks.fleet_processes import busy_seconds, descendants
 from sprung.benchmarks.serve import window_body
 from sprung.model.system import load_system
 from sprung.service.errors import UserError
@@ -30,6 +31,7 @@ from sprung.service.times import to_iso
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
 CLIENTS = 48
+TOGETHER = 10  # windows of a vehicle in one request: five seconds of a ride
 VEHICLES = 2_000
 SLOWER = 100  # than real time
 HOP = 500_000_000  # ns
@@ -39,27 +41,24 @@ class LoadClient(threading.Thread):
     """Some vehicles in turns, each one's windows in order: evenly at a rate or as fast as they are taken."""
 
     def __init__(
-        self, port: int, path: str, body: dict[str, Any], vehicles: Sequence[str], until: float, period: float
+        self, port: int, load: SentLoad, vehicles: Sequence[str], until: float, period: float, first: float
     ) -> None:
-        """vehicles: their ids; period: s between windows of this client, 0: none is waited for."""
+        """vehicles: their ids; period: s between requests of this client, 0: as fast as it goes; first: when it begins."""
         super().__init__(daemon=True)
-        self._port, self._path, self._vehicles = port, path, vehicles
-        rest = {key: value for key, value in body.items() if key not in ("vehicle", "start")}
-        self._rest = json.dumps(rest)[1:]  # written once: the client shares the machine with what it measures
-        self._until, self._period = until, period
-        self.seconds: list[float] = []
+        self._port, self._load, self._vehicles = port, load, vehicles
+        self._until, self._period, self._first = until, period, first
+        self.seconds: list[float] = []  # of requests that were taken
         self.refused = 0
 
     def run(self) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
-        number, due = 0, time.monotonic()
+        number, due = 0, self._first
         while time.monotonic() < self._until:
             round_of, turn = divmod(number, len(self._vehicles))
-            head = {"vehicle": self._vehicles[turn], "start": to_iso(FIRST + round_of * HOP)}
-            body = f"{json.dumps(head)[:-1]}, {self._rest}".encode()
+            body = self._load.body(self._vehicles[turn], round_of)
             time.sleep(max(0.0, due - time.monotonic()))
             begun = time.monotonic()
-            connection.request("POST", self._path, body, {"content-type": "application/json"})
+            connection.request("POST", self._load.path, body, {"content-type": "application/json"})
             answer = connection.getresponse()
             answer.read()
             if answer.status == 200:
@@ -87,8 +86,10 @@ def ingest(workers: int, seconds: float, minutes: float) -> Figures:
             store = {"SPRUNG_STORE": server.database()}
             port = _served(alone, ["serve", "--port"], folder, store, "/health/live")
             single.send(port, min(5.0, seconds), 0.0)  # warm
-            rate_alone = single.send(port, seconds, 0.0).rate
-        yield {"figure": "windows per second, one process, one client", "value": round(rate_alone, 1)}
+            at_rest = _busy(server)
+            one = single.send(port, seconds, 0.0)
+            spent = (_busy(server) - at_rest) / one.windows
+        yield {"figure": "windows per second, one process, one client", "value": round(one.rate, 1)} | _cost(spent)
         more = {
             "SPRUNG_STORE": server.database(),
             "SPRUNG_LATE_SECONDS": "0",
@@ -96,28 +97,46 @@ def ingest(workers: int, seconds: float, minutes: float) -> Figures:
         }
         command = ["fleet", "serve", "--workers", str(workers), "--replicas", "1", "--cores", "0.5", "--port"]
         fleet = _served(stack, command, f"{folder}/fleet", more, "/health/ready")
-        yield from _fleet_figures(fleet, body, rate_alone, seconds)
+        for together in (1, TOGETHER):
+            many = SentLoad("/ingest/windows", body, _named(CLIENTS), together=together)
+            yield from _fleet_figures(fleet, server, many, one.rate, spent, seconds)
         if minutes:
             yield from _many_vehicles(fleet, body, minutes)
 
 
-def _fleet_figures(port: int, body: dict[str, Any], rate_alone: float, seconds: float) -> Figures:
-    many = SentLoad("/ingest/windows", body, _named(CLIENTS))
+def _fleet_figures(
+    port: int, server: postgres.PostgresServer, many: SentLoad, rate_alone: float, spent_alone: float, seconds: float
+) -> Figures:
     many.send(port, min(10.0, seconds), 0.0)  # warm: replicas are added
+    at_rest = _busy(server)
     most = many.send(port, seconds, 0.0)
-    yield {"figure": "windows per second, Ray Serve", "value": round(most.rate, 1)} | most.told()
-    yield {"figure": "ratio", "value": round(most.rate / rate_alone, 2), "target": 4.0, "load": os.getloadavg()[0]}
-    eased = many.send(port, seconds, CLIENTS / (0.7 * most.rate))
+    spent = (_busy(server) - at_rest) / most.windows
+    yield {"figure": "windows per second, Ray Serve", "value": round(most.rate, 1)} | most.told() | _cost(spent)
+    ratio = {"figure": "ratio", "value": round(most.rate / rate_alone, 2), "target": 4.0}
+    # of processor time: one client keeps one core busy at the most, many keep all of them busy
+    yield ratio | {"of_all_cores": round((os.cpu_count() or 1) * spent_alone / spent, 2), "load": os.getloadavg()[0]}
+    eased = many.send(port, seconds, CLIENTS * many.together / (0.7 * most.rate))
     low, high = np.percentile(eased.seconds, [50, 99])
     yield {"figure": "latency at 70 % load, p99", "value": round(float(high), 3), "unit": "s", "target": 1.0}
     yield {"figure": "latency at 70 % load, p50", "value": round(float(low), 3), "unit": "s"} | eased.told()
 
 
+def _busy(server: postgres.PostgresServer) -> float:
+    """Processor time of everything that takes part, s: client, server, Ray, database."""
+    postmaster = int((server.folder / "data" / "postmaster.pid").read_text().split()[0])
+    return busy_seconds() + sum(one.seconds for one in descendants(postmaster))
+
+
+def _cost(spent: float) -> dict[str, float]:
+    return {"processor_ms_a_window": round(1e3 * spent, 1)}
+
+
 def _many_vehicles(port: int, body: dict[str, Any], minutes: float) -> Figures:
-    """Vehicles that each send a window every 50 s, HOP apart in their own time."""
+    """Vehicles that run at a hundredth of their rate: a request of some windows whenever so many would be there."""
     named = _named(VEHICLES)
     rate = VEHICLES / (HOP / 1e9) / SLOWER
-    sent = SentLoad("/ingest/windows", body, named, CLIENTS).send(port, 60 * minutes, CLIENTS / rate)
+    load = SentLoad("/ingest/windows", body, named, CLIENTS, TOGETHER)
+    sent = load.send(port, 60 * minutes, CLIENTS * TOGETHER / rate)
     low, high = np.percentile(sent.seconds, [50, 99])
     yield {
         "figure": f"{VEHICLES} vehicles at 1/{SLOWER} of the real rate, latency p99",
@@ -131,37 +150,65 @@ class Answered:
     """What became of a load."""
 
     rate: float  # windows a second that were stored
-    seconds: list[float]  # their latencies
+    seconds: list[float]  # latencies of their requests
     refused: int
     clients: int
+    together: int  # windows of a request
+
+    @property
+    def windows(self) -> int:
+        """How many were stored."""
+        return len(self.seconds) * self.together
 
     def told(self) -> dict[str, Any]:
         """Beside a figure."""
-        return {"clients": self.clients, "windows": len(self.seconds), "refused": self.refused}
+        return {
+            "clients": self.clients,
+            "windows": self.windows,
+            "in_a_request": self.together,
+            "refused": self.refused,
+        }
 
 
 class SentLoad:
     """Windows of some vehicles to one path; sent again, they go on with new vehicles."""
 
-    def __init__(self, path: str, body: dict[str, Any], vehicles: Sequence[str], clients: int | None = None) -> None:
-        self._path, self._body, self._vehicles = path, body, vehicles
+    def __init__(
+        self, path: str, body: dict[str, Any], vehicles: Sequence[str], clients: int | None = None, together: int = 1
+    ) -> None:
+        """body: of one window; together: windows of a vehicle in a request."""
+        self.path, self._vehicles, self.together = path, vehicles, together
+        # written once: the client shares the machine with what it measures
+        self._rate, self._channels = json.dumps(body["sample_rate"]), json.dumps(body["channels"])
         self._clients = clients or len(vehicles)
         self._times = 0
 
+    def body(self, vehicle: str, number: int) -> bytes:
+        """A vehicle's request, counted from 0."""
+        first = FIRST + number * self.together * HOP
+        windows = [f'"start": "{to_iso(first + i * HOP)}", "channels": {self._channels}' for i in range(self.together)]
+        head = f'"vehicle": "{vehicle}", "sample_rate": {self._rate}'
+        if self.together == 1:
+            return f"{{{head}, {windows[0]}}}".encode()
+        return f'{{{head}, "windows": [{", ".join(f"{{{window}}}" for window in windows)}]}}'.encode()
+
     def send(self, port: int, seconds: float, period: float) -> Answered:
-        """For so long, every client a window each `period` seconds; 0: as fast as they are taken."""
+        """For so long, every client a request each `period` seconds; 0: as fast as they are taken."""
         begun = time.monotonic()
         self._times += 1
         names = [f"{name}-{self._times}" for name in self._vehicles]
         share = [names[i :: self._clients] for i in range(self._clients)]
-        running = [LoadClient(port, self._path, self._body, part, begun + seconds, period) for part in share]
+        running = [
+            LoadClient(port, self, part, begun + seconds, period, begun + period * i / self._clients)
+            for i, part in enumerate(share)
+        ]
         for client in running:
             client.start()
         for client in running:
             client.join()
         times = [one for client in running for one in client.seconds]
-        rate = len(times) / (time.monotonic() - begun)
-        return Answered(rate, times, sum(client.refused for client in running), self._clients)
+        rate = self.together * len(times) / (time.monotonic() - begun)
+        return Answered(rate, times, sum(client.refused for client in running), self._clients, self.together)
 
 
 def _named(count: int) -> list[str]:
