@@ -43,7 +43,7 @@ class LoadClient(threading.Thread):
     def __init__(
         self, port: int, load: SentLoad, vehicles: Sequence[str], until: float, period: float, first: float
     ) -> None:
-        """vehicles: their ids; period: s between requests of this client, 0: as fast as it goes; first: when it begins."""
+        """vehicles: their ids; period: s between requests, 0: as fast as they are taken; first: when it begins."""
         super().__init__(daemon=True)
         self._port, self._load, self._vehicles = port, load, vehicles
         self._until, self._period, self._first = until, period, first
