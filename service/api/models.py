@@ -99,6 +99,18 @@ class CommonAnswer(BaseModel):
     time: str
     change: float
     std: float
+    temperature: float | None = Field(description="degC, of those that measured it")
+
+
+class TemperatureAnswer(BaseModel):
+    """How what the vehicles of a class do together follows the temperature."""
+
+    vehicle_class: str
+    kind: str
+    days: int
+    per_kelvin: float = Field(description="change of the logarithm")
+    std: float
+    explained: float = Field(description="share of the common mode's variance")
 
 
 class KnowledgeAnswer(BaseModel):
@@ -109,6 +121,7 @@ class KnowledgeAnswer(BaseModel):
     worst: list[StandingAnswer]
     fastest: list[StandingAnswer]
     common: list[CommonAnswer]
+    temperature: list[TemperatureAnswer]
     expected_crossings: dict[str, float] = Field(description="parameters by days ahead")
 
 

@@ -6,7 +6,8 @@ Levels y are log-ratios to nominal with standard deviation s.  Pure functions of
 - Usual: y = m + class + own + error, class ~ N(0, tc^2), own ~ N(0, tv^2), for all elements of one type ("secondary
   dampers") together; the variances by moments (DerSimonian and Laird 1986), the means shrunken towards the level above.
 - Common mode: what all vehicles of a class do at the same time, the median of their departures from their own means.
-  It is weather, a workshop's habit or a clock, and no vehicle's wear: trends are told without it.
+  It is weather, a workshop's habit or a clock, and no vehicle's wear: trends are told without it.  Its line over the
+  temperature, where that is measured, says how much of it is weather.
 - Trend: weighted least squares of what is left, the residual scatter taken into account where it exceeds s.
 - Limit: P(crossed by t) = Phi((b t - d) / sqrt(s^2 + sb^2 t^2)) for the distance d to the limit and the slope b (a
   straight line with uncertain start and slope); quantiles of t are given where they are within the horizon.
@@ -30,6 +31,8 @@ HORIZON_DAYS = 1000.0
 QUANTILES = (0.05, 0.5, 0.95)
 LEAST_POINTS = 3  # of a trend
 LEAST_VEHICLES = 3  # of a class that has a common mode
+LEAST_CHANGE = 1e-4  # log-ratio, of a common mode that is told
+LEAST_DAYS, LEAST_KELVIN = 6, 3.0  # of a line over temperature
 ONE_SIDED_95 = 1.645
 
 
@@ -71,6 +74,24 @@ class CommonMode:
     time: int  # ns since epoch, begin of that part
     change: float  # log-ratio
     std: float
+    temperature: float  # degC, mean of those that measured it; NaN where nobody did
+
+    @property
+    def sure(self) -> bool:
+        """Whether they did anything at all."""
+        return abs(self.change) > 3 * self.std and abs(self.change) > LEAST_CHANGE
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureEffect:
+    """How what the vehicles of a class do together follows the temperature."""
+
+    vehicle_class: str
+    kind: str
+    per_kelvin: float  # log-ratio
+    std: float
+    explained: float  # share of the common mode's variance
+    days: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +101,7 @@ class FleetKnowledge:
     usual: tuple[UsualLevel, ...]
     standings: tuple[Standing, ...]
     common: tuple[CommonMode, ...]
+    temperature: tuple[TemperatureEffect, ...] = ()
 
 
 def kind_of(parameter: str) -> str:
@@ -133,7 +155,8 @@ def knowledge(
                         tuple(float(probability(day, *line)) for day in days),
                     )
                 )
-    return FleetKnowledge(tuple(usual), tuple(standings), tuple(common))
+    sure = tuple(one for one in common if one.sure)
+    return FleetKnowledge(tuple(usual), tuple(standings), sure, temperature_effects(common))
 
 
 def worst(standings: Sequence[Standing], count: int) -> list[Standing]:
@@ -199,7 +222,7 @@ def _moments(y: FloatArray, s: FloatArray) -> tuple[float, float, float]:
 def without_common_mode(
     found: FleetLevels, level: FloatArray, classes: np.ndarray, kinds: np.ndarray
 ) -> tuple[FloatArray, list[CommonMode]]:
-    """Levels (V, N, P) less what the vehicles of a class did together, and what that was where it is sure."""
+    """Levels (V, N, P) less what the vehicles of a class did together, and what that was, sure or not."""
     rest, told = level.copy(), []
     with np.errstate(invalid="ignore"):
         own = np.nanmedian(np.where(np.isfinite(level), level, np.nan), axis=1, keepdims=True) if level.size else level
@@ -221,9 +244,36 @@ def without_common_mode(
                 rest[np.ix_(np.flatnonzero(at.any(axis=1)), np.arange(level.shape[1]), columns)] -= np.where(
                     at[at.any(axis=1)][:, :, None], middle, 0.0
                 )
-                if abs(middle) > 3 * spread and abs(middle) > 1e-4:
-                    told.append(CommonMode(str(name), str(kind), int(found.time[at].min()), middle, spread))
+                warm = _mean(found.temperature[at]) if found.temperature is not None else np.nan
+                told.append(CommonMode(str(name), str(kind), int(found.time[at].min()), middle, spread, warm))
     return rest, told
+
+
+def _mean(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if known.size else np.nan
+
+
+def temperature_effects(modes: Sequence[CommonMode]) -> tuple[TemperatureEffect, ...]:
+    """Lines of common modes over temperature, of classes and types where it is sure that there is one.
+
+    Least squares over days, weighted by what is known of each; the scatter about the line counts where it is larger.
+    """
+    told = []
+    for name, kind in dict.fromkeys((one.vehicle_class, one.kind) for one in modes):
+        own = [m for m in modes if (m.vehicle_class, m.kind) == (name, kind) and np.isfinite(m.temperature)]
+        t, y = np.array([m.temperature for m in own]), np.array([m.change for m in own])
+        if len(own) < LEAST_DAYS or np.ptp(t) < LEAST_KELVIN:
+            continue
+        w = 1 / np.maximum([m.std for m in own], LEAST_CHANGE) ** 2
+        dt, dy = t - np.average(t, weights=w), y - np.average(y, weights=w)
+        slope = float(np.sum(w * dt * dy) / np.sum(w * dt**2))
+        excess = float(max(1.0, np.sum(w * (dy - slope * dt) ** 2) / (len(own) - 2)))
+        std = float(np.sqrt(excess / np.sum(w * dt**2)))
+        if abs(slope) > 3 * std:
+            left = float(np.sum(w * (dy - slope * dt) ** 2) / np.sum(w * dy**2))
+            told.append(TemperatureEffect(name, kind, slope, std, 1 - left, len(own)))
+    return tuple(told)
 
 
 def part_of(time: np.ndarray) -> np.ndarray:

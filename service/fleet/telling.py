@@ -64,7 +64,13 @@ def knowledge_dict(found: FleetKnowledge, limit: int) -> dict[str, Any]:
     ]
     common = [
         {"vehicle_class": c.vehicle_class, "kind": c.kind, "time": to_iso(c.time), "change": c.change, "std": c.std}
+        | {"temperature": c.temperature if np.isfinite(c.temperature) else None}
         for c in found.common
+    ]
+    temperature = [
+        {"vehicle_class": t.vehicle_class, "kind": t.kind, "days": t.days}
+        | {"per_kelvin": t.per_kelvin, "std": t.std, "explained": t.explained}
+        for t in found.temperature
     ]
     return {
         "parameters": len(found.standings),
@@ -72,6 +78,7 @@ def knowledge_dict(found: FleetKnowledge, limit: int) -> dict[str, Any]:
         "worst": [standing_dict(one) for one in worst(found.standings, limit)],
         "fastest": [standing_dict(one) for one in fastest(found.standings, limit)],
         "common": common,
+        "temperature": temperature,
         "expected_crossings": expected,
     }
 

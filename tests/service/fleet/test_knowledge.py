@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,6 +18,7 @@ from sprung.service.fleet.knowledge import (
     worst,
 )
 from sprung.service.store import Store, fleet, history
+from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.levels import FleetLevels, fleet_levels
 from sprung.service.store.windows import add_windows
 from tests.service.test_store import DAY, HOP, START, record
@@ -56,6 +59,23 @@ def test_the_worst_the_fastest_and_the_common_mode_are_found() -> None:
         assert one.mean == pytest.approx(own[rows, 2].mean(), abs=3 * one.mean_std)
         assert one.own_std == pytest.approx(0.03, rel=0.35)
         assert one.vehicles == 20
+
+
+def test_a_common_mode_that_follows_the_temperature_says_so() -> None:
+    """Dampers of one class lose 0.4 % a degree; springs and the other class do nothing of the kind."""
+    found, _ = fleet_of_truth(np.random.default_rng(3))
+    warm = 10 + 8 * np.sin(np.arange(DAYS)) + 0.5 * np.random.default_rng(4).normal(size=(len(found.vehicles), DAYS))
+    level = found.level.copy()
+    level[1::2, 8:15, :2] += 0.05  # without the warm week
+    level[::2, :, :2] -= 0.004 * (10 + 8 * np.sin(np.arange(DAYS)))[None, :, None]
+    told = knowledge(replace(found, level=level, temperature=warm), NAMES, 0.25, 0.2)
+    assert [(one.vehicle_class, one.kind) for one in told.temperature] == [("south", "secondary.damping")]
+    one = told.temperature[0]
+    assert one.per_kelvin == pytest.approx(-0.004, abs=max(4 * one.std, 2e-4)) and one.explained > 0.9
+    assert one.days == DAYS
+    assert knowledge(replace(found, level=level), NAMES, 0.25, 0.2).temperature == ()
+    worn = fastest(told.standings, 1)[0]
+    assert worn.vehicle == "north-007"
 
 
 def test_quiet_vehicles_stay_quiet() -> None:
@@ -125,6 +145,8 @@ def test_levels_of_a_fleet_are_read_from_hours(any_store: Store) -> None:
             rows = [record(number, level=0.01 * day + v) for day, number in hours]
             add_windows(connection, vehicle, model, rows, START, None)
             history.add_to_rollups(connection, vehicle, model, rows, START)
+            ran = [Ran(row.start, {"temperature": 5.0 + v}) for row in rows] if v else []
+            add_circumstances(connection, vehicle, ran, START)
     with any_store.read() as connection:
         found = fleet_levels(connection, model, START // DAY * DAY, START // DAY * DAY + 5 * DAY, 5)
         north = fleet_levels(connection, model, START // DAY * DAY, START // DAY * DAY + 5 * DAY, 5, "north-")
@@ -133,3 +155,5 @@ def test_levels_of_a_fleet_are_read_from_hours(any_store: Store) -> None:
     points = found.level[2, found.time[2] > 0, 0]
     np.testing.assert_allclose(points, 2 + 0.01 * np.arange(4))
     assert np.isnan(found.level[0, found.time[0] == 0]).all()
+    assert found.temperature is not None and np.isnan(found.temperature[0]).all()
+    np.testing.assert_allclose(found.temperature[2, found.time[2] > 0], 7.0)
