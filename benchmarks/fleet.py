@@ -51,11 +51,12 @@ def run(
     minutes: float = 2.0,
     every: float = 30.0,
     vehicles: int = 10_000,
+    together: int | None = None,
 ) -> Figures:
     """Figures of one part.
 
     recordings, seconds: of identity and scaling; workers: Ray's cores; minutes: of chaos, and of many vehicles in
-    ingest (0: none); every: s between kills.
+    ingest (0: none); every: s between kills; together: windows in a request of ingest, by default one, then ten.
     """
     one_thread_each()
     if part not in PARTS:
@@ -65,7 +66,7 @@ def run(
     if part == "scaling":
         yield from scaling(recordings, seconds, workers)
     if part == "ingest":
-        yield from ingest(workers, seconds, minutes)
+        yield from ingest(workers, seconds, minutes, *([(together,)] if together else []))
     if part in ("edge", "quick"):
         yield from edge(min(seconds, 120.0))
     if part == "chaos":

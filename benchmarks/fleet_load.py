@@ -41,18 +41,19 @@ class LoadClient(threading.Thread):
     """Some vehicles in turns, each one's windows in order: evenly at a rate or as fast as they are taken."""
 
     def __init__(
-        self, port: int, load: SentLoad, vehicles: Sequence[str], until: float, period: float, first: float
+        self, port: int, load: SentLoad, vehicles: Sequence[str], number: int, times: tuple[float, float, float]
     ) -> None:
-        """vehicles: their ids; period: s between requests, 0: as fast as they are taken; first: when it begins."""
+        """vehicles: their ids; number: of requests before; times: when it begins and ends, and s between requests, 0:
+        as fast as they are taken."""
         super().__init__(daemon=True)
-        self._port, self._load, self._vehicles = port, load, vehicles
-        self._until, self._period, self._first = until, period, first
+        self._port, self._load, self._vehicles, self.number = port, load, vehicles, number
+        self._first, self._until, self._period = times
         self.seconds: list[float] = []  # of requests that were taken
         self.refused = 0
 
     def run(self) -> None:
         connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=60)
-        number, due = 0, self._first
+        number, due = self.number, self._first
         while time.monotonic() < self._until:
             round_of, turn = divmod(number, len(self._vehicles))
             body = self._load.body(self._vehicles[turn], round_of)
@@ -64,6 +65,7 @@ class LoadClient(threading.Thread):
             if answer.status == 200:
                 self.seconds.append(time.monotonic() - (due if self._period else begun))
                 number += 1
+                self.number = number
             else:
                 self.refused += 1
                 time.sleep(0.2)
@@ -71,8 +73,11 @@ class LoadClient(threading.Thread):
         connection.close()
 
 
-def ingest(workers: int, seconds: float, minutes: float) -> Figures:
-    """Windows a second, latencies at 70 % of the most, and many vehicles at a hundredth of their rate."""
+def ingest(workers: int, seconds: float, minutes: float, together: Sequence[int] = (1, TOGETHER)) -> Figures:
+    """Windows a second, latencies at 70 % of the most, and many vehicles at a hundredth of their rate.
+
+    together: windows of a vehicle in a request, one after the other.
+    """
     if find_spec("ray") is None:
         raise UserError("bench fleet ingest: Ray is not installed; pip install 'sprung[fleet]'")
     if reason := postgres.missing():
@@ -97,8 +102,8 @@ def ingest(workers: int, seconds: float, minutes: float) -> Figures:
         }
         command = ["fleet", "serve", "--workers", str(workers), "--replicas", "1", "--cores", "0.5", "--port"]
         fleet = _served(stack, command, f"{folder}/fleet", more, "/health/ready")
-        for together in (1, TOGETHER):
-            many = SentLoad("/ingest/windows", body, _named(CLIENTS), together=together)
+        for windows in together:
+            many = SentLoad("/ingest/windows", body, _named(CLIENTS), together=windows)
             yield from _fleet_figures(fleet, server, many, one.rate, spent, seconds)
         if minutes:
             yield from _many_vehicles(fleet, body, minutes)
@@ -171,7 +176,7 @@ class Answered:
 
 
 class SentLoad:
-    """Windows of some vehicles to one path; sent again, they go on with new vehicles."""
+    """Windows of some vehicles to one path; sent again, they go on: most vehicles of a fleet are known."""
 
     def __init__(
         self, path: str, body: dict[str, Any], vehicles: Sequence[str], clients: int | None = None, together: int = 1
@@ -181,7 +186,7 @@ class SentLoad:
         # written once: the client shares the machine with what it measures
         self._rate, self._channels = json.dumps(body["sample_rate"]), json.dumps(body["channels"])
         self._clients = clients or len(vehicles)
-        self._times = 0
+        self._numbers = [0] * self._clients  # requests of each client so far
 
     def body(self, vehicle: str, number: int) -> bytes:
         """A vehicle's request, counted from 0."""
@@ -195,20 +200,18 @@ class SentLoad:
     def send(self, port: int, seconds: float, period: float) -> Answered:
         """For so long, every client a request each `period` seconds; 0: as fast as they are taken."""
         begun = time.monotonic()
-        self._times += 1
-        names = [f"{name}-{self._times}" for name in self._vehicles]
-        share = [names[i :: self._clients] for i in range(self._clients)]
-        running = [
-            LoadClient(port, self, part, begun + seconds, period, begun + period * i / self._clients)
-            for i, part in enumerate(share)
-        ]
+        running = []
+        for i, number in enumerate(self._numbers):
+            times = (begun + period * i / self._clients, begun + seconds, period)
+            running.append(LoadClient(port, self, self._vehicles[i :: self._clients], number, times))
         for client in running:
             client.start()
         for client in running:
             client.join()
-        times = [one for client in running for one in client.seconds]
-        rate = self.together * len(times) / (time.monotonic() - begun)
-        return Answered(rate, times, sum(client.refused for client in running), self._clients, self.together)
+        self._numbers = [client.number for client in running]
+        latencies = [one for client in running for one in client.seconds]
+        rate = self.together * len(latencies) / (time.monotonic() - begun)
+        return Answered(rate, latencies, sum(client.refused for client in running), self._clients, self.together)
 
 
 def _named(count: int) -> list[str]:

@@ -283,10 +283,14 @@ def swap_vehicle(plan: BackfillPlan, vehicle: str) -> bool:
         return True
 
 
-@cache
 def engine_of(settings: Settings) -> Engine:
     """The engine of a process that does pieces of the work, loaded once."""
-    return load_engine(settings)
+    return _engine(settings.system, settings.dbc, settings.weights)
+
+
+@cache
+def _engine(system: Path | None, dbc: Path | None, weights: Path | None) -> Engine:
+    return load_engine(Settings(system=system, dbc=dbc, weights=weights))
 
 
 @contextmanager

@@ -53,6 +53,12 @@ def plan(
     return BackfillPlan(Settings(data_dir=tmp_path, store=url), str(place), 0, 2**62)
 
 
+def test_an_engine_is_loaded_once_whatever_else_is_set(tmp_path: Path) -> None:
+    """Settings that say nothing of the model may be anything, a table of groups, too."""
+    one = module.engine_of(Settings(data_dir=tmp_path))
+    assert module.engine_of(Settings(data_dir=tmp_path / "other", oidc_groups={"works": ["read"]})) is one
+
+
 def shown(file: FoldedFile, done: int, of: int) -> None:
     """Nothing."""
 
