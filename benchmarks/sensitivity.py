@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from sprung.benchmarks.concealed import engine_digest
 from sprung.benchmarks.sensitivity_cases import recordings
 from sprung.benchmarks.setups import Falsified
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
@@ -35,9 +36,12 @@ from sprung.model.diagnosis.rules import RULES, Rules, reason
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import System
 
-ALONE = ("component", "ambient")  # stages of recordings of their own
+ALONE = {  # stages of recordings of their own, with what decides there
+    "component": ("component", "verdict"),
+    "ambient": ("ambient", "verdict"),
+}
 LAST = ("verdict", "report")  # stages that read finished investigations
-LATE = ("evidence", "selection", "plausible", "acceptance", "noise")  # stages that go on from begun ones
+LATE = ("evidence", "selection", "plausible", "acceptance", "formula", "noise")  # stages that go on from begun ones
 FIRST = ("input_faults", "input_rounds", "input_rival", "input_rivals", "input_done")  # of acceptance, but decide early
 
 
@@ -71,7 +75,7 @@ class Subject:
     record: Falsified
     options: Options
     said: Said
-    reads: str = ""  # stage that alone decides: of component tests, of structures without inputs
+    reads: tuple[str, ...] = ()  # stages that alone decide: of component tests, of structures without inputs
     state: Investigation | None = None  # begun; None for those
     outcome: Outcome | None = None
 
@@ -107,32 +111,26 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, one per number, and the totals.
 
-    budget: `quick` has 8 recordings of a quarter car of 15 s, `cases` 28 of them, with weak effects and more kinds of
-    faults, `full` 40 of the bundled vehicle of 60 s; count and seconds say otherwise.
+    budget: `quick` has 8 recordings of a quarter car and a rig of 15 s and a tower, `cases` 28, with weak effects and
+    more kinds of faults, `full` 40 of the bundled vehicle of 60 s; count and seconds say otherwise.
     stage: of the rules, if only one is asked for.
-    folder: where recordings that are done are kept; those of the same rules are not done again.
+    folder: where numbers that are done are kept; on the same recording and engine they are not varied again.
     part: "2/3": only every third recording, the second first, for processes beside each other with one folder.
     write: file for what was found, which the reasons of the rules quote.
     """
     count = count or {"quick": 8, "cases": 28, "full": 40}[budget]
     seconds = seconds or (60.0 if budget == "full" else 15.0)
     keys = [(name, one) for name, one in RULES.constants() if stage in ("", name)]
-    settings = [budget, seed, stage, count, seconds, [[name, one.name, _numbers(one)] for name, one in keys]]
+    settings = [budget, seed, count, seconds, engine_digest()]
     own, parts = (int(x) for x in part.split("/"))
     began, done = time.process_time(), []
     for number, (name, system, record) in enumerate(recordings(budget, count, seconds, seed)):
         if number % parts != own - 1:
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
-        told = _kept(file, settings)
-        if told is None:
-            subject = _known(name, system, record)  # one at a time: remembered fits take a gigabyte
-            varied = {f"{key}.{one.name}": found for key, one in keys if (found := vary(subject, key, one))}
-            told = {"recording": name, "verdict": subject.said.verdict, "findings": subject.said.findings}
-            told |= {"varied": varied}
-            _keep(file, settings, told)
+        told = _told(name, system, record, keys, _Kept(file, settings))
         done.append(told)
-        changed = {key: one["changed"] for key, one in told["varied"].items() if one["changed"]}
+        changed = {key: one["changed"] for key, one in told["varied"].items() if one and one["changed"]}
         yield {key: told[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
     lines = [figure(key, one, done) for key, one in keys]
     yield from lines
@@ -146,29 +144,53 @@ def run(
     }
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """What is known of a recording under some settings, in a file if there is one."""
+
+    file: Path | None
+    settings: list[Any]
+
+    def read(self) -> dict[str, Any]:
+        if self.file is None or not self.file.exists():
+            return {}
+        found = json.loads(self.file.read_text())
+        told: dict[str, Any] = found["told"] if found["settings"] == self.settings else {}
+        return told
+
+    def write(self, told: dict[str, Any]) -> None:
+        if self.file is not None:
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            beside = self.file.with_suffix(".part")
+            beside.write_text(json.dumps({"settings": self.settings, "told": told}))
+            beside.replace(self.file)
+
+
+def _told(
+    name: str, system: System, record: Falsified, keys: list[tuple[str, Field[Any]]], kept: _Kept
+) -> dict[str, Any]:
+    """What a recording says of all numbers; None of those that it does not read.  Varied are those not yet known."""
+    told = kept.read()
+    known = told.get("varied", {})
+    wanted = {f"{stage}.{one.name}": (stage, one) for stage, one in keys}
+    open_keys = [key for key, (_, one) in wanted.items() if known.get(key, {}).get("varied") != _numbers(one)]
+    if not told or open_keys:
+        subject = _known(name, system, record)  # one at a time: remembered fits take a gigabyte
+        told = {"recording": name, "verdict": subject.said.verdict, "findings": subject.said.findings}
+        for key in open_keys:
+            stage, one = wanted[key]
+            known[key] = {"varied": _numbers(one), "found": vary(subject, stage, one)}
+            kept.write(told | {"varied": known})
+    return told | {"varied": {key: known[key]["found"] for key in wanted}}
+
+
 def _numbers(number: Field[Any]) -> list[Any]:
     return [number.default, *number.metadata["range"]]
 
 
-def _kept(file: Path | None, settings: list[Any]) -> dict[str, Any] | None:
-    """What is known of a recording under these settings."""
-    if file is None or not file.exists():
-        return None
-    found: dict[str, Any] = json.loads(file.read_text())
-    return found["told"] if found["settings"] == settings else None
-
-
-def _keep(file: Path | None, settings: list[Any], told: dict[str, Any]) -> None:
-    if file is not None:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        beside = file.with_suffix(".part")
-        beside.write_text(json.dumps({"settings": settings, "told": told}))
-        beside.replace(file)
-
-
 def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | None:
     """Set a number to both ends of its range on a recording; what changes.  None: its stage does not read it."""
-    if (stage in ALONE or subject.reads) and stage != subject.reads:
+    if stage not in subject.reads if subject.reads else stage in ALONE:
         return None
     changed, decades = [], 0.0
     for end in number.metadata["range"]:
@@ -188,7 +210,7 @@ def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | N
 
 def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[str, Any]:
     """The line of a number, over all recordings that its stage reads."""
-    found = [one["varied"][key] for one in done if (key := f"{stage}.{number.name}") in one["varied"]]
+    found = [one for told in done if (one := told["varied"].get(f"{stage}.{number.name}"))]
     return {
         "stage": stage,
         "number": number.name,
@@ -244,11 +266,11 @@ def _known(name: str, system: System, record: Falsified) -> Subject:
     """A recording diagnosed under the usual rules, with the steps on the way."""
     options = Options(file=name, catalogue=CATALOGUE, memory=FitMemory())
     if is_component_test(system, record.values) or not system.file.inputs:
-        reads = "component" if system.file.inputs else "ambient"
+        reads = ALONE["component" if system.file.inputs else "ambient"]
         return Subject(name, system, record, options, Said.of(diagnose(system, record, options)), reads)
     state = begun(system, record, options, _silent)
     outcome = concluded(with_findings(state, _silent), _silent)
-    return Subject(name, system, record, options, Said.of(narrate(outcome, record)), "", state, outcome)
+    return Subject(name, system, record, options, Said.of(narrate(outcome, record)), (), state, outcome)
 
 
 def _silent(share: float, text: str) -> None:

@@ -131,15 +131,14 @@ CASES = (
 
 
 def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
-    """Recordings of a vehicle, wrong set-ups among them, then component tests; budget: quick, cases or full."""
+    """Of a vehicle, wrong set-ups among them, then component tests and a tower; budget: quick, cases or full."""
     rigs = max(1, count // 8)
     made = _vehicles if budget == "full" else quarter_cars
     for number, (what, system, record) in enumerate(made(count - rigs, seconds, seed)):
         yield f"{number}-{what}", system, record
-    if budget != "quick":
-        yield "tower", parse_system(TOWER), tower(np.random.default_rng(seed + 1))
     for number in range(rigs):
         yield f"rig-{number}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2 + number))
+    yield "tower", parse_system(TOWER), tower(np.random.default_rng(seed + 1))
 
 
 def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:

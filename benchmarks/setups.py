@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.verdict import SETUP_EFFECTS
+from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS
 from sprung.model.schema import MotionSensor
 from sprung.model.system import MANCHESTER, System, load_system
 
@@ -70,7 +70,7 @@ def run(count: int = 100, seed: int = 1, seconds: float = SECONDS, first: int = 
             top = report.findings[0] if report.findings else None
             place = frozenset(top.location.split("|")) if top else frozenset()
             hit = place == wrong.channels
-            other = [f for f in report.findings if f.effect not in SETUP_EFFECTS]
+            other = [f for f in report.findings if f.effect not in {effect.name for effect in SETUP_EFFECTS}]
             physical = any(f.location.split("|")[0] in system.elements for f in other)
             right, blamed, done = right + hit, blamed + physical, done + 1
             named += top is not None and top.effect == KINDS[kind]

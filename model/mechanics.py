@@ -158,83 +158,100 @@ class Mechanics:
 
 def assemble(file: SystemFile) -> Mechanics:
     """Mechanics of a checked system file."""
-    first_dof: dict[str, int] = {}
-    dofs: list[str] = []
-    body_of_dof: list[int] = []
-    mass: list[float] = []
-    for index, (name, body) in enumerate(file.bodies.items()):
-        first_dof[name] = len(dofs)
-        for axis, inertia in (("z", body.mass.value), ("roll", body.roll_inertia), ("pitch", body.pitch_inertia)):
-            if inertia is not None:
-                dofs.append(f"{name}.{axis}")
-                body_of_dof.append(index)
-                mass.append(inertia)
-    n = len(dofs)
+    freedom = _Freedom.of(file)
+    forces = [source for source in file.inputs.values() if isinstance(source, ForceInput)]
+    H, G = _deflections(file, freedom)
+    S, L = _sensor_rows(file, freedom)
+    support_drive, force_drive = _drives(file)
+    kinds = [VELOCITY if s.kind in RATES else SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]
+    F = [freedom.point(source.body, source.position) for source in forces]
+    return Mechanics(
+        dofs=freedom.dofs,
+        body_of_dof=np.array(freedom.body_of_dof),
+        centre=np.array([body.position for body in file.bodies.values()], dtype=float).reshape(-1, 2),
+        mass=np.array(freedom.mass),
+        stiffness=np.array([e.stiffness.value for e in file.elements.values()]),
+        damping=np.array([e.damping.value for e in file.elements.values()]),
+        H=H,
+        G=G,
+        F=np.array(F).reshape(len(F), len(freedom.dofs)).T,
+        S=S,
+        L=L,
+        sensor_kind=np.array(kinds),
+        support_drive=support_drive,
+        force_drive=force_drive,
+    )
 
-    def point(name: str, position: tuple[float, float] | None) -> FloatArray:
-        """Vertical motion of a point of a body as a row over degrees of freedom."""
-        body: Body = file.bodies[name]
+
+@dataclass(frozen=True)
+class _Freedom:
+    """Degrees of freedom of a file's bodies: z of every one, roll and pitch of those with an inertia."""
+
+    file: SystemFile
+    dofs: tuple[str, ...]
+    body_of_dof: tuple[int, ...]
+    mass: tuple[float, ...]
+
+    @classmethod
+    def of(cls, file: SystemFile) -> _Freedom:
+        axes = [
+            (f"{name}.{axis}", index, inertia)
+            for index, (name, body) in enumerate(file.bodies.items())
+            for axis, inertia in (("z", body.mass.value), ("roll", body.roll_inertia), ("pitch", body.pitch_inertia))
+            if inertia is not None
+        ]
+        return cls(file, tuple(a for a, _, _ in axes), tuple(i for _, i, _ in axes), tuple(m for _, _, m in axes))
+
+    def point(self, name: str, position: tuple[float, float] | None) -> FloatArray:
+        """Vertical motion of a point of a body as a row over degrees of freedom, (n,)."""
+        body: Body = self.file.bodies[name]
         x, y = position if position is not None else body.position
-        row = np.zeros(n)
-        at = first_dof[name]
-        row[at] = 1.0
-        if body.roll_inertia is not None:
-            at += 1
-            row[at] = y - body.position[1]
-        if body.pitch_inertia is not None:
-            row[at + 1] = x - body.position[0]
+        levers = {"z": 1.0, "roll": y - body.position[1], "pitch": x - body.position[0]}
+        row = np.zeros(len(self.dofs))
+        for axis, lever in levers.items():
+            if f"{name}.{axis}" in self.dofs:
+                row[self.dofs.index(f"{name}.{axis}")] = lever
         return row
 
-    supports = [name for name, source in file.inputs.items() if not isinstance(source, ForceInput)]
-    forces = [name for name, source in file.inputs.items() if isinstance(source, ForceInput)]
-    support_drive: list[int] = []
-    force_drive: list[int] = []
-    at = 0
-    for source in file.inputs.values():
-        (force_drive if isinstance(source, ForceInput) else support_drive).append(at)
-        at += 1 if isinstance(source, ForceInput) else 2
 
-    H = np.zeros((len(file.elements), n))
+def _deflections(file: SystemFile, freedom: _Freedom) -> tuple[FloatArray, FloatArray]:
+    """Deflections of the elements over degrees of freedom (E, n) and over supports (E, supports)."""
+    supports = [name for name, source in file.inputs.items() if not isinstance(source, ForceInput)]
+    H = np.zeros((len(file.elements), len(freedom.dofs)))
     G = np.zeros((len(file.elements), len(supports)))
     for e, element in enumerate(file.elements.values()):
         for end, sign in ((element.upper, 1.0), (element.lower, -1.0)):
             if end in file.bodies:
-                H[e] += sign * point(end, element.position)
+                H[e] += sign * freedom.point(end, element.position)
             elif end != "ground":
                 G[e, supports.index(end)] += sign
-    F = np.zeros((n, len(forces)))
-    for i, name in enumerate(forces):
-        source = file.inputs[name]
-        assert isinstance(source, ForceInput)
-        F[:, i] = point(source.body, source.position)
-    S = np.zeros((len(file.sensors), n))
+    return H, G
+
+
+def _sensor_rows(file: SystemFile, freedom: _Freedom) -> tuple[FloatArray, FloatArray]:
+    """Sensors over degrees of freedom (S, n) and over elements (S, E)."""
+    S = np.zeros((len(file.sensors), len(freedom.dofs)))
     L = np.zeros((len(file.sensors), len(file.elements)))
     elements = list(file.elements)
     for i, sensor in enumerate(file.sensors.values()):
         if isinstance(sensor, ElementSensor):
             L[i, elements.index(sensor.element)] = 1.0
         elif sensor.kind in RATES:
-            S[i, dofs.index(f"{sensor.body}.{sensor.kind.removesuffix('_rate')}")] = 1.0
+            S[i, freedom.dofs.index(f"{sensor.body}.{sensor.kind.removesuffix('_rate')}")] = 1.0
         else:
-            S[i] = point(sensor.body, sensor.position)
-    return Mechanics(
-        dofs=tuple(dofs),
-        body_of_dof=np.array(body_of_dof),
-        centre=np.array([body.position for body in file.bodies.values()], dtype=float).reshape(-1, 2),
-        mass=np.array(mass),
-        stiffness=np.array([e.stiffness.value for e in file.elements.values()]),
-        damping=np.array([e.damping.value for e in file.elements.values()]),
-        H=H,
-        G=G,
-        F=F,
-        S=S,
-        L=L,
-        sensor_kind=np.array(
-            [VELOCITY if s.kind in RATES else SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]
-        ),
-        support_drive=np.array(support_drive, dtype=np.int64),
-        force_drive=np.array(force_drive, dtype=np.int64),
-    )
+            S[i] = freedom.point(sensor.body, sensor.position)
+    return S, L
+
+
+def _drives(file: SystemFile) -> tuple[IntArray, IntArray]:
+    """Indices in u of the supports' displacements, each with its rate behind it, and of the forces."""
+    support_drive: list[int] = []
+    force_drive: list[int] = []
+    at = 0
+    for source in file.inputs.values():
+        (force_drive if isinstance(source, ForceInput) else support_drive).append(at)
+        at += 1 if isinstance(source, ForceInput) else 2
+    return np.array(support_drive, dtype=np.int64), np.array(force_drive, dtype=np.int64)
 
 
 def rigid_body_modes(stiffness: FloatArray) -> FloatArray:

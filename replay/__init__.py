@@ -1,10 +1,10 @@
 """Recordings and live buses as blocks of samples, and blocks of samples as windows.
 
 The doors: `open_recording` (files), `replay.live.LiveBus` (buses), `replay.windowing.Windower` (even windows)
-and `replay.record.load_record` (one long even record).
+and `replay.record.load_record` (one long even record).  Readers load when they are first used: those of CAN buses and
+of MF4 take seconds, which processes that read nothing need not wait for.
 """
 
-from sprung.replay.account import UnreadableRecording
-from sprung.replay.recording import Recording, open_recording
+import lazy_loader
 
-__all__ = ["Recording", "UnreadableRecording", "open_recording"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

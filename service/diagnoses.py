@@ -13,7 +13,8 @@ from typing import Any
 from sqlalchemy import Connection
 
 from sprung.model.system import MANCHESTER
-from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage, run, save_excerpt
+from sprung.service.diagnosing import run, save_excerpt
+from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.durable import sync_folder, sync_tree
 from sprung.service.engines import ServedModel
 from sprung.service.errors import Busy, UserError

@@ -10,15 +10,14 @@ import logging
 import math
 import threading
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from sprung.model.system import System
 from sprung.replay.account import Account
 from sprung.replay.record import Record
+from sprung.service.diagnosis_task import IMPROVED, DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.durable import sync_file, sync_folder
 from sprung.service.opening import open_record
 from sprung.service.ring import Excerpt
@@ -28,36 +27,7 @@ from sprung.service.worker import Emit
 log = logging.getLogger("sprung.diagnosis")
 
 SIGN_OF_LIFE_SECONDS = 2.0  # a stage may take longer
-IMPROVED = "system.yaml"  # in the report's folder: the system file with what was found
 STAGE_SHARE, STAGE_SECONDS = 0.1, 20.0  # a stage's usual part of the whole, and how soon most of it is done
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosisRequest:
-    """What to diagnose."""
-
-    path: Path
-    name: str  # of the recording, in the report
-    system: System
-    dbc: Path | None
-    out: Path  # folder for page, pictures and report; made when absent
-    system_text: str | None = None  # the file that the system was read from: what was found is written into a copy
-
-
-@dataclass(frozen=True, slots=True)
-class Stage:
-    """How far it is."""
-
-    share: float  # 0..1
-    text: str
-
-
-@dataclass(frozen=True, slots=True)
-class DiagnosisResult:
-    """What it came to."""
-
-    verdict: str
-    report: dict[str, Any]  # as `sprung diagnose --json` prints it
 
 
 def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:

@@ -13,7 +13,7 @@ import numpy as np
 
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.system import System
-from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.worker import Emit
 
 START = 1_790_000_000_000_000_000  # ns

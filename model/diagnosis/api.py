@@ -60,7 +60,7 @@ def diagnose(
     """
     tell, options = progress or (lambda share, text: None), options or Options()
     channels = record.values[:, : len(system.channels)]
-    if is_component_test(system, channels):
+    if is_component_test(system, channels, options.rules):
         return diagnose_components(system, record, options, tell)
     if system.signals:
         options = replace(options, catalogue=(*options.catalogue, *following_laws(system, record)))
@@ -68,7 +68,7 @@ def diagnose(
     if system.on_track or not system.file.inputs:
         whole = replace(options.rules.record, longest=len(record.values))
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
-        decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise, options.rules.ambient)
+        decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise, options.rules)
         if decay is None:
             return diagnose_unforced(system, prepared, record, options, tell)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)

@@ -54,6 +54,9 @@ class RecordRules:
     passed: float = rule(0.4, "of the slowest mode, edge of the filter for integrals; chosen", 0.3, 0.5)
     settled: float = rule(2.0, "periods of that edge lost at either end; derived: 1e-4 of a transient left", 1.5, 3.0)
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
+    resting: float = rule(0.5, "of the channels that repeat a value together: standstill; chosen", 0.3, 0.7)
+    held: float = rule(0.05, "Hz; derived: a slower mode is one that no stiffness holds", 0.02, 0.1)
+    least_noise: float = rule(0.2, "of a declared noise that an estimate may fall to; chosen: data sheets", 0.1, 0.4)
 
 
 @dataclass(frozen=True)
@@ -154,6 +157,8 @@ class NoiseRules:
     sigmas: float = rule(6.0, "by which the ratio leaves its peers'; derived: chance and modelling errors", 4.0, 8.0)
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
+    displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
+    velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,13 @@ class SetupRules:
     offset: float = rule(0.1, "m, from which a position is wrong; derived: less is a mounting tolerance", 0.05, 0.2)
     rounds: int = rule(2, "in which an accepted delay or scale is estimated again; chosen", 1, 4)
     most: int = rule(2, "faults of one recording; chosen", 1, 3)
+    few: int = rule(12, "promising hypotheses, up to which those on forces are fitted unranked; chosen", 6, 20)
+    part_steps: int = rule(8, "of the fit of a missing part; chosen: it then stands within 1 %", 5, 12)
+    asked: float = rule(0.2, "of another body that least squares must ask for; derived: a right one is 1", 0.1, 0.4)
+    above: float = rule(1.3, "times the fastest mode, from where masses alone are told; chosen", 1.15, 1.6)
+    by_mass: float = rule(0.5, "of the misfit there, that an explanation may leave; chosen", 0.35, 0.65)
+    soonest: float = rule(0.75, "samples of a delay there; derived: rounding a clock makes half of one", 0.5, 1.5)
+    gravity: float = rule(0.1, "of a log-ratio, within which it is standard gravity; chosen", 0.05, 0.2)
 
 
 @dataclass(frozen=True)
@@ -220,6 +232,15 @@ class ComponentRules:
     at_noise: float = rule(1.2, "of the power of the record's own noise; derived: a level's scatter", 1.1, 1.4)
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
+    lowest_knee: float = rule(0.3, "of the median rate; chosen: a valve that opens below acts as friction", 0.2, 0.5)
+    frame: float = rule(0.01, "of the rod's motion; chosen: a body that moves less is ground", 0.005, 0.02)
+    moves: float = rule(2.0, "noise deviations by which a rod has to move; chosen: 1 is noise alone", 1.5, 3.0)
+    rests: float = rule(0.004, "of the motion's deviation; chosen: less is standstill", 0.002, 0.008)
+    rest: float = rule(0.25, "s that a standstill lasts; chosen: a turning point is shorter", 0.15, 0.5)
+    stands_out: float = rule(3.0, "times the noise's power, that motion has; derived: 5 % of chance", 2.0, 5.0)
+    turned: float = rule(3.0, "times what speaks for its sign, that speaks against it; chosen", 2.0, 5.0)
+    preload: float = rule(5.0, "deviations of a preload that is told; derived: one in a million", 3.0, 8.0)
+    beside: int = rule(4, "trials that are refined beside the close laws; chosen", 2, 8)
 
 
 @dataclass(frozen=True)
@@ -240,6 +261,11 @@ class AmbientRules:
     spans: int = rule(100, "of a recording, in which the end of the motion is looked for; chosen", 50, 200)
     loud: float = rule(3.0, "level over the noise's, down to which a decay is followed; chosen", 2.0, 5.0)
     beyond: float = rule(1.2, "of the decay's length that is kept; chosen", 1.0, 1.5)
+    over_noise: float = rule(2.0, "times the noise; derived: below, a falling level is the noise's", 1.5, 3.0)
+    windows: int = rule(60, "of a structure that are looked at; chosen: more say the same", 30, 120)
+    windows_track: int = rule(8, "of a vehicle on an unmeasured track; chosen", 5, 16)
+    independent: int = rule(3, "windows that tell scatter; derived: two have one difference", 3, 5)
+    parts: int = rule(40, "of the band, in which powers are compared; chosen", 25, 60)
 
 
 @dataclass(frozen=True)

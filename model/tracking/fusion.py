@@ -32,6 +32,31 @@ KNOWN = 0.5  # a posterior narrower than this share of the prior counts as ident
 
 
 @dataclass(frozen=True)
+class _Window:
+    """A usable window at the deviations that are believed."""
+
+    mask: BoolArray  # parameters that it tells, (P,)
+    time_ns: int
+    centre: int  # ns
+    share: float  # of a window that is new
+    value: FloatArray  # log-ratios (P,)
+    covariance: FloatArray  # (P, P)
+    cross: FloatArray  # sensitivities to deviations (P, H)
+
+
+@dataclass(frozen=True)
+class _Filtered:
+    """What the filter makes of a window."""
+
+    belief: kalman.Belief
+    measured: scatter.Scatter
+    watch: surprise.Surprise
+    fresh: FloatArray  # variance of what is new in it, (P,)
+    plausible: FloatArray  # its values, no further from what was believed than OUTLYING, (P,)
+    bounded: bool
+
+
+@dataclass(frozen=True)
 class Fusion:
     """Constants of one tracker that the fusion of its windows needs."""
 
@@ -54,39 +79,73 @@ class Fusion:
         conditions: Conditions | None,
     ) -> tuple[TrackerState, Jump | None]:
         """Filter, scatter and change tests after a usable window; a deviation that is found to have jumped."""
-        settings, model, H = self.settings, self.model, self.model.size
+        settings, model = self.settings, self.model
         elapsed = np.inf if state.last is None else (time_ns - state.last) * 1e-9
-        share = min(1.0, elapsed / settings.window)
-        belief, calibration, jump = state.belief, state.calibration, None
+        share, belief = min(1.0, elapsed / settings.window), state.belief
         if state.last is not None:
             belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self.limit)
-        found = estimate.deviating if H else None
+        found = estimate.deviating if model.size else None
         belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
-        if found is not None and not found.whole:
+        belief, calibration, found, jump, agrees = self._weighed(state.calibration, belief, found, time_ns, share)
+        if estimate.faults and not agrees:  # mended by what is not believed yet: its values are of neither
+            undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
+            return replace(undecided, belief=belief, calibration=calibration), None
+        if jump is not None and self.armed(state):
+            calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
+            state = replace(state, changes=change_test.restarted(state.changes))
+        window = _Window(mask, time_ns, centre, share, *self._at_belief(estimate, found, calibration, belief, mask))
+        filtered = self._filtered(state, belief, calibration, window)
+        weather, tested = self._tested(state, calibration, conditions, window, filtered)
+        new = replace(
+            state,
+            last=time_ns,
+            used=state.used + 1,
+            outliers=state.outliers + int(filtered.bounded),
+            belief=filtered.belief,
+            scatter=filtered.measured,
+            surprise=filtered.watch,
+            changes=tested,
+            calibration=self._learned(state, tested, calibration, window.cross, filtered.belief),
+            weather=weather,
+            cargo=cargo,
+        )
+        return new, jump
+
+    def _weighed(
+        self,
+        calibration: dev.DeviationRecord,
+        belief: kalman.Belief,
+        found: Deviating | None,
+        time_ns: int,
+        share: float,
+    ) -> tuple[kalman.Belief, dev.DeviationRecord, Deviating | None, Jump | None, bool]:
+        """Deviations after a window; it as they take it, a jump, and whether it agrees with what is believed."""
+        model = self.model
+        if found is None:
+            return belief, calibration, None, None, True
+        if not found.whole:
             belief = dev.loaded(belief, model, found, share)
             gains = np.where(model.cargo, found.cross, calibration.cross)
             found = replace(found, cross=gains, point=np.where(model.cargo, found.point, 0.0))
-        elif found is not None:
-            apart = (time_ns - int(calibration.recent[-1])) * 1e-9
-            calibration, belief, jump, agrees = dev.weigh(
-                calibration, model, belief, found, min(1.0, apart / settings.window), time_ns
-            )
-            if estimate.faults and not agrees:  # mended by what is not believed yet: its values are of neither
-                undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
-                return replace(undecided, belief=belief, calibration=calibration), None
-            if jump is not None and self.armed(state):
-                calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
-                state = replace(state, changes=change_test.restarted(state.changes))
-        value, covariance, cross = self._at_belief(estimate, found, calibration, belief, mask)
-        variance = np.where(mask, covariance.diagonal(), 1.0)
-        open_ = self._open(calibration, belief, cross)
+            return belief, calibration, found, None, True
+        apart = (time_ns - int(calibration.recent[-1])) * 1e-9
+        weight = min(1.0, apart / self.settings.window)
+        calibration, belief, jump, agrees = dev.weigh(calibration, model, belief, found, weight, time_ns)
+        return belief, calibration, found, jump, agrees
 
+    def _filtered(
+        self, state: TrackerState, belief: kalman.Belief, calibration: dev.DeviationRecord, window: _Window
+    ) -> _Filtered:
+        """The belief corrected by a window as uncertain as windows have turned out to be; reopened where it lags."""
+        settings, mask, value = self.settings, window.mask, window.value
+        variance = np.where(mask, window.covariance.diagonal(), 1.0)
+        open_ = self._open(calibration, belief, window.cross)
         measured = scatter.update(
-            state.scatter, value, variance + open_, mask, time=time_ns, window=nanoseconds(settings.window)
+            state.scatter, value, variance + open_, mask, time=window.time_ns, window=nanoseconds(settings.window)
         )
         wide = np.sqrt(measured.inflation)
-        covariance = covariance * np.outer(wide, wide)
-        fresh = (variance + open_) * measured.inflation / share
+        covariance = window.covariance * np.outer(wide, wide)
+        fresh = (variance + open_) * measured.inflation / window.share
 
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
         reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.inflation)
@@ -96,47 +155,48 @@ class Fusion:
         )
         if jumped.any():
             belief = kalman.reopen(belief, jumped, settings.process)
-            if H:
-                belief = dev.unsure(belief, model)
+            if self.model.size:
+                belief = dev.unsure(belief, self.model)
+        cross = window.cross if self.model.size else None
         belief, innovation = kalman.correct(
-            belief, value, covariance, mask, share=share, bound=settings.outlier, cross=cross if H else None
+            belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross
         )
-        off = self._of_baseline(state, calibration, cross, belief)
+        return _Filtered(belief, measured, watch, fresh, plausible, innovation.bounded)
+
+    def _tested(
+        self,
+        state: TrackerState,
+        calibration: dev.DeviationRecord,
+        conditions: Conditions | None,
+        window: _Window,
+        filtered: _Filtered,
+    ) -> tuple[weathers.Weather, change_test.Changes]:
+        """Weather and change tests after a window, less what deviations and weather account for."""
+        settings, belief, fresh, mask = self.settings, filtered.belief, filtered.fresh, window.mask
+        off = self._of_baseline(state, calibration, window.cross, belief)
         at = weathers.features(conditions, self.load(belief))
         usable = mask & (state.changes.learned >= settings.learning)
         assert state.weather is not None
         weather = weathers.foreseen(state.weather, self.weather, at, learning=not self.armed(state))
-        left = np.where(usable, value - off - np.where(usable, state.changes.baseline, 0.0), 0.0)
-        weather = weathers.together(weather, self.weather, left, fresh, usable, centre)
+        left = np.where(usable, window.value - off - np.where(usable, state.changes.baseline, 0.0), 0.0)
+        weather = weathers.together(weather, self.weather, left, fresh, usable, window.centre)
         effect = np.where(usable, weather.effect + weathers.shared(weather, self.weather), 0.0)
         doubt = np.where(usable, weather.doubt, 0.0)
+        seconds = window.share * settings.window
         tested = change_test.update(
             state.changes,
-            value - off - effect,
+            window.value - off - effect,
             fresh,
             mask,
-            seconds=share * settings.window,
-            time=centre,
+            seconds=seconds,
+            time=window.centre,
             settings=settings,
-            plausible=plausible - off - effect,
+            plausible=filtered.plausible - off - effect,
             doubt=doubt,
         )
         still = usable & (tested.active == 0) & (np.maximum(tested.up, tested.down) < STILL)
-        weather = weathers.learned(weather, self.weather, left, fresh, still, at, centre, share * settings.window)
-        new = replace(
-            state,
-            last=time_ns,
-            used=state.used + 1,
-            outliers=state.outliers + int(innovation.bounded),
-            belief=belief,
-            scatter=measured,
-            surprise=watch,
-            changes=tested,
-            calibration=self._learned(state, tested, calibration, cross, belief),
-            weather=weather,
-            cargo=cargo,
-        )
-        return new, jump
+        weather = weathers.learned(weather, self.weather, left, fresh, still, at, window.centre, seconds)
+        return weather, tested
 
     def _loaded(
         self,

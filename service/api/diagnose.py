@@ -19,7 +19,7 @@ from sprung.service.api.recordings import job_dict
 from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import discard, receive
 from sprung.service.core import Core
-from sprung.service.diagnosing import IMPROVED
+from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.errors import NotFound
 from sprung.service.links import with_links
 from sprung.service.notify.events import vehicle_page

@@ -18,7 +18,7 @@ from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Version
 from sprung.service.core import Core
-from sprung.service.diagnosing import IMPROVED
+from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.errors import NotFound, UserError
 from sprung.service.store import fleet, vehicle_models, work
 from sprung.service.store.vehicle_models import SERVICE_FILE, ModelVersion

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
-from sprung.service.diagnosing import DiagnosisRequest, run
+from sprung.service.diagnosing import run
+from sprung.service.diagnosis_task import DiagnosisRequest
 from sprung.service.errors import UserError
 from sprung.service.fleet.backfill import KINDS, FoundFile, list_files, local_copy
 from sprung.service.fleet.tasks import Tasks

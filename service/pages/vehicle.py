@@ -16,7 +16,7 @@ from sprung.service.api.actions import mark_dict
 from sprung.service.api.fleet import load_view, silent_before
 from sprung.service.api.lists import report_dict
 from sprung.service.api.vehicle_model import models_answer
-from sprung.service.diagnosing import IMPROVED
+from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.pages.drawing import Mark, plan_view, side_view
 from sprung.service.pages.render import percent, render
 from sprung.service.pages.routes import HEALTH

@@ -22,7 +22,7 @@ class Obedient:
     """A subject whose verdict follows one number."""
 
     name = "made"
-    reads = ""
+    reads = ()
     said = RUBBING
     state = object()
 
@@ -52,7 +52,8 @@ def test_a_component_test_is_not_asked_about_vehicles() -> None:
 def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -> None:
     made = list(recordings("quick", 8, 3.0, 1))
     assert [name.split("-", 1)[1] for name, _, _ in made][:3] == ["friction", "weak friction", "cubic spring"]
-    assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made)
+    assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made[:-1])
+    assert made[-1][0] == "tower" and made[-1][2].values.shape == (18000, 2)
     healthy, rubbing = made[5][2].values, made[0][2].values
     assert np.std(healthy[:, 2]) > 0.1 and np.std(rubbing[:, 2]) > 0.1  # m/s^2
 
@@ -74,8 +75,20 @@ def test_a_recording_that_is_done_is_not_done_again(tmp_path: Path) -> None:
     again = list(run(stage="report", count=2, seconds=3.0, part="2/2", folder=tmp_path))
     assert first[0]["verdict"] == "missing_physics" and again[0]["verdict"] == "as kept"
     assert again[1:-1] == first[1:-1]
-    other = list(run(stage="verdict", count=2, seconds=3.0, part="2/2", folder=tmp_path))
-    assert other[0]["verdict"] == "missing_physics"  # of other settings: made anew
+    other = list(run(stage="report", count=2, seconds=3.0, part="2/2", seed=1, folder=tmp_path))
+    assert other[0]["verdict"] != "as kept"  # another recording
+
+
+def test_only_numbers_that_are_not_known_are_varied(tmp_path: Path) -> None:
+    list(run(stage="report", count=2, seconds=3.0, part="2/2", folder=tmp_path))
+    (kept,) = tmp_path.glob("*.json")
+    known = json.loads(kept.read_text())
+    known["told"]["varied"]["report.far"]["varied"] = [0, 0, 0]  # it had another value then
+    known["told"]["varied"]["report.loose"]["found"] = {"changed": [], "decades": 7.0}
+    kept.write_text(json.dumps(known))
+    list(run(stage="report", count=2, seconds=3.0, part="2/2", folder=tmp_path))
+    now = json.loads(kept.read_text())["told"]["varied"]
+    assert now["report.far"]["varied"] == [1.6, 1.1, 2.3] and now["report.loose"]["found"]["decades"] == 7.0
 
 
 def test_what_is_quoted_of_a_run_is_json_of_every_number_that_was_varied() -> None:

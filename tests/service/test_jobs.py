@@ -13,7 +13,8 @@ from sqlalchemy.exc import OperationalError
 
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.diagnosing import Stage, within
+from sprung.service.diagnosing import within
+from sprung.service.diagnosis_task import Stage
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.jobs import Jobs, Kind, Progress

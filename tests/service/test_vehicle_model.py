@@ -17,7 +17,7 @@ from sqlalchemy import select
 
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.diagnosing import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.engine import load_engine
 from sprung.service.settings import Settings
 from sprung.service.store.schema import audit

@@ -6,17 +6,17 @@ from itertools import pairwise
 
 import numpy as np
 
-from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES
 from sprung.model.diagnosis.record.signals import Signals, roughness
-from sprung.model.diagnosis.rules import RULES, AmbientRules
+from sprung.model.diagnosis.rules import RULES, AmbientRules, Rules
 from sprung.model.signals import FloatArray
 
 
-def decay_stretch(signals: Signals, noise: FloatArray, rules: AmbientRules = RULES.ambient) -> slice | None:
+def decay_stretch(signals: Signals, noise: FloatArray, all_rules: Rules = RULES) -> slice | None:
     """The samples in which the sensors only decay, with noise (S,) of one sample; None where they do not.
 
     What stands still afterwards is left out: it tells nothing, and a held-out part of it could not judge anything.
     """
+    rules = all_rules.ambient
     begin = _begin(signals, noise, rules)
     if begin is None:
         return None
@@ -27,7 +27,7 @@ def decay_stretch(signals: Signals, noise: FloatArray, rules: AmbientRules = RUL
     loud = [np.sqrt(np.mean(moved[a:b] ** 2, axis=0)).max() > rules.loud for a, b in pairwise(edges) if b > a]
     last = int(edges[int(np.flatnonzero(loud)[-1]) + 1]) if any(loud) else len(moved)
     end = begin + int(rules.beyond * last)
-    return slice(begin, None if end - begin < MINIMUM_SAMPLES else min(end, signals.samples))
+    return slice(begin, None if end - begin < all_rules.record.minimum_samples else min(end, signals.samples))
 
 
 def _begin(signals: Signals, noise: FloatArray, rules: AmbientRules) -> int | None:
@@ -36,7 +36,7 @@ def _begin(signals: Signals, noise: FloatArray, rules: AmbientRules) -> int | No
     blocks = [moved[a:b] for a, b in pairwise(edges)]
     level = np.array([np.sqrt(np.mean(np.mean((block / noise) ** 2, axis=0))) for block in blocks])
     first = int(np.argmax(level))
-    falling = np.maximum(level[first:], 2.0)  # below twice the noise nothing is told
+    falling = np.maximum(level[first:], rules.over_noise)
     if edges[first] > (1 - rules.least) * signals.samples or falling[-1] > rules.fallen * falling[0]:
         return None
     if np.any(falling[1:] > rules.rise * falling[:-1]):

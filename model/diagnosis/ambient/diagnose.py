@@ -19,6 +19,7 @@ from sprung.model.diagnosis.ambient.windows import (
     independent,
     with_known,
 )
+from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, verdict_of
 from sprung.model.diagnosis.record.channels import Prepared, TooLittleError
@@ -57,7 +58,8 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
     HeldOutErrors: `TooLittleError` where no window tells anything.
     """
     signals = prepared.signals
-    windows, note = all_windows(system, signals, lambda share: tell(0.05 + 0.5 * share, "windows"))
+    rules, memory = options.rules.ambient, options.memory or FitMemory()
+    windows, note = all_windows(system, signals, rules, memory, lambda share: tell(0.05 + 0.5 * share, "windows"))
     if not windows:
         seconds = min(system.window, signals.samples) / system.sample_rate
         raise TooLittleError(
@@ -67,16 +69,16 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
     tell(0.6, "what all windows say together")
     split = signals.start + options.train_share * signals.samples / signals.sample_rate
     first = [w for w in windows if w.end <= split] or windows
-    pooled = pool(first if len(first) > 2 else windows, options.rules.ambient)
+    pooled = pool(first if len(first) >= rules.independent else windows, rules)
     held = [w for w in windows if w.begin >= split - 1e-9]
     notes = [note] if note else []
     if not held:
         held = windows[-1:]
         notes.append("the recording is too short to hold a part back: what was fitted was judged on the same window")
     tell(0.8, "the last part under what the first part told")
-    shared = with_known(system, signals, held, pooled.log_ratio) or held
+    shared = with_known(system, signals, held, pooled.log_ratio, memory) or held
     varying = bool(np.any(pooled.varying))
-    errors, band = _errors(shared, held if varying else shared)
+    errors, band = _errors(shared, held if varying else shared, rules)
     tell(0.95, "report")
     report = _report(system, prepared, record, options, windows, pooled, errors, band)
     tell(1.0, "done")
@@ -97,7 +99,7 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
             continue
         value, std = theta[tells, p], sigma[tells, p]
         one = apart & tells
-        if one.sum() >= 3:
+        if one.sum() >= rules.independent:
             own, own_std = theta[one, p], sigma[one, p]
             centre = np.sum(own / own_std**2) / np.sum(1 / own_std**2)
             scatter = float(np.sum(((own - centre) / own_std) ** 2))
@@ -107,15 +109,17 @@ def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Po
         mean[p] = float(np.median(value)) if varying[p] else float(np.sum(value / std**2) / np.sum(1 / std**2))
         number = max(1, int(one.sum()))
         inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows tell the same thing twice
-        between = float(np.std(value)) / np.sqrt(number) if number > 2 else 0.0
+        between = float(np.std(value)) / np.sqrt(number) if number >= rules.independent else 0.0
         deviation[p] = max(inside, between)
     return Pooled(mean, deviation, varying, chance)
 
 
-def _errors(before: list[WindowResult], after: list[WindowResult]) -> tuple[HeldOutErrors, tuple[float, float]]:
+def _errors(
+    before: list[WindowResult], after: list[WindowResult], rules: AmbientRules
+) -> tuple[HeldOutErrors, tuple[float, float]]:
     """Before: one value of every parameter for all windows; after: with what varies."""
-    one, chance, _ = displaced([w for w, good in zip(before, independent(before), strict=True) if good])
-    own, _, band = displaced([w for w, good in zip(after, independent(after), strict=True) if good])
+    one, chance, _ = displaced([w for w, good in zip(before, independent(before), strict=True) if good], rules.parts)
+    own, _, band = displaced([w for w, good in zip(after, independent(after), strict=True) if good], rules.parts)
     return HeldOutErrors(np.sqrt(one), np.sqrt(own), np.sqrt(chance)), band
 
 
@@ -147,7 +151,7 @@ def _report(
         place = names[int(np.argmax(errors.after))]
         findings.insert(0, Finding(place, UNKNOWN, (), None, None, sentence=f"a misfit that no law explains: {where}"))
     track = tuple(_point(system, window) for window in windows)
-    share = errors.explained() if any(f.effect != UNKNOWN for f in findings) else None
+    share = errors.explained(options.rules.verdict) if any(f.effect != UNKNOWN for f in findings) else None
     values = tuple(
         ReportedParameter(p.name, value, value * float(s), p.nominal, p.unit)
         for p, value, s in zip(
@@ -168,7 +172,7 @@ def _report(
         findings=tuple(findings),
         augmented=values,
         augmented_validation=_figures(names, errors.after),
-        noise_floor=_figures(names, errors.bounded()),
+        noise_floor=_figures(names, errors.bounded(options.rules.verdict)),
         localization={},
         explained=share,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),

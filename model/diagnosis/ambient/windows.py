@@ -10,13 +10,11 @@ import numpy as np
 from sprung.model.ambient.identify import AmbientIdentifier, as_estimate
 from sprung.model.ambient.sensing import sensing
 from sprung.model.ambient.transient import TransientWindow
+from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.rules import AmbientRules
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
-
-MOST = 60  # windows that are looked at of structures; of vehicles on a track
-MOST_TRACK = 8
-PARTS = 40  # of the band, in which powers are compared
 
 Told = Callable[[float], None]
 
@@ -96,12 +94,12 @@ def times(signals: Signals, start: int, stop: int) -> tuple[float, float]:
     return signals.start + start / signals.sample_rate, signals.start + stop / signals.sample_rate
 
 
-def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], str]:
+def stretches(system: System, signals: Signals, rules: AmbientRules) -> tuple[list[tuple[int, int]], str]:
     """First and last samples of the windows, half overlapping, and what was left out, in words."""
     length = min(system.window, signals.samples)
     hop = max(1, length // 2)
     starts = list(range(0, signals.samples - length + 1, hop))
-    most = MOST_TRACK if system.on_track else MOST
+    most = rules.windows_track if system.on_track else rules.windows
     note = ""
     if len(starts) > most:
         chosen = np.unique(np.round(np.linspace(0, len(starts) - 1, most)).astype(int))
@@ -113,11 +111,26 @@ def stretches(system: System, signals: Signals) -> tuple[list[tuple[int, int]], 
     return [(start, start + length) for start in starts], note
 
 
-def all_windows(system: System, signals: Signals, tell: Told) -> tuple[list[WindowResult], str]:
+@dataclass(frozen=True)
+class _Remembering:
+    """Windows that are looked at once, however often they are asked for."""
+
+    looked: ShakenStructure | UnmeasuredTrack
+    memory: FitMemory
+
+    def result(self, start: int, stop: int, known: FloatArray | None) -> WindowResult | None:
+        sensors = np.ascontiguousarray(self.looked.signals.sensors[start:stop])
+        key = (type(self.looked), start, sensors.tobytes(), None if known is None else known.tobytes())
+        return self.memory.recall(key, lambda: self.looked.result(start, stop, known))
+
+
+def all_windows(
+    system: System, signals: Signals, rules: AmbientRules, memory: FitMemory, tell: Told
+) -> tuple[list[WindowResult], str]:
     """Every window that tells anything, and what was left out, in words."""
     kind = UnmeasuredTrack if system.on_track else ShakenStructure
-    looked = kind(system, signals)
-    cuts, note = stretches(system, signals)
+    looked = _Remembering(kind(system, signals), memory)
+    cuts, note = stretches(system, signals, rules)
     found = []
     for number, (start, stop) in enumerate(cuts):
         tell(number / len(cuts))
@@ -127,11 +140,13 @@ def all_windows(system: System, signals: Signals, tell: Told) -> tuple[list[Wind
     return found, note
 
 
-def with_known(system: System, signals: Signals, windows: list[WindowResult], known: FloatArray) -> list[WindowResult]:
+def with_known(
+    system: System, signals: Signals, windows: list[WindowResult], known: FloatArray, memory: FitMemory
+) -> list[WindowResult]:
     """The same windows under parameters (P,) that all of them share."""
     if system.on_track:
         return windows
-    looked, again = ShakenStructure(system, signals), []
+    looked, again = _Remembering(ShakenStructure(system, signals), memory), []
     for window in windows:
         start, stop = (round((at - signals.start) * signals.sample_rate) for at in (window.begin, window.end))
         result = looked.result(start, stop, known)
@@ -140,13 +155,14 @@ def with_known(system: System, signals: Signals, windows: list[WindowResult], kn
     return again
 
 
-def displaced(windows: list[WindowResult]) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
+def displaced(windows: list[WindowResult], parts: int) -> tuple[FloatArray, FloatArray, tuple[float, float]]:
     """Share of every sensor's power that the model puts at other frequencies, what chance gives, and where most is.
 
+    parts: of the band, in which powers are compared.
     Shares (S,) and (S,), frequencies in Hz.  Chance is that of the measured bins, whatever the model expects.
     """
     frequency = windows[0].powers.frequency
-    edges = np.linspace(frequency[0], frequency[-1] * (1 + 1e-9), min(PARTS, max(1, len(frequency) // 4)) + 1)
+    edges = np.linspace(frequency[0], frequency[-1] * (1 + 1e-9), min(parts, max(1, len(frequency) // 4)) + 1)
     sensors = windows[0].powers.whole.shape[1]
     apart, chance = np.zeros((len(edges) - 1, sensors)), np.zeros((len(edges) - 1, sensors))
     whole = np.zeros(sensors)

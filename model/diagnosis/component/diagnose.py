@@ -38,6 +38,7 @@ from sprung.model.diagnosis.report.report import (
     ReportedParameter,
     Unexplained,
 )
+from sprung.model.diagnosis.rules import VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -73,29 +74,29 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell(0.05, "channels, motion and noise")
-    records = component_records(system, record.values, record.sample_rate, options.train_share)
+    records = component_records(system, record.values, record.sample_rate, options.train_share, options.rules)
     judged = []
     for number, one in enumerate(records):
 
         def progress(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
             tell(share, f"{name}: {text}")
 
-        judged.append(_judge(replace(one, task=replace(one.task, rules=options.rules.component)), progress))
+        judged.append(_judge(one, options.rules.verdict, progress))
     tell(0.95, "report")
     report = _report(system, record, options, judged)
     tell(1.0, "done")
     return report
 
 
-def _judge(one: ComponentRecord, tell: Told) -> Judged:
+def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
     turned = _turned(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, tell=tell, given=one.given)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, noise_floor(one, final), turned)
-    share = judged.errors.explained()
-    left = bool(np.any(judged.errors.unexplained() > 0))
+    share = judged.errors.explained(rules)
+    left = bool(np.any(judged.errors.unexplained(rules) > 0))
     carried = bool(found.steps) and share is not None and share >= one.task.rules.named
     if left and not carried:
         tell("what is left, as an unnamed force")
@@ -113,7 +114,7 @@ def _turned(task: ComponentTask) -> bool:
     force = task.force[: task.split]
     solved = np.linalg.lstsq(columns, force, rcond=None)[0]
     with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
-    found: bool = sum(with_sign) < 0 and abs(min(with_sign)) > 3 * max(*with_sign, 0.0)
+    found: bool = sum(with_sign) < 0 and abs(min(with_sign)) > task.rules.turned * max(*with_sign, 0.0)
     return found
 
 
@@ -150,8 +151,8 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
     findings.sort(key=_rank)
     rules = replace(options.rules.verdict, carried=options.rules.component.named)
     verdict = verdict_of([f.effect for f in findings], errors, rules)
-    explained = errors.explained() if any(f.effect not in NO_FAULTS for f in findings) else None
-    left = errors.unexplained()
+    explained = errors.explained(rules) if any(f.effect not in NO_FAULTS for f in findings) else None
+    left = errors.unexplained(rules)
     names = [j.record.sensor for j in judged]
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
@@ -167,7 +168,7 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
         findings=tuple(findings),
         augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final)),
         augmented_validation=_figures(names, errors.after),
-        noise_floor=_figures(names, errors.bounded()),
+        noise_floor=_figures(names, errors.bounded(rules)),
         localization={
             j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual)) for j in judged
         },
@@ -203,7 +204,8 @@ def _findings(one: Judged) -> list[Finding]:
         findings.append(unknown_finding(one.record.element, unnamed, one.found.steps, mapped=one.surface is not None))
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     sign = -1.0 if one.reversed else 1.0
-    if abs(one.final.preload) > 5 * max(deviation, one.floor / np.sqrt(one.record.task.split)):
+    least = one.final.task.rules.preload * max(deviation, one.floor / np.sqrt(one.record.task.split))
+    if abs(one.final.preload) > least:
         findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
     return findings
 

@@ -49,7 +49,7 @@ class ComponentTask:
 
     @cached_property
     def seen(self) -> Seen:
-        return Seen.of(self.motion)
+        return Seen.of(self.motion, self.rules)
 
     def every(self, stride: int) -> ComponentTask:
         """The same thinned out."""

@@ -13,15 +13,12 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
-from sprung.model.diagnosis.record.channels import MINIMUM_SAMPLES, DiagnosisError, TooLittleError
+from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
+from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.laws.following import Covariate
 from sprung.model.schema import ElementSensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-_LONGEST_GAP = 0.05  # s, that is closed by interpolation
-_HARDLY = 0.01  # of the motion of the other end: a body that moves less is ground
-_STILL_MOTION = 2.0  # deviation over that of the displacement's noise: a test that moves less tells nothing
 
 
 @dataclass(frozen=True)
@@ -36,7 +33,7 @@ class ComponentRecord:
     given: ComponentModel = NO_LAWS  # laws of the system file
 
 
-def is_component_test(system: System, values: FloatArray) -> bool:
+def is_component_test(system: System, values: FloatArray, rules: Rules = RULES) -> bool:
     """Whether nothing has to be simulated: no bodies, or only ones that the measured forces hardly move.
 
     values (T, C): a recording's columns.  A foundation that a user invents for a damper on a test bench is one: its
@@ -65,7 +62,7 @@ def is_component_test(system: System, values: FloatArray) -> bool:
             for body in ends & held.keys():
                 held[body] += element.stiffness.value
     least = min(held.values())
-    return least > 0 and force / least < _HARDLY * float(min(moved))
+    return least > 0 and force / least < rules.component.frame * float(min(moved))
 
 
 def component_elements(system: System, held: set[str]) -> dict[str, str]:
@@ -79,7 +76,9 @@ def component_elements(system: System, held: set[str]) -> dict[str, str]:
     }
 
 
-def component_records(system: System, values: FloatArray, sample_rate: float, share: float) -> list[ComponentRecord]:
+def component_records(
+    system: System, values: FloatArray, sample_rate: float, share: float, rules: Rules = RULES
+) -> list[ComponentRecord]:
     """The component tests in a recording's columns (T, C), in the order of `system.channels`.
 
     Errors: `DiagnosisError` when a channel is missing, `TooLittleError` when too little is left or nothing moves.
@@ -91,7 +90,7 @@ def component_records(system: System, values: FloatArray, sample_rate: float, sh
             "supports) and a sensor {kind: force, element: ...} on it"
         )
     names = [channel.name for channel in (*system.channels, *system.signals)]
-    return [_record(system, values, names, sample_rate, e, s, share) for e, s in elements.items()]
+    return [_record(system, values, names, sample_rate, e, s, share, rules) for e, s in elements.items()]
 
 
 def _record(
@@ -102,11 +101,54 @@ def _record(
     element: str,
     sensor: str,
     share: float,
+    rules: Rules,
 ) -> ComponentRecord:
-    ends = system.file.elements[element]
     notes: list[str] = []
-    count = len(values)
-    displacement, velocity, has_velocity = np.zeros(count), np.zeros(count), True
+    displacement, velocity = _deflection(system, element, values, names, sample_rate, notes)
+    force = _column(values, names, sensor)
+    good = np.isfinite(displacement) & np.isfinite(force) & (True if velocity is None else np.isfinite(velocity))
+    first, last = _longest(good, max(1, int(rules.record.gap * sample_rate)))
+    if last - first < rules.record.minimum_samples:
+        raise TooLittleError(
+            f"too short to decide anything: {element} has {last - first} usable samples in a row; "
+            f"at least {rules.record.minimum_samples} are needed"
+        )
+    if last - first < len(values):
+        notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
+    part = slice(first, last)
+    d, f = _closed(displacement[part]), _closed(force[part])
+    v = None if velocity is None else _closed(velocity[part])
+    if np.std(d) <= rules.component.moves * white_noise(d) or np.ptp(d) == 0:
+        raise TooLittleError(f"too still to decide anything: {element} is not moved")
+    if np.ptp(f) == 0:
+        raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; nothing can be told without it")
+    rests = still_stretches(d, sample_rate, rules.component)
+    run = _between(rests, len(d), rules.record.minimum_samples)
+    if (run.start, run.stop) != (0, len(d)):
+        notes.append(
+            f"{element} stands still before {run.start / sample_rate:.2f} s and after {run.stop / sample_rate:.2f} s: "
+            "cut out; the force's noise was measured there"
+        )
+    begin = (first + run.start) / sample_rate
+    task = ComponentTask(
+        motion=element_motion(d[run], None if v is None else v[run], sample_rate, begin, rules.component),
+        force=f[run],
+        split=int(share * (run.stop - run.start)),
+        nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
+        rules=rules.component,
+        signals=covariates(system, values, sample_rate, element, notes),
+        noise=max(noise_at_rest(f, rests) or 0.0, white_noise(f[run])),
+    )
+    given = given_model(system, element, notes)
+    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes), given)
+
+
+def _deflection(
+    system: System, element: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
+) -> tuple[FloatArray, FloatArray | None]:
+    """Motion of an element's upper end less that of its lower, (T,); its rate where both ends' are measured."""
+    ends = system.file.elements[element]
+    displacement, velocity, has_velocity = np.zeros(len(values)), np.zeros(len(values)), True
     for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
         if end not in system.file.inputs:
             if end != "ground":
@@ -114,45 +156,16 @@ def _record(
             continue
         moved, rate = _motion_of(system, end, values, names, sample_rate, notes)
         displacement += sign * moved
-        if rate is None:
-            has_velocity = False
-        else:
-            velocity += sign * rate
-    force = _column(values, names, sensor)
-    good = np.isfinite(displacement) & np.isfinite(force) & (np.isfinite(velocity) | (not has_velocity))
-    first, last = _longest(good, max(1, int(_LONGEST_GAP * sample_rate)))
-    if last - first < MINIMUM_SAMPLES:
-        raise TooLittleError(
-            f"too short to decide anything: {element} has {last - first} usable samples in a row; "
-            f"at least {MINIMUM_SAMPLES} are needed"
-        )
-    if last - first < count:
-        notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
-    part = slice(first, last)
-    d, f, v = (_closed(series[part]) for series in (displacement, force, velocity))
-    if np.std(d) <= _STILL_MOTION * white_noise(d) or np.ptp(d) == 0:
-        raise TooLittleError(f"too still to decide anything: {element} is not moved")
-    if np.ptp(f) == 0:
-        raise DiagnosisError(f"sensor {sensor} is stuck: it repeats one value; nothing can be told without it")
-    rests = still_stretches(d, sample_rate)
-    rest = noise_at_rest(f, rests)
+        has_velocity &= rate is not None
+        velocity += sign * (rate if rate is not None else 0.0)
+    return displacement, velocity if has_velocity else None
+
+
+def _between(rests: list[slice], count: int, least: int) -> slice:
+    """What lies between standstill at the two ends of `count` samples; all of them where that is too little."""
     start = rests[0].stop if rests and rests[0].start == 0 else 0
-    stop = rests[-1].start if rests and rests[-1].stop == len(d) else len(d)
-    if stop - start < MINIMUM_SAMPLES:
-        start, stop = 0, len(d)
-    if (start, stop) != (0, len(d)):
-        notes.append(
-            f"{element} stands still before {start / sample_rate:.2f} s and after {stop / sample_rate:.2f} s: "
-            "cut out; the force's noise was measured there"
-        )
-    run = slice(start, stop)
-    motion = element_motion(d[run], v[run] if has_velocity else None, sample_rate, (first + start) / sample_rate)
-    nominal = NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping")))
-    signals = covariates(system, values, sample_rate, element, notes)
-    noise = max(rest or 0.0, white_noise(f[run]))
-    task = ComponentTask(motion, f[run], int(share * (stop - start)), nominal, signals=signals, noise=noise)
-    given = given_model(system, element, notes)
-    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes), given)
+    stop = rests[-1].start if rests and rests[-1].stop == count else count
+    return slice(start, stop) if stop - start >= least else slice(0, count)
 
 
 def _motion_of(

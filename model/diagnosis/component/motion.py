@@ -14,15 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.signals import FloatArray
 
 ComplexArray = NDArray[np.complexfloating]
 
 _ORDER = 6  # of the differences that tell white noise
 _BLOCKS = 40  # of them, the median counts: bursts are no noise
-_STANDS_OUT = 3.0  # power of a bin over that of the noise from which it is motion
-_STILL_SECONDS, _STILL_SAMPLES = 0.25, 25
-_STILL = 0.004  # of the whole motion's deviation: less is standstill
+_STILL_SAMPLES = 25  # at least, of a standstill
 
 
 @dataclass(frozen=True)
@@ -61,14 +60,14 @@ def white_noise(series: FloatArray) -> float:
     return float(np.sqrt(np.median([block.mean() for block in blocks])))
 
 
-def still_stretches(series: FloatArray, sample_rate: float) -> list[slice]:
-    """Where a motion (T,) stands still for at least a quarter of a second."""
-    span = max(_STILL_SAMPLES, int(_STILL_SECONDS * sample_rate))
+def still_stretches(series: FloatArray, sample_rate: float, rules: ComponentRules = RULES.component) -> list[slice]:
+    """Where a motion (T,) stands still."""
+    span = max(_STILL_SAMPLES, int(rules.rest * sample_rate))
     if len(series) < 4 * span:
         return []
     mean = uniform_filter1d(series, span)
     deviation = np.sqrt(np.maximum(uniform_filter1d(series**2, span) - mean**2, 0.0))
-    rests = deviation < max(_STILL * float(np.std(series)), 2.0 * white_noise(series))
+    rests = deviation < max(rules.rests * float(np.std(series)), 2.0 * white_noise(series))
     edges = np.flatnonzero(np.diff(np.concatenate([[0], rests.astype(int), [0]])))
     pairs = zip(edges[::2], edges[1::2], strict=True)
     return [slice(int(a), int(b)) for a, b in pairs if b - a >= span]
@@ -87,14 +86,18 @@ def noise_at_rest(series: FloatArray, stretches: list[slice]) -> float | None:
 
 
 def element_motion(
-    displacement: FloatArray, velocity: FloatArray | None, sample_rate: float, start: float = 0.0
+    displacement: FloatArray,
+    velocity: FloatArray | None,
+    sample_rate: float,
+    start: float = 0.0,
+    rules: ComponentRules = RULES.component,
 ) -> ElementMotion:
     """Motion from a measured displacement (T,) and, where there is one, a measured velocity (T,)."""
     count, step = len(displacement), 1 / sample_rate
     time = start + step * np.arange(count, dtype=np.float64)
     spectrum, omega, line = _continued(displacement, sample_rate)
     noise = white_noise(displacement)
-    passed = _wiener(spectrum, noise)
+    passed = _wiener(spectrum, noise, rules.stands_out)
     rate_spectrum = 1j * omega * passed * spectrum
     rate_power = omega**2 * passed**2 * noise**2
     if velocity is not None:
@@ -104,7 +107,7 @@ def element_motion(
         variance_d = (omega * noise) ** 2  # of the differentiated displacement
         share = variance_d / np.maximum(variance_d + max(level, 1e-300) ** 2, 1e-300)  # of the measured velocity
         rate_spectrum = share * seen + (1 - share) * 1j * omega * spectrum
-        rate_spectrum = _wiener(rate_spectrum, level) * rate_spectrum
+        rate_spectrum = _wiener(rate_spectrum, level, rules.stands_out) * rate_spectrum
         rate_power = share * level**2
     here = slice(count - 1, 2 * count - 1)
     rate = np.asarray(np.fft.irfft(rate_spectrum, 3 * count - 2)[here] + line, dtype=np.float64)
@@ -133,15 +136,15 @@ def _continued(series: FloatArray, sample_rate: float, odd: bool = True) -> tupl
     return np.fft.rfft(whole), omega, slope
 
 
-def _wiener(spectrum: ComplexArray, noise: float) -> FloatArray:
-    """Filter that passes what stands out of white noise, up to the highest such frequency."""
+def _wiener(spectrum: ComplexArray, noise: float, stands_out: float) -> FloatArray:
+    """Filter that passes what stands out of white noise by a ratio, up to the highest such frequency."""
     count = 2 * (len(spectrum) - 1)
     power = np.abs(spectrum) ** 2 / max(count, 1)
     reach = max(5, count // 400) | 1
     smooth = uniform_filter1d(median_filter(power, size=3), size=reach)
     level = max(noise**2, 1e-300)
     passed = np.clip(1 - level / np.maximum(smooth, 1e-300), 0.0, 1.0)
-    out = np.flatnonzero(smooth > _STANDS_OUT * level)
+    out = np.flatnonzero(smooth > stands_out * level)
     passed[(out[-1] + 1 if len(out) else 1) :] = 0.0
     found: FloatArray = passed
     return found

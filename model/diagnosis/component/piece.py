@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.rules import ComponentRules
+from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import UNKNOWN
@@ -38,12 +38,14 @@ class Seen:
     rate: FloatArray  # m/s, quantiles 0 .. 100 % of the magnitude, (101,)
     seconds: float
     step: float  # s
+    lowest_knee: float  # m/s: a valve that opens far below usual rates acts as friction, and is called so
 
     @classmethod
-    def of(cls, motion: ElementMotion) -> Seen:
+    def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> Seen:
         quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
         travel = 0.5 * float(np.ptp(motion.deflection))
-        return cls(max(travel, 1e-12), np.maximum(quantiles, 1e-12), len(motion.time) * motion.step, motion.step)
+        rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
+        return cls(max(travel, 1e-12), rate, seconds, motion.step, rules.lowest_knee * float(rate[50]))
 
     @property
     def rate_rms(self) -> float:

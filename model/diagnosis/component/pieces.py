@@ -25,7 +25,6 @@ from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA
 from sprung.model.signals import FloatArray
 
-_LOWEST_KNEE = 0.3  # of the median rate: a valve that opens far below usual rates acts as friction, and is called so
 _SHARPEST = 1e-6  # an exponent this close to 1 is 1
 _POLYTROPIC = 1.3  # of a gas: no test of usual rates tells it from the column's length
 
@@ -36,6 +35,10 @@ def _yields(seen: Seen) -> FloatArray:
 
 def _yield_limits(seen: Seen) -> tuple[float, float]:
     return (2e-4 * seen.travel, 0.8 * seen.travel)  # beyond it nothing yields: a spring that softens
+
+
+def _knee_limits(seen: Seen) -> tuple[float, float]:
+    return (seen.lowest_knee, float(seen.rate[97]))
 
 
 def _none(seen: Seen) -> FloatArray:
@@ -212,7 +215,7 @@ _BLOWOFF = Piece(
     _law("damper_blowoff"),
     ("knee",),
     lambda seen: grid(rates_at(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
-    lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))],
+    lambda seen: [_knee_limits(seen)],
     (-1,),
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e)),
     lambda p: (p[0],),
@@ -223,7 +226,7 @@ _TWO_KNEES = Piece(
     _wider("damper_blowoff"),
     ("knee", "knee_compression"),
     lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7]), rates_at(seen, [0.2, 0.4, 0.7])),
-    lambda seen: [(_LOWEST_KNEE * float(seen.rate[50]), float(seen.rate[97]))] * 2,
+    lambda seen: [_knee_limits(seen)] * 2,
     (-1, -1),
     lambda a, s, e: (s[0], 1 + a[0] / _damping(e), s[1], 1 + a[1] / _damping(e)),
     lambda p: (p[0], p[2]),

@@ -133,7 +133,7 @@ def _next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: Compo
     chosen = []
     for _error, model in trials:
         name = model.pieces[-1].key
-        if name not in seen and len(seen) >= rules.close + 4:
+        if name not in seen and len(seen) >= rules.close + rules.beside:
             continue
         seen[name] = seen.get(name, 0) + 1
         if seen[name] <= rules.starts:

@@ -86,7 +86,7 @@ def begun(system: System, record: Recorded, options: Options, tell: Progress) ->
     tell(0.02, "channels and noise")
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
     signals, split = cut(prepared.signals, options.train_share)
-    declared = declared_noise(system, signals)
+    declared = declared_noise(system, signals, options.rules.record)
     tell(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options)
     tell(0.15, "set-up: signs, channels, nodes, scales, positions")

@@ -35,10 +35,9 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
         supports = [state.signals.support_names[i] for i in pairs]
         d = (noise.displacement / declared.displacement)[pairs]
         v = (noise.velocity / declared.velocity)[pairs]
-        found += _outliers(
-            [f"{n}.displacement" for n in supports], d, np.ones(len(pairs), dtype=bool), 0.5 * count, rules
-        )
-        found += _outliers([f"{n}.velocity" for n in supports], v, np.ones(len(pairs), dtype=bool), 0.15 * count, rules)
+        every = np.ones(len(pairs), dtype=bool)
+        found += _outliers([f"{n}.displacement" for n in supports], d, every, rules.displacement * count, rules)
+        found += _outliers([f"{n}.velocity" for n in supports], v, every, rules.velocity * count, rules)
     return tuple(found)
 
 

@@ -41,7 +41,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     if state.setup_faults and not lost:  # they were undone before anything was fitted
         worst = np.sqrt(state.setup_faults[0].before / len(size))
         deciding = replace(errors, before=np.maximum(errors.before, worst))
-    effects = [fault.effect for fault in state.setup_faults]
+    effects = [fault.effect.name for fault in state.setup_faults]
     effects += [fault.term.law.name for fault in state.input_faults]
     effects += [SENSOR_STUCK.name] * len(state.prepared.stuck) + [SENSOR_NOISE.name] * len(noisy)
     effects += [found.trial.term.law.name for found in state.found]

@@ -18,20 +18,11 @@ import numpy as np
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation import setup_changes as changes
-from sprung.model.diagnosis.investigation.setup_hypotheses import (
-    ORDINARY,
-    hypotheses,
-    moves_sensor,
-)
-from sprung.model.diagnosis.investigation.setup_response import NOTHING, Group, Hypothesis, ModelResponse, relative
-from sprung.model.diagnosis.investigation.setup_structure import (
-    NEAR,
-    SetupScores,
-    Weighed,
-    moves_element,
-    structure_hypotheses,
-)
+from sprung.model.diagnosis.investigation.setup_effects import Hypothesis, SetupEffect, SetupPlace, Weighing
+from sprung.model.diagnosis.investigation.setup_hypotheses import hypotheses
+from sprung.model.diagnosis.investigation.setup_response import ModelResponse, relative
+from sprung.model.diagnosis.investigation.setup_scores import SetupScores
+from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.screening.score import Projector
@@ -41,24 +32,17 @@ from sprung.model.laws import StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_FEW = 12  # hypotheses that are all fitted where spectra cannot rank them
-_PART_STEPS = 8  # of the fit of a part
-_SMALL = 0.05  # of a sample, or of a ratio, of differences
-
 
 @dataclass(frozen=True)
 class SetupFault:
     """One accepted fault of the set-up."""
 
-    effect: str  # a word of the contract
-    location: str  # channels joined by "|"
+    effect: SetupEffect
+    site: SetupPlace
     value: float | None  # time s, ratio, offset m
     std: float
     before: float  # misfit of all sensors without and with it
     after: float
-    axis: int = 0  # of a position
-    group: Group = NOTHING
-    detail: str = ""  # in words: where an element belongs
 
 
 def without_setup_faults(
@@ -74,7 +58,7 @@ def without_setup_faults(
             break
         fault, system, mended, problem, fit = best
         split, signals = fitted_samples(signals, mended, split), mended
-        if any(fault.location == known.location for known in found):
+        if any(fault.site.location == known.site.location for known in found):
             break
         found.append(fault)
         present = misfit(fit)
@@ -86,7 +70,7 @@ def _left_beside_a_part(problem: Problem, fit: Fit) -> float:
     laws = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
     hits = [hit for hit, _ in structure_candidates(Projector(problem, fit), laws)]
     best = sorted(hits, key=lambda hit: -hit.score)[: problem.rules.setup.parts]
-    fits = [try_optimise(problem, start_of(fit, hit), _PART_STEPS) for hit in best]
+    fits = [try_optimise(problem, start_of(fit, hit), problem.rules.setup.part_steps) for hit in best]
     return min((float(np.sum(misfit(one))) for one in fits if one is not None), default=np.inf)
 
 
@@ -132,7 +116,7 @@ def _best(
                     return _sharpened(fault, declared, fitted)
                 accepted.append((_fault(hypothesis, total, left), changed, mended, other, again))
         best = min(accepted, key=lambda one: one[0].after, default=None)
-        if best is not None and best[0].effect not in ORDINARY:
+        if best is not None and not best[0].effect.ordinary:
             return _sharpened(best, declared, fitted_samples(signals, best[2], split))
     return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
 
@@ -141,28 +125,28 @@ def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total:
     """Hypotheses worth fitting, the most promising first: of channels, then of the system file."""
     rules = problem.rules.setup
     nominal = Forward(system, fit.forward.part, problem.sensors, np.zeros(len(fit.point.theta)))
-    promising: dict[tuple[str, str, bool], Hypothesis] = {}
+    promising: dict[tuple[SetupEffect, str, bool], Hypothesis] = {}
     for one in (ModelResponse.of(problem, fit.forward), ModelResponse.of(problem, nominal)):
         whole = one.left(one.shown)
         for hypothesis in hypotheses(one, system, signals, rules):
-            key = (hypothesis.effect, hypothesis.location, hypothesis.by_mass)
+            key = (hypothesis.effect, hypothesis.site.location, hypothesis.by_mass)
             share = replace(hypothesis, left=hypothesis.left / whole)
             # under a measured force spectra at wrong resonances say nothing of its sign
-            always = problem.process_noise and hypothesis.effect == "sign_reversed" and "|" not in hypothesis.location
+            always = problem.process_noise and hypothesis.unranked
             good = always or hypothesis.by_mass or share.left < rules.promising
             if good and (key not in promising or share.left < promising[key].left):
                 promising[key] = share
     by_left = sorted(promising.values(), key=lambda h: h.left)
-    few = len(promising) <= _FEW
+    few = len(promising) <= rules.few
     forced = [h for h in by_left if few and h.left >= rules.promising and not h.by_mass]
     ranked = [h for h in by_left if h.by_mass]
-    ranked += [h for h in by_left if h.effect not in ORDINARY and h not in (*forced, *ranked)][: rules.tried] + forced
+    ranked += [h for h in by_left if not h.effect.ordinary and h not in (*forced, *ranked)][: rules.tried] + forced
     if ranked:
-        yield ranked + [h for h in by_left if h.effect in ORDINARY][: rules.beside]
-    of_file: dict[tuple[str, str, str], Hypothesis] = {}
+        yield ranked + [h for h in by_left if h.effect.ordinary][: rules.beside]
+    of_file: dict[tuple[SetupEffect, str, str], Hypothesis] = {}
     for hypothesis in sorted(structure_hypotheses(problem, fit, rules), key=lambda h: h.left):
         if hypothesis.left < rules.promising * total:
-            of_file.setdefault((hypothesis.effect, hypothesis.location, hypothesis.detail), hypothesis)
+            of_file.setdefault((hypothesis.effect, hypothesis.site.location, hypothesis.site.detail), hypothesis)
     yield list(of_file.values())[: rules.tried]
 
 
@@ -170,55 +154,23 @@ def _fault(hypothesis: Hypothesis, before: float, after: float) -> SetupFault:
     """With a rough deviation of its value: by what is left of the misfit."""
     value = hypothesis.value
     std = 0.0 if value is None else float(abs(value) * np.sqrt(after) / 3)
-    return SetupFault(
-        hypothesis.effect,
-        hypothesis.location,
-        value,
-        std,
-        before,
-        after,
-        hypothesis.axis,
-        hypothesis.group,
-        hypothesis.detail,
-    )
+    return SetupFault(hypothesis.effect, hypothesis.site, value, std, before, after)
 
 
 def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
     """A delay, scale or position estimated again on the structure fitted without it, which had absorbed some of it."""
     fault, system, signals, problem, fit = accepted
-    if fault.value is None:
+    effect = fault.effect
+    if fault.value is None or effect.left is None:
         return accepted
     rules, value, std = problem.rules, fault.value, fault.std
     for _ in range(rules.setup.rounds):
-        found, unit = _weighed(fault, system, problem, fit)
+        weighing = Weighing(SetupScores(problem, fit), ModelResponse.of(problem, fit.forward), system)
+        found, unit = effect.left(fault.site, weighing)
         change, std = found.amount * unit, found.std * unit
-        value = value * (1 + change) if fault.effect == "wrong_scale" else value + change
-        system, mended = _undo(fault, system, change)(system, signals)
+        value = effect.further(value, change)
+        system, mended = effect.remainder(fault.site, change)(system, signals)
         split, signals = fitted_samples(signals, mended, split), mended
         problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory)
-    std *= value if fault.effect == "wrong_scale" else 1.0
+    std *= value if effect.relative else 1.0
     return replace(fault, value=value, std=std, after=float(np.sum(misfit(fit)))), system, signals, problem, fit
-
-
-def _weighed(fault: SetupFault, system: System, problem: Problem, fit: Fit) -> tuple[Weighed, float]:
-    """What is left of a fault that was undone, in units of seconds, of the ratio or of metres."""
-    scores, one = SetupScores(problem, fit), ModelResponse.of(problem, fit.forward)
-    if fault.effect == "node_delay":
-        unit = _SMALL * one.step
-        return scores.of(one.late(fault.group, unit) - one.shown), unit
-    if fault.effect == "wrong_scale":
-        return scores.of(one.scaled(fault.group, 1 + _SMALL) - one.shown), _SMALL
-    move = changes.moved_element if fault.location in system.elements else changes.moved_sensor
-    return scores.of_system(move(system, fault.location, fault.axis, NEAR)), NEAR
-
-
-def _undo(fault: SetupFault, system: System, change: float) -> changes.Undo:
-    """Undoes a little more of a fault."""
-    group = fault.group
-    if fault.effect == "node_delay":
-        return changes.advance(group.sensors, group.supports, change, group.forces)
-    if fault.effect == "wrong_scale":
-        return changes.scale(group.sensors, group.supports, group.supports, 1 + change, group.forces)
-    if fault.location in system.elements:
-        return moves_element(fault.location, fault.axis, change)
-    return moves_sensor(fault.location, fault.axis, change)

@@ -8,19 +8,26 @@ from itertools import combinations
 import numpy as np
 
 from sprung.model.diagnosis.investigation import setup_changes as changes
-from sprung.model.diagnosis.investigation.setup_response import Group, Hypothesis, ModelResponse
+from sprung.model.diagnosis.investigation.setup_effects import (
+    CHANNELS_SWAPPED,
+    NODE_DELAY,
+    ONE_GAIN,
+    ONE_LAG,
+    SENSOR_POSITION,
+    SIGN_REVERSED,
+    WRONG_SCALE,
+    Hypothesis,
+    SetupPlace,
+)
+from sprung.model.diagnosis.investigation.setup_response import Group, ModelResponse
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.rules import SetupRules
-from sprung.model.laws.sensor_faults import SENSOR_GAIN, SENSOR_LAG
 from sprung.model.schema import MotionSensor
 from sprung.model.system import System
 
-ORDINARY = (SENSOR_GAIN.name, SENSOR_LAG.name)  # that screening seeks; they only have to be beaten
 _ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
-_ABOVE = 1.3  # times the fastest mode, from where masses alone are told
-_LATE, _TELLS = 0.75, 0.5  # samples of a delay; of the misfit there that an explanation may leave
-_UNIT, STANDARD_GRAVITY = 0.1, 9.80665  # of a log ratio that is a unit; m/s^2
+_STANDARD_GRAVITY = 9.80665  # m/s^2
 _ALIKE = 1e-6  # m, of positions that mirror each other
 
 
@@ -121,10 +128,11 @@ def _signs(one: ModelResponse, signals: Signals, wired: Wiring) -> Iterator[Hypo
         if len(group.supports) == 1 and not group.sensors:
             name = signals.support_names[group.supports[0]]
         left = one.left(one.turned(group))
-        yield Hypothesis("sign_reversed", name, None, left, changes.turn(group.sensors, group.supports), group)
+        undo, alone = changes.turn(group.sensors, group.supports), len(group.sensors) + len(group.supports) == 1
+        yield Hypothesis(SIGN_REVERSED, SetupPlace(name, group), None, left, undo, unranked=alone)
     for j, name in enumerate(signals.force_names):
         left = one.left(one.shown - 2 * one.of_force[:, :, j])
-        yield Hypothesis("sign_reversed", name, None, left, changes.turn(forces=[j]))
+        yield Hypothesis(SIGN_REVERSED, SetupPlace(name), None, left, changes.turn(forces=[j]), unranked=True)
 
 
 def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
@@ -132,9 +140,8 @@ def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiri
         names = [signals.sensor_names[i] for pair in sensors for i in pair]
         names += [signals.support_names[j] for pair in supports for j in pair]
         left = one.left(_exchanged(one, sensors, supports))
-        return Hypothesis(
-            "channels_swapped", "|".join(names), None, left, changes.exchange(list(sensors), list(supports))
-        )
+        undo = changes.exchange(list(sensors), list(supports))
+        return Hypothesis(CHANNELS_SWAPPED, SetupPlace("|".join(names)), None, left, undo)
 
     for i, j in combinations(range(len(wired.sensors)), 2):
         if wired.kind[i] == wired.kind[j]:
@@ -171,8 +178,7 @@ def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
             continue
         late = one.delay(group, rules.latest)
         if late > 0:
-            undo = changes.advance(group.sensors, group.supports, late)
-            yield Hypothesis("node_delay", wired.name(group), late, one.left(one.late(group, late)), undo, group)
+            yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, one.left(one.late(group, late)))
 
 
 def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -183,8 +189,8 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
             continue  # the same as all sensors the other way
         ratio = one.ratio(group)
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
-            undo = changes.scale(group.sensors, group.supports, group.supports, ratio)
-            yield Hypothesis("wrong_scale", wired.name(group), ratio, one.left(one.scaled(group, ratio)), undo, group)
+            left = one.left(one.scaled(group, ratio))
+            yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, left)
 
 
 def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -196,7 +202,7 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     """
     if len(wired.sensors) < 2:
         return
-    inert = one.above(_ABOVE * one.highest_mode)
+    inert = one.above(rules.above * one.highest_mode)
     before = inert.left(inert.shown)
     sensors, forces = (
         Group(tuple(range(len(wired.sensors)))),
@@ -205,19 +211,17 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     late = inert.delay(sensors, rules.latest)
     group = sensors if late > 0 else forces
     late = late if late > 0 else inert.delay(forces, rules.latest)
-    if late > _LATE * one.step and inert.left(inert.late(group, late)) < _TELLS * before:
-        undo = changes.advance(group.sensors, (), late, group.forces)
+    if late > rules.soonest * one.step and inert.left(inert.late(group, late)) < rules.by_mass * before:
         left = one.left(one.late(group, late))
-        yield Hypothesis("node_delay", wired.name(group), late, left, undo, group, by_mass=True)
+        yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, left, by_mass=True)
     ratio = inert.ratio(sensors)
     if not (np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale)):
         return
-    group = sensors if abs(abs(np.log(ratio)) - np.log(STANDARD_GRAVITY)) < _UNIT else forces
+    group = sensors if abs(abs(np.log(ratio)) - np.log(_STANDARD_GRAVITY)) < rules.gravity else forces
     ratio = ratio if group is sensors else 1 / ratio
-    if inert.left(inert.scaled(group, ratio)) < _TELLS * before:
-        undo = changes.scale(group.sensors, (), (), ratio, group.forces)
+    if inert.left(inert.scaled(group, ratio)) < rules.by_mass * before:
         left = one.left(one.scaled(group, ratio))
-        yield Hypothesis("wrong_scale", wired.name(group), ratio, left, undo, group, by_mass=True)
+        yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, left, by_mass=True)
 
 
 def _positions(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -234,13 +238,7 @@ def _positions(one: ModelResponse, system: System, signals: Signals, rules: Setu
             if abs(offset) >= rules.offset:
                 shown = one.shown
                 shown[:, i] += offset * change
-                moved = moves_sensor(name, axis, offset)
-                yield Hypothesis("wrong_position", name, offset, one.left(shown), moved, Group((i,)), axis)
-
-
-def moves_sensor(name: str, axis: int, offset: float) -> changes.Undo:
-    """A sensor where it is."""
-    return changes.in_system(lambda system: changes.moved_sensor(system, name, axis, offset))
+                yield Hypothesis.of(SENSOR_POSITION, SetupPlace(name, Group((i,)), axis), offset, one.left(shown))
 
 
 def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: int) -> tuple[float, ComplexArray]:
@@ -257,10 +255,8 @@ def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: i
 def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
     """Gain and lag of single sensors: no faults of a set-up, but what a position may be mistaken for."""
     for i, name in enumerate(map(str, signals.sensor_names)):
-        group = Group((i,))
+        site = SetupPlace(name, group := Group((i,)))
         ratio, late = one.ratio(group), one.delay(group, rules.latest)
         if ratio > 0:
-            undo = changes.scale([i], (), (), ratio)
-            yield Hypothesis(SENSOR_GAIN.name, name, ratio, one.left(one.scaled(group, ratio)), undo, group)
-        undo = changes.advance([i], (), late)
-        yield Hypothesis(SENSOR_LAG.name, name, late, one.left(one.late(group, late)), undo, group)
+            yield Hypothesis.of(ONE_GAIN, site, ratio, one.left(one.scaled(group, ratio)))
+        yield Hypothesis.of(ONE_LAG, site, late, one.left(one.late(group, late)))

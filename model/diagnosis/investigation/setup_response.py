@@ -8,7 +8,6 @@ import numpy as np
 from scipy.optimize import minimize_scalar
 
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.setup_changes import Undo
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.signals import FloatArray
@@ -24,21 +23,6 @@ class Group:
 
 
 NOTHING = Group()
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """A fault of the set-up and how to undo it."""
-
-    effect: str  # a word of the contract
-    location: str  # channels joined by "|", or an element
-    value: float | None  # time s, ratio, offset m
-    left: float  # misfit by spectra
-    undo: Undo
-    group: Group = NOTHING
-    axis: int = 0  # of a position
-    detail: str = ""  # in words
-    by_mass: bool = False  # told above all modes: to be fitted whatever spectra at wrong resonances say
 
 
 def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:

@@ -17,6 +17,7 @@ from typing import Literal
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.basis import UNKNOWN
@@ -24,10 +25,7 @@ from sprung.model.laws.formula import EFFECT
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
-SETUP_EFFECTS = frozenset(
-    {"node_delay", "sign_reversed", "channels_swapped", "wrong_scale", "wrong_position", "wrong_body"}
-)
-SENSOR_FAULTS = frozenset({law.name for law in CATALOGUE if law.fault} | SETUP_EFFECTS)
+SENSOR_FAULTS = frozenset([law.name for law in CATALOGUE if law.fault] + [effect.name for effect in SETUP_EFFECTS])
 UNLISTED = frozenset({UNKNOWN, EFFECT})  # physics that no law of the catalogue explains
 NO_FAULTS = frozenset({law.name for law in CATALOGUE if law.nuisance})
 

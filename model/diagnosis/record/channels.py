@@ -18,8 +18,6 @@ from sprung.model.simulate.drives import ORDERS
 from sprung.model.simulate.fusion import motion
 from sprung.model.system import System
 
-MINIMUM_SAMPLES = RULES.record.minimum_samples
-
 
 class DiagnosisError(ValueError):
     """The recording cannot be diagnosed; the message says what is missing and what to do."""
@@ -51,7 +49,7 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     notes: list[str] = []
     resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
     notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
-    still = standstill(values, max(int(sample_rate), 20))
+    still = standstill(values, max(int(sample_rate), 20), rules.resting)
     if still.any() and not still.all():
         values[still] = np.nan
         notes.append(
@@ -163,6 +161,49 @@ def _close_gaps(values: FloatArray) -> FloatArray:
     return values
 
 
+@dataclass(frozen=True)
+class _Inputs:
+    """Measured inputs by role."""
+
+    displacement: list[FloatArray]
+    velocity: list[FloatArray]
+    force: list[FloatArray]
+    integrated: list[bool]
+    accelerated: list[bool]
+    support_names: list[str]
+    force_names: list[str]
+    levelled: FloatArray | None  # the acceleration of a support that nothing else tells of: then it is the only one
+
+
+def _inputs(system: System, values: FloatArray, dt: float, frozen: set[str], notes: list[str]) -> _Inputs:
+    """Inputs from the columns (T, C) of a recording.  Errors: `DiagnosisError` when one is missing."""
+    found = _Inputs([], [], [], [], [], [], [], None)
+    column = 0
+    for name, source in system.file.inputs.items():
+        if isinstance(source, TrackInput):  # nobody measures it
+            continue
+        quantities = list(source.measured) if isinstance(source, SupportInput) else [""]
+        there = {q: values[:, column + i] for i, q in enumerate(quantities) if not np.isnan(values[0, column + i])}
+        column += len(quantities)
+        if not there:
+            raise DiagnosisError(_missing(name, frozen))
+        if not isinstance(source, SupportInput):
+            found.force.append(there[""])
+            found.force_names.append(name)
+            continue
+        if set(there) == {"acceleration"} and carries_everything(system, name):
+            found = replace(found, levelled=there["acceleration"])
+        elif "displacement" not in there and "displacement" in quantities:
+            notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
+        d, v = _moved(source, there, dt)
+        found.displacement.append(d)
+        found.velocity.append(v)
+        found.integrated.append("displacement" not in there)
+        found.accelerated.append("acceleration" in there)
+        found.support_names.append(name)
+    return found
+
+
 def _by_role(
     system: System,
     values: FloatArray,
@@ -171,37 +212,8 @@ def _by_role(
     notes: list[str],
     first: int,
 ) -> Prepared:
-    displacement, velocity, force, integrated, accelerated = [], [], [], [], []
-    support_names, force_names = [], []
-    column = 0
-    levelled: FloatArray | None = None  # the acceleration of a support that nothing else tells of
     frozen = {name for name, _ in stuck}
-    for name, source in system.file.inputs.items():
-        if isinstance(source, TrackInput):  # nobody measures it
-            continue
-        if not isinstance(source, SupportInput):
-            series = values[:, column]
-            column += 1
-            if np.isnan(series[0]):
-                raise DiagnosisError(_missing(name, frozen))
-            force.append(series)
-            force_names.append(name)
-            continue
-        quantities = list(source.measured)
-        there = {q: values[:, column + i] for i, q in enumerate(quantities) if not np.isnan(values[0, column + i])}
-        column += len(quantities)
-        if not there:
-            raise DiagnosisError(_missing(name, frozen))
-        if set(there) == {"acceleration"} and carries_everything(system, name):
-            levelled = there["acceleration"]
-        elif "displacement" not in there and "displacement" in quantities:
-            notes.append(f"{name}.displacement is missing: integrated from its {next(iter(there))}")
-        d, v = _moved(source, there, 1 / sample_rate)
-        displacement.append(d)
-        velocity.append(v)
-        integrated.append("displacement" not in there)
-        accelerated.append("acceleration" in there)
-        support_names.append(name)
+    inputs = _inputs(system, values, 1 / sample_rate, frozen, notes)
     sensors = values[:, len(system.inputs) :]
     present = np.isfinite(sensors).all(axis=0)
     if not present.any():
@@ -209,22 +221,22 @@ def _by_role(
     for name in np.array(system.sensors)[~present]:
         if name not in frozen:
             notes.append(f"sensor {name} is missing: diagnosed without it")
-    if levelled is not None:  # then it is the only support
-        kept = _second_derivative(displacement[0], levelled, 1 / sample_rate)
+    if inputs.levelled is not None:
+        kept = _second_derivative(inputs.displacement[0], inputs.levelled, 1 / sample_rate)
         sensors = _without_offsets(sensors, kept, system.mechanics.sensor_kind == ACCELERATION)
     empty = np.zeros((len(values), 0))
     signals = Signals(
         sample_rate=sample_rate,
-        displacement=np.column_stack(displacement) if displacement else empty,
-        velocity=np.column_stack(velocity) if velocity else empty,
-        force=np.column_stack(force) if force else empty,
+        displacement=np.column_stack(inputs.displacement) if inputs.displacement else empty,
+        velocity=np.column_stack(inputs.velocity) if inputs.velocity else empty,
+        force=np.column_stack(inputs.force) if inputs.force else empty,
         sensors=sensors[:, present],
         sensor_index=np.flatnonzero(present),
         sensor_names=tuple(np.array(system.sensors)[present]),
-        support_names=tuple(support_names),
-        force_names=tuple(force_names),
-        integrated=np.array(integrated, dtype=bool),
-        accelerated=np.array(accelerated, dtype=bool),
+        support_names=tuple(inputs.support_names),
+        force_names=tuple(inputs.force_names),
+        integrated=np.array(inputs.integrated, dtype=bool),
+        accelerated=np.array(inputs.accelerated, dtype=bool),
         start=first / sample_rate,
         speed=values[:, : len(system.inputs)] if system.on_track else empty,
     )

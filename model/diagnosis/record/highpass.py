@@ -21,7 +21,6 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 _ORDER = 4  # of the filter, which runs forwards and backwards
-_HELD = 0.05  # Hz; a slower motion is one that no stiffness holds
 
 
 def carries_everything(system: System, support: str) -> bool:
@@ -32,9 +31,9 @@ def carries_everything(system: System, support: str) -> bool:
     return not (others or grounded or absolute)
 
 
-def slowest_mode(system: System) -> float:
-    """Hz, of the motions that a stiffness holds."""
-    return min(mode.frequency for mode in system.mechanics.modes(system.bodies) if mode.frequency > _HELD)
+def slowest_mode(system: System, held: float) -> float:
+    """Hz, of the motions that a stiffness holds: those above a frequency."""
+    return min(mode.frequency for mode in system.mechanics.modes(system.bodies) if mode.frequency > held)
 
 
 def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signals, float]:
@@ -42,7 +41,7 @@ def passed(system: System, signals: Signals, rules: RecordRules) -> tuple[Signal
     alone = signals.integrated & signals.accelerated & np.isnan(signals.velocity[0])
     if not alone.any() or carries_everything(system, signals.support_names[0]):
         return signals, 0.0
-    edge = rules.passed * slowest_mode(system)
+    edge = rules.passed * slowest_mode(system, rules.held)
     cut = round(rules.settled / edge * signals.sample_rate)
     filtered = butter(_ORDER, edge, "highpass", fs=signals.sample_rate, output="sos")
 

@@ -17,13 +17,13 @@ from math import comb
 import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative, detrend_ends
+from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import ForceInput, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import USUAL_NOISE, System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
-_LEAST = 0.2  # of a sensor's declared noise, or of what its fastest changes leave room for
 _ORDER = 8  # of the differences that tell those
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
@@ -111,8 +111,11 @@ class Part:
     velocity: ComplexArray  # of the velocity channel alone, as displacement V / j w, (F, supports)
 
 
-def declared_noise(system: System, signals: Signals) -> Noise:
-    """Noise as the system file states it; where it states none, a thousandth of the signal."""
+def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.record) -> Noise:
+    """Noise as the system file states it; where it states none, a thousandth of the signal.
+
+    Estimates of a sensor's may fall to a share of that, or of what its fastest changes leave room for.
+    """
     displacement, velocity, acceleration, force = [], [], [], []
     at_support = at_force = 0
     for source in system.file.inputs.values():
@@ -138,7 +141,7 @@ def declared_noise(system: System, signals: Signals) -> Noise:
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
     levels = np.array(sensors)
-    least = _LEAST * np.minimum(levels, roughness(signals.sensors))
+    least = rules.least_noise * np.minimum(levels, roughness(signals.sensors))
     return Noise(np.array(displacement), np.array(velocity), np.array(acceleration), np.array(force), levels, least)
 
 

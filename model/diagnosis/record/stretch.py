@@ -7,11 +7,9 @@ from scipy.ndimage import uniform_filter1d
 
 from sprung.model.signals import BoolArray, FloatArray
 
-MOST_CHANNELS = 0.5  # of all, that repeat one value together where a recording stands still
 
-
-def standstill(values: FloatArray, least: int) -> BoolArray:
-    """Samples at which more than half of the channels (T, C) are in runs of `least` equal values or more, (T,)."""
+def standstill(values: FloatArray, least: int, share: float) -> BoolArray:
+    """Samples at which more than a share of the channels (T, C) are in runs of `least` equal values or more, (T,)."""
     present = np.isfinite(values).any(axis=0)
     resting = np.zeros(len(values))
     for series in values[:, present].T:
@@ -20,7 +18,7 @@ def standstill(values: FloatArray, least: int) -> BoolArray:
         long = np.flatnonzero(np.diff(edges) >= least)
         for run in long:
             resting[edges[run] : edges[run + 1]] += 1
-    return np.asarray(resting > MOST_CHANNELS * present.sum())
+    return np.asarray(resting > share * present.sum())
 
 
 def liveliest(sensors: FloatArray, longest: int) -> tuple[int, int]:

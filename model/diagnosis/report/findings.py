@@ -144,31 +144,16 @@ def _input_finding(fault: InputFault) -> Finding:
     )
 
 
-_SETUP_WORDS = {
-    "sign_reversed": "{place}: the sign is reversed",
-    "channels_swapped": "{place}: the two channels are exchanged",
-    "node_delay": "{place}: all of them are late by {value}, as a whole node is",
-    "wrong_scale": "{place}: {value} times what it should show, a wrong scale or unit",
-    "wrong_position": "{place}: sits {value} along {axis} from where the system file says",
-    "wrong_body": "{place}: is not fixed to what the system file says; its {detail} fits",
-}
-_SETUP_VALUES = {"node_delay": ("time", "s"), "wrong_scale": ("ratio", "1"), "wrong_position": ("offset", "m")}
-
-
 def _setup_finding(fault: SetupFault) -> Finding:
     parameters: tuple[LawParameter, ...] = ()
-    words = ""
-    if fault.value is not None:
-        name, unit = _SETUP_VALUES[fault.effect]
+    if fault.value is not None and fault.effect.parameter is not None:
+        name, unit = fault.effect.parameter
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
-        words = with_deviation(parameters[0])
-    sentence = _SETUP_WORDS[fault.effect].format(
-        place=fault.location.replace("|", " and "), value=words, axis="xy"[fault.axis], detail=fault.detail
-    )
+    sentence = fault.effect.told(fault.site, with_deviation(parameters[0]) if parameters else "")
     share = 100 * (1 - fault.after / fault.before)
     return Finding(
-        location=fault.location,
-        effect=fault.effect,
+        location=fault.site.location,
+        effect=fault.effect.name,
         parameters=parameters,
         p_value=None,
         delta_bic=None,

@@ -40,8 +40,8 @@ def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[Syste
     system, values = vehicle
     wrong = falsified(system, values, kind, np.random.default_rng(8))
     fault = found(wrong.file or system, wrong.values)[0]
-    assert fault.effect == KINDS[kind]
-    assert frozenset(fault.location.split("|")) == wrong.channels
+    assert fault.effect.name == KINDS[kind]
+    assert frozenset(fault.site.location.split("|")) == wrong.channels
 
 
 def test_a_delay_is_estimated_with_its_deviation(vehicle: tuple[System, np.ndarray]) -> None:

@@ -14,7 +14,7 @@ def test_standstill_is_where_most_channels_rest_together() -> None:
     moving = np.random.default_rng(1).normal(size=(1000, 4))
     moving[300:500] = moving[300]
     moving[600:900, 0] = 1.0  # one frozen sensor is no standstill
-    still = standstill(moving, 100)
+    still = standstill(moving, 100, 0.5)
     assert still[310:490].all() and not still[:299].any() and not still[502:].any()
 
 

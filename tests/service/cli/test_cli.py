@@ -43,6 +43,7 @@ def fake_engine(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in list(os.environ):
         if name.startswith("SPRUNG_"):
             monkeypatch.delenv(name)
+    monkeypatch.setenv("SPRUNG_ISOLATE_READING", "false")  # a process for every file costs two seconds
 
 
 @pytest.fixture
@@ -73,8 +74,13 @@ def lines(text: str) -> list[dict[str, Any]]:
 
 
 def test_replay_prints_a_line_per_window_and_a_summary(
-    healthy: Path, csv_system: Path, system: System, capsys: pytest.CaptureFixture[str]
+    healthy: Path,
+    csv_system: Path,
+    system: System,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.delenv("SPRUNG_ISOLATE_READING")  # as users have it: the file is read in a process of its own
     assert main(["replay", str(healthy), "--system", str(csv_system), "--json"]) == 0
     captured = capsys.readouterr()
     *windows, last = lines(captured.out)

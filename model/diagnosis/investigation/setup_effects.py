@@ -1,0 +1,146 @@
+"""What may be wrong with a set-up: each kind with its words, how it is undone and how what is left of it is weighed.
+
+A new kind is a new value here and an iterator of hypotheses beside the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from sprung.model.diagnosis.investigation import setup_changes as changes
+from sprung.model.diagnosis.investigation.setup_response import NOTHING, Group, ModelResponse
+from sprung.model.diagnosis.investigation.setup_scores import SetupScores, Weighed
+from sprung.model.laws.sensor_faults import SENSOR_GAIN, SENSOR_LAG
+from sprung.model.system import System
+
+NEAR = 0.02  # m, of differences
+_SMALL = 0.05  # of a sample, or of a ratio, of differences
+
+
+@dataclass(frozen=True)
+class SetupPlace:
+    """Where a fault of the set-up is."""
+
+    location: str  # channels joined by "|", or an element
+    group: Group = NOTHING  # the channels that share it
+    axis: int = 0  # of a position: x or y
+    detail: str = ""  # in words: where an element belongs
+
+
+@dataclass(frozen=True)
+class Weighing:
+    """A fit with a fault undone, on which what is left of it can be weighed."""
+
+    scores: SetupScores
+    response: ModelResponse
+    system: System
+
+
+@dataclass(frozen=True)
+class SetupEffect:
+    """A kind of fault of a set-up."""
+
+    name: str  # a word of the contract
+    sentence: str = ""  # with {place}, {value}, {axis}, {detail}
+    parameter: tuple[str, str] | None = None  # name and unit of its value
+    relative: bool = False  # what is left of its value is a share of it
+    ordinary: bool = False  # a fault of one sensor that screening seeks: it only has to be beaten
+    undo: Callable[[SetupPlace, float], changes.Undo] | None = None  # of a value
+    left: Callable[[SetupPlace, Weighing], tuple[Weighed, float]] | None = None  # of its value, in units of the second
+
+    def undone(self, site: SetupPlace, value: float) -> changes.Undo:
+        """The change that undoes a value of it."""
+        assert self.undo is not None, f"{self.name} has no value"
+        return self.undo(site, value)
+
+    def further(self, value: float, change: float) -> float:
+        """A value with what was left of it."""
+        return value * (1 + change) if self.relative else value + change
+
+    def remainder(self, site: SetupPlace, change: float) -> changes.Undo:
+        """The change that undoes what was left of it, too."""
+        return self.undone(site, 1 + change if self.relative else change)
+
+    def told(self, site: SetupPlace, value: str) -> str:
+        """In words."""
+        place = site.location.replace("|", " and ")
+        return self.sentence.format(place=place, value=value, axis="xy"[site.axis], detail=site.detail)
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A fault of the set-up and how to undo it."""
+
+    effect: SetupEffect
+    site: SetupPlace
+    value: float | None  # time s, ratio, offset m
+    left: float  # misfit by spectra
+    undo: changes.Undo
+    by_mass: bool = False  # told above all modes: to be fitted whatever spectra at wrong resonances say
+    unranked: bool = False  # the same under a measured force only, after those that spectra rank
+
+    @classmethod
+    def of(cls, effect: SetupEffect, site: SetupPlace, value: float, left: float, by_mass: bool = False) -> Hypothesis:
+        """With a value, which the kind of fault knows how to undo."""
+        return cls(effect, site, value, left, effect.undone(site, value), by_mass)
+
+
+def _advanced(site: SetupPlace, late: float) -> changes.Undo:
+    return changes.advance(site.group.sensors, site.group.supports, late, site.group.forces)
+
+
+def _late(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+    one = fitted.response
+    unit = _SMALL * one.step
+    return fitted.scores.of(one.late(site.group, unit) - one.shown), unit
+
+
+def _rescaled(site: SetupPlace, ratio: float) -> changes.Undo:
+    group = site.group
+    return changes.scale(group.sensors, group.supports, group.supports, ratio, group.forces)
+
+
+def _scaled(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+    one = fitted.response
+    return fitted.scores.of(one.scaled(site.group, 1 + _SMALL) - one.shown), _SMALL
+
+
+def _moved(move: Callable[[System, str, int, float], System], name: str) -> SetupEffect:
+    """A position: of sensors or elements, each moved in its own way."""
+
+    def undo(site: SetupPlace, offset: float) -> changes.Undo:
+        return changes.in_system(lambda system: move(system, site.location, site.axis, offset))
+
+    def left(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+        return fitted.scores.of_system(move(fitted.system, site.location, site.axis, NEAR)), NEAR
+
+    words = "{place}: sits {value} along {axis} from where the system file says"
+    return SetupEffect(name, words, ("offset", "m"), undo=undo, left=left)
+
+
+SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
+CHANNELS_SWAPPED = SetupEffect("channels_swapped", "{place}: the two channels are exchanged")
+NODE_DELAY = SetupEffect(
+    "node_delay",
+    "{place}: all of them are late by {value}, as a whole node is",
+    ("time", "s"),
+    undo=_advanced,
+    left=_late,
+)
+WRONG_SCALE = SetupEffect(
+    "wrong_scale",
+    "{place}: {value} times what it should show, a wrong scale or unit",
+    ("ratio", "1"),
+    relative=True,
+    undo=_rescaled,
+    left=_scaled,
+)
+SENSOR_POSITION = _moved(changes.moved_sensor, "wrong_position")
+ELEMENT_POSITION = _moved(changes.moved_element, "wrong_position")
+WRONG_BODY = SetupEffect("wrong_body", "{place}: is not fixed to what the system file says; its {detail} fits")
+ONE_GAIN = SetupEffect(SENSOR_GAIN.name, ordinary=True, undo=_rescaled)
+ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced)
+SETUP_EFFECTS = (
+    SIGN_REVERSED, CHANNELS_SWAPPED, NODE_DELAY, WRONG_SCALE, SENSOR_POSITION, ELEMENT_POSITION, WRONG_BODY,
+)  # fmt: skip

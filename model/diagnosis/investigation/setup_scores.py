@@ -1,0 +1,75 @@
+"""Changes of a set-up weighed with the sensitivities of all parameters projected out, in the metric of the misfit.
+
+Spring and damper values absorb much of a wrong set-up: what a change leaves beside them is what is weighed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_STEP = 1e-3  # of a log-ratio, of differences
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """How much of a change least squares asks for beside all parameters."""
+
+    amount: float
+    std: float
+    left: float  # misfit
+
+
+class SetupScores:
+    """Changes of the set-up weighed on the residual of a fit, or of the nominal values."""
+
+    def __init__(self, problem: Problem, fit: Fit, nominal: bool = False) -> None:
+        self.problem, part = problem, problem.part
+        self.theta = np.zeros_like(fit.point.theta) if nominal else fit.point.theta
+        self.band = slice(1, part.grid.band.stop)
+        self.weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(part.sensors[self.band]) ** 2, axis=0), 1e-300))
+        self.shown = self._shown(problem.system, self.theta)
+        columns = [
+            (self._shown(problem.system, self.theta + _STEP * one) - self.shown) / _STEP
+            for one in np.eye(len(self.theta))
+        ]
+        matrix = np.column_stack([self._flat(column) for column in columns])
+        self.basis, triangle = np.linalg.qr(matrix)
+        self.basis = self.basis[:, np.abs(np.diag(triangle)) > 1e-9 * np.abs(np.diag(triangle)).max()]
+        left = part.sensors[self.band] - self.shown if nominal else fit.spectrum[self.band]
+        self.residual = self._apart(self._flat(left))
+
+    def of_system(self, system: System, renewed: str = "") -> Weighed:
+        """A changed system file; the element `renewed` has its nominal values: at a wrong body it was fitted away."""
+        theta = [0.0 if p.element == renewed else x for p, x in zip(system.parameters, self.theta, strict=True)]
+        return self.of(self._shown(system, np.array(theta)) - self.shown)
+
+    def of(self, change: ComplexArray) -> Weighed:
+        """A change of what the sensors show, (F, S)."""
+        column = self._apart(self._flat(change))
+        size = float(column @ column)
+        if size < 1e-12:
+            return Weighed(0.0, np.inf, float(self.residual @ self.residual))
+        amount = float(column @ self.residual) / size
+        rest = self.residual - amount * column
+        left = float(rest @ rest)
+        return Weighed(amount, float(np.sqrt(left / len(rest) / size)), left)
+
+    def _shown(self, system: System, theta: FloatArray) -> ComplexArray:
+        forward = Forward(system, self.problem.part, self.problem.sensors, theta)
+        return forward.linear_sensors[self.band]
+
+    def _flat(self, spectrum: ComplexArray) -> FloatArray:
+        flat = (spectrum * self.weight).ravel()
+        return np.concatenate([flat.real, flat.imag])
+
+    def _apart(self, column: FloatArray) -> FloatArray:
+        return np.asarray(column - self.basis @ (self.basis.T @ column))

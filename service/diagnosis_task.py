@@ -1,0 +1,39 @@
+"""What goes into the process of a diagnosis and what comes out; light, since both sides load it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sprung.model.system import System
+
+IMPROVED = "system.yaml"  # in the report's folder: the system file with what was found
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisRequest:
+    """What to diagnose."""
+
+    path: Path
+    name: str  # of the recording, in the report
+    system: System
+    dbc: Path | None
+    out: Path  # folder for page, pictures and report; made when absent
+    system_text: str | None = None  # the file that the system was read from: what was found is written into a copy
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """How far it is."""
+
+    share: float  # 0..1
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosisResult:
+    """What it came to."""
+
+    verdict: str
+    report: dict[str, Any]  # as `sprung diagnose --json` prints it
