@@ -1,4 +1,4 @@
-"""Paths of memories along a known motion, stepped exactly from sample to sample."""
+"""Paths of memories along a known motion: exact, from reversal to reversal where they can be."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from sprung.model.laws.reversals import Stretches
 from sprung.model.signals import FloatArray
 
 
@@ -14,22 +15,21 @@ def stop_path(deflection: FloatArray, reach: float, corner: float = 0.0) -> Floa
 
     corner: m before `reach` over which it begins to slip, u' = d' (reach - u) / corner while it goes on.
     """
-    path = np.empty(len(deflection))
-    u, path[0], firm = 0.0, 0.0, reach - corner
-    for i, way in enumerate(np.diff(deflection).tolist(), 1):
-        ahead, size = (u, way) if way > 0 else (-u, -way)
-        free = firm - ahead
-        if size <= free:
-            ahead += size
-        elif corner > 0:
-            if free > 0:
-                ahead, size = firm, size - free
-            ahead = reach - (reach - ahead) * math.exp(-size / corner)
-        else:
-            ahead = reach
-        u = ahead if way > 0 else -ahead
-        path[i] = u
-    return path
+    runs, firm = Stretches.of(deflection), reach - corner
+
+    def ahead(u: float, way: float) -> float:
+        if way <= firm - u:
+            return u + way
+        if corner <= 0:
+            return reach
+        return reach - (reach - max(u, firm)) * math.exp(-(way - max(firm - u, 0.0)) / corner)
+
+    u = runs.begins(ahead)[runs.stretch]
+    slipping = np.full(len(u), reach)
+    if corner > 0:
+        since = np.maximum(runs.way - np.maximum(firm - u, 0.0), 0.0)
+        slipping -= (reach - np.maximum(u, firm)) * np.exp(-since / corner)
+    return runs.path(np.where(runs.way <= firm - u, u + runs.way, slipping))
 
 
 def presliding_path(deflection: FloatArray, reach: float, level: FloatArray | None = None) -> FloatArray:
@@ -37,8 +37,11 @@ def presliding_path(deflection: FloatArray, reach: float, level: FloatArray | No
 
     Without a level Dahl (1968); with one that depends on the rate, (T,), LuGre.
     """
-    ways = np.diff(deflection)
-    middle = np.ones(len(ways)) if level is None else 0.5 * (level[1:] + level[:-1])
+    if level is None:
+        runs = Stretches.of(deflection)
+        z = runs.begins(lambda z, way: 1 - (1 - z) * math.exp(-way / reach))[runs.stretch]
+        return runs.path(1 - (1 - z) * np.exp(-runs.way / reach))
+    ways, middle = np.diff(deflection), 0.5 * (level[1:] + level[:-1])
     keep = np.exp(-np.abs(ways) / (reach * middle))
     towards = np.sign(ways) * middle * (1 - keep)
     path = np.empty(len(deflection))

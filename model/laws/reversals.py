@@ -5,15 +5,49 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
-from sprung.model.signals import FloatArray
+from sprung.model.signals import FloatArray, IntArray
 
 # Of the Bouc-Wen law as it is commonly written, z' = v - beta (abs(v) abs(z)^(n-1) z + gamma v abs(z)^n)
 GAMMA = 0.5
 _FAR, _BLOWS = 60.0, 1.5  # ends of the growing functions
+
+
+@dataclass(frozen=True)
+class Stretches:
+    """A deflection (T,) from reversal to reversal: along each stretch a rate-independent memory has a closed form."""
+
+    lengths: FloatArray  # way from reversal to reversal, m, (R,)
+    signs: FloatArray  # direction of every stretch, +-1, (R,)
+    stretch: IntArray  # that every sample but the first ends in, (T - 1,)
+    way: FloatArray  # from the stretch's begin to every sample but the first, m, (T - 1,)
+
+    @classmethod
+    def of(cls, deflection: FloatArray) -> Stretches:
+        """Where it stands still it goes on in one direction."""
+        signs = np.sign(np.diff(deflection))
+        signs[signs == 0] = 1.0
+        turns = np.flatnonzero(signs[1:] != signs[:-1]) + 1
+        starts, ends = np.concatenate([[0], turns]), np.concatenate([turns, [len(signs)]])
+        stretch = np.repeat(np.arange(len(starts)), ends - starts)
+        way = np.abs(deflection[1:] - deflection[starts][stretch])
+        return cls(np.abs(deflection[ends] - deflection[starts]), signs[starts], stretch, way)
+
+    def begins(self, ahead: Callable[[float, float], float]) -> FloatArray:
+        """Values at the begin of every stretch, in its direction, from 0; `ahead(value, way)`: after a way. (R,)."""
+        found, value, before = [], 0.0, 1.0
+        for length, sign in zip(self.lengths.tolist(), self.signs.tolist(), strict=True):
+            found.append(value if sign == before else -value)
+            value, before = ahead(found[-1], length), sign
+        return np.array(found)
+
+    def path(self, ahead: FloatArray) -> FloatArray:
+        """Values (T,) from those in the direction of every stretch, (T - 1,); 0 at first."""
+        return np.concatenate([[0.0], self.signs[self.stretch] * ahead])
 
 
 def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma: float = GAMMA) -> FloatArray:
@@ -24,25 +58,16 @@ def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma:
     So one function of u, the way X(u), and its inverse carry z from any reversal to the next.
     """
     ahead, behind = _Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent)
-    steps = np.diff(deflection)
-    direction = np.sign(steps)
-    direction[direction == 0] = 1.0
-    turns = np.flatnonzero(direction[1:] != direction[:-1]) + 1
-    starts = np.concatenate([[0], turns])  # first step of every monotone stretch
-    ends = np.concatenate([turns, [len(steps)]])
-    begin = np.array(_ways(ahead, behind, np.abs(deflection[ends] - deflection[starts])))
-    stretch = np.repeat(np.arange(len(starts)), ends - starts)
-    position = begin[stretch] + np.abs(deflection[1:] - deflection[starts][stretch])
-    z = np.zeros_like(deflection)
-    z[1:] = direction * np.where(position > 0, ahead.along(position), -behind.along(-position))
-    return z
+    runs = Stretches.of(deflection)
+    position = np.array(_ways(ahead, behind, runs.lengths))[runs.stretch] + runs.way
+    return runs.path(np.where(position > 0, ahead.along(position), -behind.along(-position)))
 
 
-def _ways(ahead: _Side, behind: _Side, travelled: FloatArray) -> list[float]:
+def _ways(ahead: _Side, behind: _Side, lengths: FloatArray) -> list[float]:
     """The way X at which every monotone stretch begins: minus the z at which the one before ended."""
     ways = []
     u = 0.0
-    for length in travelled.tolist():
+    for length in lengths.tolist():
         start = ahead.way(u) if u > 0 else -behind.way(-u)
         ways.append(start)
         end = start + length
