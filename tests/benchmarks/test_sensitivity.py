@@ -51,7 +51,7 @@ def test_a_component_test_is_not_asked_about_vehicles() -> None:
 
 def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -> None:
     made = list(recordings("quick", 8, 3.0, 1))
-    assert [name.split("-", 1)[1] for name, _, _ in made][:3] == ["friction", "weak friction", "cubic spring"]
+    assert [name.split("-", 1)[1] for name, _, _ in made[:3]] == ["friction", "weak friction", "cubic spring"]
     assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made[:-1])
     assert made[-1][0] == "tower" and made[-1][2].values.shape == (18000, 2)
     healthy, rubbing = made[5][2].values, made[0][2].values
