@@ -29,7 +29,7 @@ class MadeRecord:
     extra: dict = field(default_factory=dict)
 
 
-def simulate(law=None, *, seconds: float = 30.0, seed: int = 0, noise: float = 1.0, level: float = 1.0) -> MadeRecord:
+def simulate(law=None, *, seconds: float = 20.0, seed: int = 0, noise: float = 1.0, level: float = 1.0) -> MadeRecord:
     """Columns wheel displacement, velocity, four accelerations; `law(d, v)` adds a force to the secondary element.
 
     Road of random phases from 0.5 to 18 Hz, Runge-Kutta at 1 kHz, every channel low-passed at 42 Hz alike, decimated.

@@ -124,6 +124,7 @@ class Parametrised:
     parameters: tuple[ParameterSpec, ...]
     prior_cost: float = 0.0  # evidence by which the law must beat commoner ones
     named: bool = True  # whether it is physics with a name
+    listed: bool = True  # False: only its formula, or the map of its force, tells what it is
     fault: bool = False  # whether it is one of the measurement, not of the system
     nuisance: bool = False  # reported, and no reason for any verdict
 
@@ -201,6 +202,7 @@ class ElementLaw(Parametrised):
     alike: Callable[[Values], tuple[tuple[float, ...], ...]] | None = None
     prior_cost: float = 0.0
     named: bool = True
+    listed: bool = True
     nuisance: bool = False
     screened: bool = True  # sought in systems of bodies; else only where the force of its element is measured
     at: tuple[str, ...] = ()  # elements that it may act at; empty: all

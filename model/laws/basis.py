@@ -86,6 +86,7 @@ def static_law(basis: _Basis, seen: Observed) -> StaticLaw:
         sentence="a force that no law of the catalogue explains",
         prior_cost=RARE + 2 * float(np.log(len(SMALL) + _OTHERS)),
         named=False,
+        listed=False,
         basis=basis,
         scale_d=scale_d,
         scale_v=scale_v,

@@ -44,6 +44,7 @@ def formula_law(
         confused_with=(),
         sentence=f"a force {formula}",
         strength=None,
+        listed=False,
         memory=int(rate is not None),
         memory_rate=no_memory if rate is None else _rate(rate, parameters),
         formula=formula,

@@ -45,10 +45,10 @@ def presliding_path(deflection: FloatArray, reach: float, level: FloatArray | No
     keep = np.exp(-np.abs(ways) / (reach * middle))
     towards = np.sign(ways) * middle * (1 - keep)
     path = np.empty(len(deflection))
-    z, path[0] = 0.0, 0.0
+    bent, path[0] = 0.0, 0.0
     for i, (a, b) in enumerate(zip(keep.tolist(), towards.tolist(), strict=True), 1):
-        z = a * z + b
-        path[i] = z
+        bent = a * bent + b
+        path[i] = bent
     return path
 
 

@@ -124,7 +124,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
     gap, stop = 1.2e-3, 2e5
     report = diagnose(
         parse_system(SYSTEM),
-        simulate(lambda d, v, z: stop * np.sign(d) * max(abs(d) - gap, 0.0), seconds=8.0),
+        simulate(lambda d, v, z: stop * np.sign(d) * max(abs(d) - gap, 0.0), seconds=6.0),
         Options(),
     )
     (finding,) = report.findings
@@ -139,7 +139,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
 
 def test_friction_shows_in_a_free_decay_without_any_input():
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
-    record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=6.0, level=0.0, start=0.01)
+    record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=4.0, level=0.0, start=0.01)
     record.values[:, 0] = 0.0
     report = diagnose(parse_system(SYSTEM), record, Options())
     assert report.findings[0].location == "spring"
@@ -158,7 +158,7 @@ def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family()
         simulate(
             lambda d, v, z: alpha * z,
             lambda d, v, z: v - beta * (abs(v) * z + gamma * v * abs(z)),
-            seconds=12.0,
+            seconds=8.0,
             level=40.0,
         ),
         Options(),

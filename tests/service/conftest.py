@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,7 +18,8 @@ from tests.served import worsen
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
+def core(engine: Engine, tmp_path: Path, empty_store: Path) -> Core:
+    shutil.copy(empty_store, tmp_path / "sprung.db")
     return build_core(Settings(data_dir=tmp_path), engine)
 
 

@@ -8,11 +8,10 @@ from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, s
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
+from sprung.model.laws.gas import PRELOAD
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-PRELOAD = "preload"  # every component test has one
 
 
 def given_model(system: System, element: str, notes: list[str]) -> ComponentModel:
@@ -22,7 +21,7 @@ def given_model(system: System, element: str, notes: list[str]) -> ComponentMode
     """
     model = ComponentModel()
     for placed in system.laws:
-        if placed.location != element or placed.law.name == PRELOAD:
+        if placed.location != element or placed.law is PRELOAD:  # every component test has one
             continue
         piece, shape = _piece(placed)
         if piece is None:
@@ -67,5 +66,5 @@ def identified_laws(
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     if abs(fit.preload) > deviation:
         parameter = LawParameter("force", sign * fit.preload, deviation, "N")
-        found.append(IdentifiedLaw(element, PRELOAD, (parameter,)))
+        found.append(IdentifiedLaw(element, PRELOAD.name, (parameter,)))
     return tuple(found)

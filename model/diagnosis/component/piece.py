@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -25,7 +24,6 @@ from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
 Shape = Sequence[float]
-Kind = Literal["static", "friction", "hysteresis", "linear"]
 
 _UNIT = SpringDamper(1.0, 1.0)
 
@@ -69,6 +67,18 @@ class FittedPiece:
     rules: ComponentRules
 
 
+@dataclass(frozen=True)
+class PieceKind:
+    """Pieces that do much the same."""
+
+    name: str
+    dissipates: bool  # its force over deflection is a loop whatever the rate; of such a kind one is enough
+
+
+STATIC = PieceKind("static", dissipates=False)
+FRICTION = PieceKind("friction", dissipates=True)
+HYSTERESIS = PieceKind("hysteresis", dissipates=True)
+
 Parameters = Callable[[FloatArray, Shape, SpringDamper], tuple[float, ...]]
 Believed = Callable[[FittedPiece], bool]
 Named = Callable[[FloatArray, Shape, SpringDamper], Values]
@@ -86,7 +96,7 @@ class Piece:
     parameters: Parameters  # the law's, of strengths, shapes and the element; its force is linear in the strengths
     shape_of: Callable[[Sequence[float]], tuple[float, ...]]  # shapes of the law's parameters
     quoted: Named = lambda a, s, e: {}
-    kind: Kind = "static"  # look-alikes within a kind are told apart last
+    kind: PieceKind = STATIC  # look-alikes within a kind are told apart last
     plain: int = 0  # prior cost: how many commoner laws it contains
     acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
     acting_parameters: Parameters | None = None
@@ -95,7 +105,7 @@ class Piece:
     @property
     def dissipates(self) -> bool:
         """Whether its force over deflection is a loop whatever the rate."""
-        return self.kind in ("friction", "hysteresis")
+        return self.kind.dissipates
 
     @property
     def effect(self) -> str:
@@ -152,7 +162,7 @@ class Following:
         return f"{self.piece.key} {self.signal.name}"
 
     @property
-    def kind(self) -> Kind:
+    def kind(self) -> PieceKind:
         return self.piece.kind
 
     @property
@@ -214,7 +224,7 @@ class SliderSurface:
     effect: str = UNKNOWN
     title: str = "a force that no law explains"
     key: str = UNKNOWN
-    kind: Kind = "static"
+    kind: PieceKind = STATIC
     dissipates: bool = False
     believed: Believed = lambda fitted: True
     plain: int = 0

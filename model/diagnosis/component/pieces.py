@@ -10,6 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.diagnosis.component.piece import (
+    FRICTION,
+    HYSTERESIS,
     FittedPiece,
     Following,
     LawPiece,
@@ -100,7 +102,7 @@ _COULOMB = Piece(
     lambda a, s, e: (a[0], s[0]),
     lambda p: (p[1],),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
-    kind="friction",
+    kind=FRICTION,
 )
 _STRIBECK = Piece(
     _law("stribeck"),
@@ -111,7 +113,7 @@ _STRIBECK = Piece(
     lambda a, s, e: (a[0], a[0] + a[1], s[1], s[0]),
     lambda p: (p[3], p[2]),
     lambda a, s, e: {"breakaway_force": (a[0] + a[1], "N")},
-    kind="friction",
+    kind=FRICTION,
     plain=1,
 )
 _DAHL = Piece(
@@ -123,7 +125,7 @@ _DAHL = Piece(
     lambda a, s, e: (a[0], a[0] / s[0]),
     lambda p: (p[0] / p[1],),
     _yield_words,
-    kind="hysteresis",
+    kind=HYSTERESIS,
     plain=1,
 )
 _LUGRE = Piece(
@@ -137,7 +139,7 @@ _LUGRE = Piece(
     lambda a, s, e: (a[0], a[0] * (1 + s[2]), s[1], a[0] / s[0]),
     lambda p: (p[0] / p[3], p[2], p[1] / p[0] - 1),
     _yield_words,
-    kind="hysteresis",
+    kind=HYSTERESIS,
     plain=1,
 )
 
@@ -163,7 +165,7 @@ _BOUC_WEN = Piece(
     _loop,
     _loop_shape,
     _yield_words,
-    kind="hysteresis",
+    kind=HYSTERESIS,
 )
 _FREE_BOUC_WEN = Piece(
     _wider("bouc_wen"),
@@ -174,7 +176,7 @@ _FREE_BOUC_WEN = Piece(
     _loop,
     _loop_shape,
     _yield_words,
-    kind="hysteresis",
+    kind=HYSTERESIS,
 )
 _PINCHED = Piece(
     _law("pinched_hysteresis"),
@@ -185,7 +187,7 @@ _PINCHED = Piece(
     lambda a, s, e: (a[0], s[0], -a[1] / max(a[0], 1e-300), s[1]),
     lambda p: (p[1], p[3]),
     lambda a, s, e: {"yield_force": (a[0], "N")},
-    kind="hysteresis",
+    kind=HYSTERESIS,
     plain=2,
 )
 
@@ -204,7 +206,7 @@ _BACKLASH = Piece(
     lambda a, s, e: (a[0] + a[1], s[0], a[0] / s[1] + _inner(a, s), _inner(a, s)),
     lambda p: (p[1], (p[0] - 0.5 * p[1] * (p[3] if len(p) > 3 else 0.0)) / p[2]),
     lambda a, s, e: {"slip_force": (a[0] + a[1], "N"), "lost_motion": (s[0], "m")},
-    kind="hysteresis",
+    kind=HYSTERESIS,
     believed=_slips,
 )
 
@@ -252,7 +254,6 @@ _SERIES = Piece(
     lambda a, s, e: (a[0],),
     lambda p: (0.1,),
     lambda a, s, e: {"relaxation_time": (s[0], "s")},
-    kind="linear",
     acting=_law("air_spring"),  # the branch of spring and damper in series, with a damper beside it that is free
     acting_parameters=lambda a, s, e: (a[0], s[0]),
 )

@@ -125,7 +125,7 @@ def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules)
 def _next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> list[Ranked]:
     """Models with one more law, refined, best first."""
     used = {piece.effect for piece in current.model.pieces}
-    kinds = {piece.kind for piece in current.model.pieces} & {"hysteresis", "friction"}
+    kinds = {piece.kind for piece in current.model.pieces if piece.dissipates}
     open_pieces = [p for p in pieces if p.effect not in used and p.kind not in kinds]
     trials = [trial for piece in open_pieces for trial in _trials(current, piece, rules)]
     trials.sort(key=lambda t: t[0])

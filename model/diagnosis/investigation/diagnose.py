@@ -37,7 +37,6 @@ from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, 
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
 from sprung.model.laws import ElementLaw
-from sprung.model.laws.formula import EFFECT
 from sprung.model.system import System
 
 
@@ -262,7 +261,7 @@ def _repeats(state: Investigation, hit: Candidate) -> bool:
     for term in state.fit.point.terms:
         if hit.term.key[:2] == term.key[:2]:
             return True
-        if hit.location == term.location and (not term.law.named or term.law.name == EFFECT):
+        if hit.location == term.location and not term.law.listed:
             return True
     return False
 

@@ -8,7 +8,6 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import ElementLaw, reversal_step
-from sprung.model.laws.formula import EFFECT
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -89,4 +88,4 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
 def formula_of(term: Term) -> tuple[str, str]:
     """Text of the force and of its hidden state's rate, of a law that is known by them alone; empty for others."""
     law = term.law
-    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and law.name == EFFECT else ("", "")
+    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and not law.listed else ("", "")

@@ -1,0 +1,65 @@
+"""Kinds of wrong set-ups: what each undoes is what it says, and its words hold its value."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.investigation.setup_effects import (
+    ELEMENT_POSITION,
+    NODE_DELAY,
+    ONE_GAIN,
+    SENSOR_POSITION,
+    SETUP_EFFECTS,
+    SIGN_REVERSED,
+    WRONG_SCALE,
+    Hypothesis,
+    SetupPlace,
+)
+from sprung.model.diagnosis.investigation.setup_response import Group
+from sprung.model.diagnosis.investigation.verdict import SENSOR_FAULTS
+from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.system import load_system
+from tests.diagnosis_cases import quarter_car, simulate
+
+
+def test_every_kind_is_a_fault_of_the_measurement_with_words_of_its_own() -> None:
+    for effect in SETUP_EFFECTS:
+        assert effect.name in SENSOR_FAULTS and not effect.ordinary
+        told = effect.told(SetupPlace("a|b", detail="lower car"), "7")
+        assert told.startswith("a and b: ") and ("7" in told) == (effect.parameter is not None)
+    assert ONE_GAIN.ordinary
+
+
+def test_a_scale_and_what_is_left_of_it_are_undone_one_after_the_other() -> None:
+    system, record = quarter_car(), simulate(seconds=5)
+    signals = prepare(system, record.values, 100.0).signals
+    place = SetupPlace("car_a", Group((0,)))
+    _, once = Hypothesis.of(WRONG_SCALE, place, 1.9, 0.0).undo(system, signals)
+    _, twice = WRONG_SCALE.remainder(place, 0.05)(system, once)
+    assert WRONG_SCALE.further(1.9, 0.05) == pytest.approx(1.995)
+    np.testing.assert_allclose(twice.sensors[:, 0], signals.sensors[:, 0] / 1.995)
+    np.testing.assert_array_equal(twice.sensors[:, 1:], signals.sensors[:, 1:])
+
+
+def test_a_delay_is_taken_back_and_positions_move_in_the_file() -> None:
+    system, record = quarter_car(), simulate(seconds=5)
+    signals = prepare(system, record.values, 100.0).signals
+    _, early = NODE_DELAY.undone(SetupPlace("car_a", Group((0,))), 0.03)(system, signals)
+    lost = (signals.samples - early.samples) // 2
+    middle = slice(50, 300)
+    np.testing.assert_allclose(
+        early.sensors[middle, 0], signals.sensors[lost + 3 :, 0][middle], atol=0.1 * np.std(signals.sensors[:, 0])
+    )
+    train = load_system()
+    sensor, element = train.sensors[0], train.elements[0]
+    for effect, kind, name in ((SENSOR_POSITION, "sensors", sensor), (ELEMENT_POSITION, "elements", element)):
+        moved, same = effect.undone(SetupPlace(name, axis=1), 0.25)(train, signals)
+        assert same is signals and effect.name == "wrong_position"
+        before, after = (getattr(one.file, kind)[name].position for one in (train, moved))
+        assert after[1] - before[1] == pytest.approx(0.25) and after[0] == before[0]
+
+
+def test_what_has_no_value_is_not_undone_by_one() -> None:
+    with pytest.raises(AssertionError, match="has no value"):
+        SIGN_REVERSED.undone(SetupPlace("car_a"), 1.0)
