@@ -87,7 +87,7 @@ def test_noise_that_was_found_higher_is_no_law() -> None:
 def test_the_loop_is_closed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """diagnose -> improved file -> diagnose: friction found, then nothing is left."""
     system = parse_system(TEXT.replace("damping: 1800}", f"damping: 1800, laws: [{LAW}]}}"))
-    rng, rate, samples = np.random.default_rng(5), 100.0, 4000
+    rng, rate, samples = np.random.default_rng(5), 100.0, 2500
     t = np.arange(samples) / rate
     f, phase = rng.uniform(0.5, 12, 60), rng.uniform(0, 6.3, 60)
     road = (2e-3 / f * np.sin(2 * np.pi * f * t[:, None] + phase)).sum(axis=1)

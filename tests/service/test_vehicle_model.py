@@ -47,7 +47,7 @@ sensors:
 """
 LAW = "laws: [{coulomb_friction: {force: {value: 58, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"
 FOUND = FILE.replace("damping: 1400}", f"damping: 1400, {LAW}}}")
-SECONDS = 16
+SECONDS = 11
 
 
 def found(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:

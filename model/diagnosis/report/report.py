@@ -158,7 +158,7 @@ class TrackPoint:
         return {"begin": self.begin, "end": self.end, "frequencies": modes, "adequate": self.adequate}
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Report:
     """The answer of one diagnosis."""
 
