@@ -44,7 +44,7 @@ sensors:
 """
 
 
-def sweep(seconds: float = 20.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sweep(seconds: float = 12.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Time, deflection and exact rate of several sines of two amplitudes."""
     t = np.arange(int(seconds * RATE)) / RATE
     swell = 0.6 + 0.4 * np.sin(2 * np.pi * 0.07 * t)

@@ -10,7 +10,7 @@ from sprung.model.diagnosis.api import Report, diagnose
 from sprung.model.system import parse_system
 from tests.diagnosis.component.test_component import RATE, C, K, RigRecording, sweep
 
-T, D, V = sweep()
+T, D, V = sweep(20.0)
 
 
 def diagnosed(force: np.ndarray, noise: float = 1.0, signals: dict[str, np.ndarray] | None = None) -> Report:
