@@ -51,6 +51,13 @@ def empty_store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
+def data_dir(tmp_path: Path, empty_store: Path) -> Path:
+    """A service's folder whose store is there already."""
+    shutil.copy(empty_store, tmp_path / "sprung.db")
+    return tmp_path
+
+
+@pytest.fixture
 def store(tmp_path: Path, empty_store: Path) -> Iterator[Store]:
     opened = open_store(f"sqlite:///{shutil.copy(empty_store, tmp_path / 'test.db')}")
     yield opened

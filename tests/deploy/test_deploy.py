@@ -106,8 +106,8 @@ class Bus:
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    built = build_core(Settings(data_dir=tmp_path), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    built = build_core(Settings(data_dir=data_dir), engine)
     built.feeds.append(Bus())  # type: ignore[arg-type]
     return built
 

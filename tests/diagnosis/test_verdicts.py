@@ -35,7 +35,7 @@ def test_dry_friction_is_found_named_and_sized():
 
 
 def test_what_a_recording_does_not_tell_apart_is_called_a_family():
-    report = _diagnose(simulate(lambda d, v: 8 * np.tanh(v / 0.002), seed=21))
+    report = _diagnose(simulate(lambda d, v: 8 * np.tanh(v / 0.002), seed=21, seconds=30))
     (finding,) = report.findings
     assert finding.family is not None
     assert set(finding.family.split(" or ")) == {"coulomb_friction", "bouc_wen"}
@@ -72,7 +72,7 @@ def test_wrong_gain_of_one_sensor_is_no_physics():
 
 
 def test_late_sensor_is_timed_right_although_its_misfit_passed_for_noise():
-    record = simulate(seed=25)
+    record = simulate(seed=25, seconds=30)
     signal, lag, delay = record.values[:, 4], 0.02, -0.0004  # lead, as a bilinear filter has it beside its lag
     s = 2j * np.pi * np.fft.rfftfreq(2 * len(signal), 1 / record.sample_rate)
     both = np.fft.rfft(np.concatenate([signal, signal[::-1]]))

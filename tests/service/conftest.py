@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -18,9 +17,8 @@ from tests.served import worsen
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path, empty_store: Path) -> Core:
-    shutil.copy(empty_store, tmp_path / "sprung.db")
-    return build_core(Settings(data_dir=tmp_path), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    return build_core(Settings(data_dir=data_dir), engine)
 
 
 @pytest.fixture

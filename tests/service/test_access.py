@@ -31,8 +31,8 @@ DAY = 86_400_000_000_000
 
 
 @pytest.fixture
-def core(engine: Engine, system: System, tmp_path: Path) -> Core:
-    core = build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
+def core(engine: Engine, system: System, data_dir: Path) -> Core:
+    core = build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine)
     for vehicle in ("north-1", "south-1"):
         core.pipeline.process(vehicle, [make_window(system, i) for i in range(2)])
     return core

@@ -23,8 +23,8 @@ PROBLEM = "application/problem+json"
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path, compute_queue=2, max_body_bytes=300_000), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    return build_core(Settings(data_dir=data_dir, compute_queue=2, max_body_bytes=300_000), engine)
 
 
 @pytest.fixture

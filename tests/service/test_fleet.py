@@ -25,8 +25,8 @@ from tests.service_fakes import FakeIdentifier, make_window
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path, vehicles_in_memory=3), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    return build_core(Settings(data_dir=data_dir, vehicles_in_memory=3), engine)
 
 
 def feed(core: Core, system: System, vehicle: str, windows: int, level: float = 0.0, first: int = 0) -> None:

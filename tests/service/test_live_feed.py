@@ -54,8 +54,8 @@ class RowSource:
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Iterator[Core]:
-    core = build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
+def core(engine: Engine, data_dir: Path) -> Iterator[Core]:
+    core = build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine)
     yield core
     core.close()
 

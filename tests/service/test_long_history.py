@@ -28,9 +28,9 @@ MOST_SECONDS = 0.3  # of processor time, for 30 days of 24 parameters
 
 
 @pytest.fixture
-def core(engine: Engine, system: System, tmp_path: Path) -> Core:
+def core(engine: Engine, system: System, data_dir: Path) -> Core:
     """A vehicle with minutes and hours of thirty days, as they are left when single windows are forgotten."""
-    built = build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
+    built = build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine)
     built.pipeline.process("a", [make_window(system, i) for i in range(3)])
     size = len(system.tracked)
     rng = np.random.default_rng(3)

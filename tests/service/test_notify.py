@@ -70,9 +70,9 @@ def receiver(received: Received) -> Iterator[str]:
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path, receiver: str) -> Core:
+def core(engine: Engine, data_dir: Path, receiver: str) -> Core:
     settings = Settings(
-        data_dir=tmp_path,
+        data_dir=data_dir,
         webhooks=receiver,
         webhook_networks="127.0.0.0/8",
         webhook_secret=SECRET,

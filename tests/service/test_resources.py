@@ -18,10 +18,10 @@ from sprung.service.settings import Settings
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Core:
+def core(engine: Engine, data_dir: Path, monkeypatch: pytest.MonkeyPatch) -> Core:
     monkeypatch.setattr("sprung.service.condition.FRESH_SECONDS", 0.0)
     monkeypatch.setattr("sprung.service.store.engine.PROBE_SECONDS", 0.2)
-    return build_core(Settings(data_dir=tmp_path, min_free_bytes=0), engine)
+    return build_core(Settings(data_dir=data_dir, min_free_bytes=0), engine)
 
 
 def test_a_store_that_another_process_locks_is_not_ready_and_comes_back(client: TestClient, tmp_path: Path) -> None:

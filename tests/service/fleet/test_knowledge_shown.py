@@ -45,8 +45,8 @@ def fill(core: Core, parameter: int) -> None:
 
 
 @pytest.fixture
-def core(engine: Engine, tmp_path: Path) -> Core:
-    return build_core(Settings(data_dir=tmp_path), engine)
+def core(engine: Engine, data_dir: Path) -> Core:
+    return build_core(Settings(data_dir=data_dir), engine)
 
 
 @pytest.fixture
