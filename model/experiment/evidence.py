@@ -22,7 +22,7 @@ from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.menu import MenuRun
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
-from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
+from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System
@@ -90,8 +90,8 @@ def fitted(system: System, values: FloatArray, known: float = KNOWN) -> FittedRu
 
 
 def _refined(system: System, windows: FloatArray) -> Refined:
-    laws = acting_laws(system)
-    return IdentifierWithLaws(system, laws).refine(windows) if laws else Refiner(system).refine(windows, None)
+    refiner = LawRefiner if acting_laws(system) else Refiner
+    return refiner(system, windows.shape[1]).refine(windows)
 
 
 def _known(system: System, known: float) -> FloatArray:

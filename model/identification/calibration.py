@@ -17,7 +17,9 @@ the gains and delays, and tells them apart from springs.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -25,7 +27,7 @@ from scipy.interpolate import CubicSpline
 from torch import Tensor
 
 from sprung.model.identification.deviations import deviations
-from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
+from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import WindowModel, as_rows
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
@@ -43,6 +45,50 @@ class Evidence:
 
     def numpy(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self.cross.numpy(), self.information.numpy(), self.score.numpy()
+
+
+class Products(Protocol):
+    """Gauss-Newton's products at a point of windows, linear or with laws; U unknowns, K residuals."""
+
+    @property
+    def whiten(self) -> Tensor:
+        """Shape (B, F, R, R)."""
+
+    @property
+    def free(self) -> Tensor:
+        """Whitened responses to the first state, normalised, (B, N, K)."""
+
+    @property
+    def sensitivities(self) -> Tensor:
+        """Whitened, (B, U, K)."""
+
+    @property
+    def factor(self) -> Tensor:
+        """Cholesky factor of the free responses' products, (B, N, N)."""
+
+    @property
+    def across(self) -> Tensor:
+        """Free responses solved for the sensitivities, (B, N, U)."""
+
+    @property
+    def covariance(self) -> Tensor:
+        """Of the unknowns, weak prior included, (B, U, U)."""
+
+
+class Seconded(Protocol):
+    """What a second step with these products was taken from."""
+
+    @property
+    def residual(self) -> Tensor:
+        """Whitened, before the step, (B, K, 1)."""
+
+    @property
+    def step(self) -> Tensor:
+        """Of the unknowns, (B, U)."""
+
+    @property
+    def outputs(self) -> Tensor:
+        """Simulated, before the step, (B, T, S')."""
 
 
 class DeviationSensitivity:
@@ -64,15 +110,23 @@ class DeviationSensitivity:
         self.share = torch.as_tensor(np.array(share).reshape(-1, len(omega)).T.copy())  # of its drive, (F, inputs)
         self._dropped: dict[bytes, Tensor] = {}
 
-    def evidence(self, at: Linearisation, after: Chord, data: WindowBatch) -> Evidence:
-        """At the log-ratios that the chord step `after` of `at` leads to."""
+    def motions(self, data: WindowBatch) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
+        """Values and rates (B, T, W/2) of the drives as gains change them, and as delays do."""
+        value, slope = data.w[:, :, 0::2], data.w[:, :, 1::2]
+        return (value, slope), (slope, self.slope @ slope)
+
+    def evidence(self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]) -> Evidence:
+        """At the log-ratios that the chord step `after` of `at` leads to.
+
+        by_drive: what each drive makes the whitened signals show, (B, F, R, W/2), along each of `motions`.
+        """
         # Known directions as orthonormal rows, so that single precision is enough for what follows.
         free = torch.linalg.solve_triangular(at.factor, at.free, upper=False)  # (B, N, K)
         J = at.sensitivities - at.across.mT @ at.free
         root = torch.linalg.cholesky(at.covariance)  # C = root root'
         known = torch.cat([free, root.mT @ J], dim=1).to(torch.float32)  # (B, N + P, K)
         r = after.residual.to(torch.float32)
-        columns, redundant = self._columns(at, after, data)
+        columns, redundant = self._columns(at, after, data, by_drive)
         rows = as_rows(columns)  # (B, H, K)
         with_known = known @ rows.mT  # (B, N + P, H)
         information = rows @ rows.mT - with_known.mT @ with_known
@@ -106,7 +160,9 @@ class DeviationSensitivity:
             information = information - along @ along.mT * share
         return information, score
 
-    def _columns(self, at: Linearisation, after: Chord, data: WindowBatch) -> tuple[Tensor, Tensor | None]:
+    def _columns(
+        self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]
+    ) -> tuple[Tensor, Tensor | None]:
         """Whitened sensitivities of the compressed signals (B, F, R, H), and of the dropped ones (B, F, X, H)."""
         model = self.model
         kind = torch.complex64
@@ -115,11 +171,7 @@ class DeviationSensitivity:
         out = torch.zeros(B, F, R, len(self.deviations), dtype=kind)
         # A reading is (1 + g) y(t - tau): the true motion below is that much smaller and earlier.
         share = self.share[:, None].to(kind)
-        value, slope = data.w[:, :, 0::2], data.w[:, :, 1::2]
-        delayed = (slope, self.slope @ slope)
-        for first, sign, shown in zip(
-            (0, C), (-1, 1), model.by_drive(at, ((value, slope), delayed), data), strict=True
-        ):
+        for first, sign, shown in zip((0, C), (-1, 1), by_drive, strict=True):
             out[..., first : first + self.inputs] = sign * shown[..., self.drive] * share
         columns = self.inputs + torch.as_tensor(np.flatnonzero(data.present))
         shown = model.spectra(after.outputs).to(kind)  # (B, F, S')

@@ -30,8 +30,8 @@ class Deviation:
 def deviations(system: System) -> tuple[Deviation, ...]:
     """Gains of all channels, delays of all channels, what describes the loads of bodies with passengers or goods."""
     tracks = any(isinstance(source, TrackInput) for source in system.file.inputs.values())
-    if tracks or not system.bodies or len(system.tracked) > len(system.parameters):
-        return ()  # unmeasured tracks, component tests and laws have identifiers of their own
+    if tracks or not system.bodies:
+        return ()  # unmeasured tracks and component tests have identifiers of their own
     channels = system.channels
     groups = clock_groups(system)
     stated = system.tolerances

@@ -9,6 +9,7 @@ without it.  A window explained this way tells as much about the springs as any 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,7 +20,7 @@ from scipy.interpolate import make_interp_spline
 from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
-from sprung.model.identification.refine import Refined, Refiner
+from sprung.model.identification.refine import Refined, Refines
 from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFault
 from sprung.model.system import System
 
@@ -61,11 +62,16 @@ def fits(refined: Refined) -> BoolArray:
 class Explainer:
     """Searches for what is wrong with the measurements of windows of one system."""
 
-    def __init__(self, system: System, samples: int, start, workers: int = 1) -> None:  # type: ignore[no-untyped-def]
-        """`start`: function from windows (B, T, C) to log-ratios to refine from, or None for the nominal ones."""
-        self.system, self.samples, self.start, self.workers = system, samples, start, workers
-        self._refiners: dict[int, Refiner] = {}
-        deviations = self.refiner(samples).calibration.deviations
+    def __init__(
+        self,
+        system: System,
+        samples: int,
+        refiner: Callable[[int], Refines],
+        start: Callable[[FloatArray], FloatArray] | None,
+    ) -> None:
+        """refiner: of windows of so many samples; start: from windows (B, T, C) to log-ratios to refine from."""
+        self.system, self.samples, self.start, self.refiner = system, samples, start, refiner
+        deviations = refiner(samples).calibration.deviations
         self.deviations = deviations
         self.channels = len(system.channels)
         self.groups = clock_groups(system)
@@ -76,11 +82,6 @@ class Explainer:
         whole = [(late[:, self.groups == group] > 0).all(axis=1) for group in np.unique(self.groups)]
         alone = (late > 0).sum(axis=1) == np.array([[np.sum(self.groups == g)] for g in np.unique(self.groups)])
         self._clocks = self.directions[(np.array(whole) & alone).any(axis=0)]  # one delay for each clock
-
-    def refiner(self, samples: int) -> Refiner:
-        if samples not in self._refiners:
-            self._refiners[samples] = Refiner(self.system, samples, self.workers)
-        return self._refiners[samples]
 
     def _directions(self) -> FloatArray:
         """Simple explanations as rows over the deviations: each alone, and one delay for all that share a clock."""
@@ -255,7 +256,7 @@ class Explainer:
 
     def _with_load(self, point: FloatArray, one: Refined) -> FloatArray:
         """The loads that were refined along are part of where the window was linearised."""
-        P = len(self.system.parameters)
+        P = len(self.system.tracked)
         out = point.copy()
         out[2 * self.channels :] = one.log_ratio[0, P:] if one.log_ratio.shape[1] > P else 0.0
         return out
@@ -344,7 +345,7 @@ class Explainer:
         present: BoolArray = np.asarray(~np.isnan(windows[0, :, len(self.system.inputs) :]).any(axis=0))
         with torch.no_grad():
             data = model.batch(model.knots(windows), windows, present)
-            nominal = torch.zeros(1, len(self.system.parameters), dtype=torch.float64)
+            nominal = torch.zeros(1, len(model.system.parameters), dtype=torch.float64)
             at = model.linearise(nominal, WindowBatch(data.w[:1], data.measured[:1], present))
             s = model.simulator
             discrete = model.compressed(s.discretise(s.element_values(nominal)), data)

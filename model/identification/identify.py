@@ -16,8 +16,8 @@ from sprung.model.identification.estimator import Estimator, bundled_estimator, 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.faults import Explainer
 from sprung.model.identification.linearise import PRIOR_STD, prior_std
-from sprung.model.identification.refine import Refined, Refiner
-from sprung.model.identification.with_laws import IdentifierWithLaws, acting_laws
+from sprung.model.identification.refine import Refined, Refiner, Refines
+from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.simulate.drives import ORDERS, drives_of
@@ -36,7 +36,7 @@ class Identifier:
     estimator: Estimator | None = None
     workers: int = 1
     times: StageTimes = field(default_factory=StageTimes)
-    _refiners: dict[int, Refiner] = field(default_factory=dict)
+    _refiners: dict[int, Refines] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
 
     @property
@@ -61,7 +61,7 @@ class Identifier:
         explain: look for a wrong measurement or a load in windows that do not fit, see `model.identification.faults`.
         Errors: `UnusableWindow` for a wrong shape or an input that is not finite.
         """
-        windows = self._checked(windows)
+        windows = self.system.undistorted(self._checked(windows))
         if len(windows) == 0:
             return []
         begin = time.perf_counter()
@@ -84,7 +84,7 @@ class Identifier:
 
     def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
         """point: deviations (H,) that were taken back from the samples before."""
-        P = len(self.system.parameters)
+        P = len(self.system.tracked)
         deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
         return estimates(refined, P, states, deviating)
 
@@ -123,12 +123,13 @@ class Identifier:
             estimator = self.estimator
             fitting = estimator is not None and estimator.samples == samples
             start = (lambda w: estimator.estimate(w).log_ratio) if estimator is not None and fitting else None
-            self._explainers[samples] = Explainer(self.system, samples, start, self.workers)
+            self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
         return self._explainers[samples]
 
-    def _refiner(self, samples: int) -> Refiner:
+    def _refiner(self, samples: int) -> Refines:
         if samples not in self._refiners:
-            self._refiners[samples] = Refiner(self.system, samples, self.workers)
+            kind = LawRefiner if acting_laws(self.system) else Refiner
+            self._refiners[samples] = kind(self.system, samples, self.workers)
         return self._refiners[samples]
 
     def _checked(self, windows: FloatArray) -> FloatArray:
@@ -145,28 +146,6 @@ class Identifier:
         if np.isinf(sensors).any():
             raise UnusableWindow(f"{channels[inputs + int(np.argwhere(np.isinf(sensors))[0][2])].name}: not finite")
         return windows
-
-
-@dataclass(slots=True)
-class Undistorted:
-    """Windows without the faults of measurements that the system file states."""
-
-    system: System
-    inner: Identifies
-
-    @property
-    def digest(self) -> str:
-        """Names the model that made an estimate."""
-        return self.inner.digest
-
-    @property
-    def times(self) -> StageTimes:
-        """Seconds of the last batch."""
-        return self.inner.times
-
-    def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
-        """One `Estimate` per window; see `model.identifier.Identifies`."""
-        return self.inner.identify(self.system.undistorted(windows), start, states=states)
 
 
 def load_identifier(system: System, model: str | Path | None = None, workers: int = 1) -> Identifies:
@@ -186,18 +165,15 @@ def load_identifier(system: System, model: str | Path | None = None, workers: in
 
 
 def _with_laws(system: System, workers: int) -> Identifies:
-    """The identifier around the laws of a system file.  Errors: `UnusableWindow` for a law that windows cannot hold."""
+    """The identifier of a system file with laws.  Errors: `UnusableWindow` for a law that windows cannot hold."""
     if system.on_track or not system.file.inputs:
         raise UnusableWindow(f"{system.name}: laws can be tracked where the inputs are measured; leave them out")
-    laws = acting_laws(system)
-    if not laws:  # faults of measurements alone
-        return Undistorted(system, Identifier(system, None, workers))
-    if any(drive.integrated == ORDERS["acceleration"] for drive in drives_of(system)):
+    if acting_laws(system) and any(drive.integrated == ORDERS["acceleration"] for drive in drives_of(system)):
         raise UnusableWindow(
             f"{system.name}: laws act along deflections, which accelerations alone leave open; "
             "measure the supports' displacement or velocity as well, or leave the laws out"
         )
-    return Undistorted(system, IdentifierWithLaws(system, laws, workers))
+    return Identifier(system, None, workers)
 
 
 def identifiability(system: System, seed: int = 0) -> FloatArray:
@@ -225,7 +201,8 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
         return None
     C = len(system.channels)
     H = 2 * C + len(load_terms(system))
-    prior = prior_std(system)[P:] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
+    # in the refined values, not of the window
+    prior = prior_std(system)[len(system.parameters) :] ** -2 / max(refined.chi_square[b], 1.0)
     at = np.zeros(H) if point is None else point.copy()
     covariance = refined.covariance[b]
     cross = refined.cross[b] if whole else np.zeros((len(covariance), H))

@@ -52,6 +52,7 @@ class Slopes:
     by_d1: FloatArray
     by_v0: FloatArray
     by_v1: FloatArray
+    memory_size: FloatArray  # rms of the memory over a window, (B,)
 
 
 class Along:
@@ -67,10 +68,15 @@ class Along:
         self.time: FloatArray = np.arange(self.d.shape[1], dtype=np.float64) * self.step
         self.size_d = np.sqrt(np.mean(deflection**2, axis=1, keepdims=True)) + 1e-12
         self.size_v = np.sqrt(np.mean(rate**2, axis=1, keepdims=True)) + 1e-12
+        self._last: tuple[bytes, FloatArray] | None = None
 
     def memory(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
         """The law's state on the fine grid, (1, ..., fine), from `first` (...,); values broadcast with (..., 1)."""
-        return recall(self.law, p, self.d, self.v, time=self.time, element=element, first=first[None])
+        key = b"".join(np.asarray(part).tobytes() for part in (*p, *element, first))
+        if self._last is None or self._last[0] != key:  # force and slopes are asked for at one point
+            memory = recall(self.law, p, self.d, self.v, time=self.time, element=element, first=first[None])
+            self._last = key, memory
+        return self._last[1]
 
     def fine(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
         """The force on the fine grid, (..., B, fine)."""
@@ -96,14 +102,6 @@ class Along:
         shown = self.force(list(values), SpringDamper(k, c), np.broadcast_to(first, values.shape[1:3]))
         shown = np.broadcast_to(shown, (2 * count, *shown.shape[-2:]))
         return np.asarray((shown[0::2] - shown[1::2]) / (2 * _STEP))
-
-    def by_first_memory(
-        self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray, scale: FloatArray
-    ) -> FloatArray:
-        """What the force changes per unit of the first memory, of size `scale` (B,), along the same motion, (B, T)."""
-        near = _STEP * scale
-        up, down = (self.force(p, element, first + sign * near) for sign in (1, -1))
-        return np.asarray((up - down) / (2 * near[:, None]))
 
     def slopes(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> Slopes:
         """Slopes by the motion; values and element (B, 1)."""
@@ -134,9 +132,10 @@ class Along:
         by_d, by_v = (self._around(slope(of, law.force)) for of in "dv")
         zero = np.zeros((len(self.d), self.samples - 1))
         if not law.memory:
-            return Slopes(by_d, by_v, np.zeros_like(by_d), zero, zero, zero, zero, zero)
+            return Slopes(by_d, by_v, np.zeros_like(by_d), zero, zero, zero, zero, zero, zero[:, 0])
         by_z = self._around(slope("z", law.force))
-        return Slopes(by_d, by_v, by_z, *self._carried(*(slope(of, law.memory_rate) for of in "zdv")))
+        carried = self._carried(*(slope(of, law.memory_rate) for of in "zdv"))
+        return Slopes(by_d, by_v, by_z, *carried, near["z"][:, 0] / _NEAR)
 
     def _around(self, fine: FloatArray) -> FloatArray:
         """Means (B, T) around the samples, weighed by hats that reach to the neighbours."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -14,7 +14,7 @@ from sprung.model.simulate.linear import Discrete, ElementValues
 class WindowPoint:
     """Where B windows stand."""
 
-    unknowns: Tensor  # log-ratios of the linear parameters and of laws' values, then first memories, (B, U)
+    unknowns: Tensor  # log-ratios of the linear parameters and laws' values, loads, then first memories, (B, U)
     x0: Tensor  # states at the first sample, (B, N)
     force: Tensor  # of the laws at the samples, (B, T, L)
 
@@ -51,8 +51,22 @@ class Steps:
     values: ElementValues
     discrete: Discrete  # outputs not compressed, absent sensors left out
     push: tuple[Tensor, Tensor, Tensor, Tensor]  # P0, S0, P1, S1, (B, N, n)
+    compliance: Tensor  # accelerations by generalised forces, (B, n, n)
     direct: Tensor  # what sensors show of generalised forces at once, (B, S', n)
     shown: Tensor  # and of forces of elements, (S', E)
+
+    def take(self, at: Tensor) -> Steps:
+        """Some of the windows."""
+        v, d = self.values, self.discrete
+        coupling = None if v.coupling is None else v.coupling[at]
+        return Steps(
+            ElementValues(v.stiffness[at], v.damping[at], v.mass[at], coupling),
+            Discrete(d.Ad[at], d.G0[at], d.G1[at], d.C[at], d.D[at]),
+            (self.push[0][at], self.push[1][at], self.push[2][at], self.push[3][at]),
+            self.compliance[at],
+            self.direct[at],
+            self.shown,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +79,7 @@ class Moved:
 
 @dataclass(frozen=True, slots=True)
 class Columns:
-    """Gauss-Newton's products at one point; U unknowns: linear parameters, laws' values, memories."""
+    """Gauss-Newton's products at one point; U unknowns: linear parameters, laws' values, loads, memories."""
 
     whiten: Tensor  # (B, F, R, R)
     carried: Tensor  # noise of the drives in the compressed signals, (B, F, R, W/2)
@@ -78,6 +92,10 @@ class Columns:
     information: Tensor  # on the unknowns, (B, U, U)
     covariance: Tensor  # of the unknowns, weak prior included, (B, U, U)
     precision: Tensor  # of the prior, (B, U)
+
+    def take(self, at: Tensor) -> Columns:
+        """Some of the windows."""
+        return Columns(**{f.name: getattr(self, f.name)[at] for f in fields(self)})
 
     def solve(self, residual: Tensor, unknowns: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Cost with the best first state (B,), step of the unknowns (B, U), step of the first state without it (B, N).

@@ -30,6 +30,7 @@ from sprung.model.laws import SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import phi_functions
+from sprung.model.simulate.loading import by_inertia
 from sprung.model.system import System
 
 _SWEEPS = 4  # of Newton's method on the forces, at most
@@ -39,9 +40,12 @@ _MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
 
 
 class LawWindows:
-    """Windows of one length of a system, `bare` of its laws, with the laws `acting`."""
+    """Windows of one length of a system, `bare` of its laws, with the laws `acting`.
 
-    def __init__(self, bare: System, acting: Sequence[Acting], model: WindowModel) -> None:
+    loads: its loads are unknown, too.
+    """
+
+    def __init__(self, bare: System, acting: Sequence[Acting], model: WindowModel, loads: bool = False) -> None:
         self.system, self.acting, self.model = bare, acting, model
         m = bare.mechanics
         self.rows = np.array([a.weights for a in acting]) @ m.H  # deflections of the sites by the coordinates, (L, n)
@@ -55,10 +59,12 @@ class LawWindows:
         # of a rate over one sample, by the least noise of an accelerometer; where there is none by that of a sensor
         self.rate_noise = float(noise[moving].min() if moving.any() else noise.min()) / bare.sample_rate
         self.slope = torch.tensor(slopes_of(model.samples)) / model.simulator.dt
-
-    @property
-    def unknowns(self) -> int:
-        return len(self.system.parameters) + len(self.free) + len(self.memories)
+        self.loads = len(model.simulator.loading) if loads else 0
+        P = len(bare.parameters)
+        self.first_load = P + len(self.free)
+        self.told = self.first_load + self.loads  # log-ratios and loads; memories follow
+        self.unknowns = self.told + len(self.memories)
+        self.linear = torch.cat([torch.arange(P), torch.arange(self.first_load, self.told)])  # of the linear system
 
     def values(self, point: WindowPoint, law: int) -> FloatArray:
         """Values of one law, (B, values)."""
@@ -72,29 +78,29 @@ class LawWindows:
         """Memory of one law at the first sample, (B,)."""
         if law not in self.memories:
             return np.zeros(len(point.unknowns))
-        at = len(self.system.parameters) + len(self.free) + self.memories.index(law)
+        at = self.told + self.memories.index(law)
         found: FloatArray = point.unknowns[:, at].numpy()
         return found
 
     def steps(self, point: WindowPoint, data: WindowBatch) -> Steps:
         """The linear step at a point."""
-        s, x = self.model.simulator, point.unknowns[:, : len(self.system.parameters)]
+        s, x = self.model.simulator, point.unknowns[:, self.linear]
         values = s.element_values(x)
         discrete = s.discretise(values)
         at = torch.as_tensor(np.flatnonzero(data.present))
         A, *_ = s.continuous(values)
         N, n = A.shape[1], A.shape[1] // 2
         phi = phi_functions(A * s.normalised_step)  # (B, 5, N, N)
-        inverse = torch.diag_embed(1 / values.mass)  # (B, n, n)
+        inverse = values.accelerated(torch.eye(n, dtype=torch.float64).expand(len(x), n, n))
         load = torch.cat([torch.zeros_like(inverse), inverse], dim=1) / s.scale[:, None]
         psi = (phi.flatten(1, 2) @ load).reshape(len(x), 5, N, n)[:, 1:] * s.dt
         G = (s.hermite @ psi.flatten(2)).reshape(len(x), 2, 2, N, n) * s.scale[:, None]
         push = (G[:, 0, 0], G[:, 0, 1], G[:, 1, 0], G[:, 1, 1])
         kind = torch.as_tensor(self.system.mechanics.sensor_kind)
-        direct = torch.where((kind == ACCELERATION)[:, None], s.S, 0.0)[at] / values.mass[:, None, :]
+        direct = torch.where((kind == ACCELERATION)[:, None], s.S, 0.0)[at] @ inverse
         shown = torch.where((kind == FORCE)[:, None], s.L, 0.0)[at]
         present = replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
-        return Steps(values, present, push, direct, shown)
+        return Steps(values, present, push, inverse, direct, shown)
 
     def simulate(self, steps: Steps, force: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
         """States (B, T, N) and outputs (B, T, S') under given forces of the laws (B, T, L)."""
@@ -139,9 +145,9 @@ class LawWindows:
         force = point.force
         for _ in range(_SWEEPS):
             states, _ = self.simulate(steps, force, point.x0, data)
-            along = self._along(states, data, smooth)
+            along = self.along(states, data, smooth)
             wanted = self._forces(along, point, steps)
-            flow = self._flow(along, point, steps) if flow is None else flow
+            flow = self.flow(along, point, steps) if flow is None else flow
             change = flow.answer(wanted - force)
             force = force + change
             if bool((self._shown_at_once(change, steps, data) < _SETTLED).all()):
@@ -153,18 +159,19 @@ class LawWindows:
         """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
         load = change @ self.pull
         shown = change @ (self.weights @ steps.shown.T) - load @ steps.direct.mT
-        carried = (load / steps.values.mass[:, None] * self.model.simulator.dt) / self.rate_noise
+        carried = (load @ steps.compliance.mT * self.model.simulator.dt) / self.rate_noise
         at_once = torch.cat([shown / self.noise[torch.as_tensor(data.present)], carried], dim=2)
         return at_once.square().mean(dim=1).amax(dim=1).sqrt()
 
-    def _along(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> list[Along]:
+    def along(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> list[Along]:
+        """The laws along given states."""
         d, v = self.site_motion(states, data, smooth)
         rate = self.system.sample_rate
         return [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
 
     def forces(self, point: WindowPoint, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
         """The laws' forces along given states, (B, T, L)."""
-        return self._forces(self._along(states, data, smooth), point, steps)
+        return self._forces(self.along(states, data, smooth), point, steps)
 
     def _forces(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
         shape = point.force.shape[:2]
@@ -177,7 +184,8 @@ class LawWindows:
         values = list(self.values(point, law).T[:, :, None])
         return values, SpringDamper(k[:, None], c[:, None]), self.first_memory(point, law)
 
-    def _flow(self, along: list[Along], point: WindowPoint, steps: Steps) -> Flow:
+    def flow(self, along: list[Along], point: WindowPoint, steps: Steps) -> Flow:
+        """What a motion does with changes."""
         slopes = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return Flow(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
 
@@ -186,18 +194,16 @@ class LawWindows:
         compressed = (data.measured - motion.outputs) @ self.model.compression.matrix(data.present).mT
         return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
 
-    def flow(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Flow:
-        """What a motion does with changes."""
-        return self._flow(self._along(motion.states, data, smooth), point, steps)
-
     def columns(
-        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray, flow: Flow
-    ) -> Columns:
-        """Everything that Gauss-Newton needs at a settled point."""
+        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
+    ) -> tuple[Columns, Flow]:
+        """Everything that Gauss-Newton needs at a settled point, and what its motion does with changes."""
+        along = self.along(motion.states, data, smooth)
+        flow = self.flow(along, point, steps)
         transfer = self.model.transfer(steps.values, data)
         carried = transfer.drive * self.model.drive_noise[:, None]
         whiten = self.model.whitening(carried)
-        shown, scale = self._shown(point, steps, motion, data, smooth, flow)
+        shown = self.shown(point, steps, motion, data, smooth, along, flow)
         spectra = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
         white = as_rows(whiten @ spectra)
         N = point.x0.shape[1]
@@ -210,48 +216,93 @@ class LawWindows:
         across = torch.cholesky_solve(across_products, factor)
         information = J @ J.mT - across_products.mT @ across
         precision = torch.full((len(J), self.unknowns), 1 / PRIOR_STD**2, dtype=torch.float64)
+        precision[:, self.linear] = self.model.precision[: len(self.linear)]
         if self.memories:
-            precision[:, -len(self.memories) :] = torch.as_tensor(1 / (_MEMORY_STD * scale) ** 2)
+            precision[:, self.told :] = torch.as_tensor(1 / (_MEMORY_STD * flow.memory_size) ** 2)
         covariance = torch.linalg.inv(information + torch.diag_embed(precision))
         told = (information, covariance, precision)
-        return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told)
+        return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told), flow
 
-    def _shown(
-        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray, flow: Flow
-    ) -> tuple[Tensor, FloatArray]:
-        """What the compressed signals show, (B, R, T, N + U), of the first state and of the unknowns; and the rms of
-        the memories, (B, Z)."""
+    def shown(
+        self,
+        point: WindowPoint,
+        steps: Steps,
+        motion: Moved,
+        data: WindowBatch,
+        smooth: FloatArray,
+        along: list[Along],
+        flow: Flow,
+    ) -> Tensor:
+        """What the compressed signals show of the first state and of the unknowns, (B, R, T, N + U)."""
         B, T, N = motion.states.shape
         Q = self.model.compression.matrix(data.present)
-        along = self._along(motion.states, data, smooth)
-        columns = self.unknowns
+        columns, memories = self.unknowns, len(self.memories)
         load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
         P0, S0, P1, S1 = (-(push @ self.model.simulator.H[which].T).unsqueeze(2) for push in steps.push)
-        linear = slice(N, N + len(which))
-        push = load.new_zeros(B, N, T - 1, N + columns)
+        linear = slice(len(which))
+        push = load.new_zeros(B, N, T - 1, columns)
         push[..., linear] = P0 * load[:, None, :-1]
         push[..., linear] += S0 * slope[:, None, :-1]
         push[..., linear] += P1 * load[:, None, 1:]
         push[..., linear] += S1 * slope[:, None, 1:]
         by_mass = self._mass_loads(point, steps, motion, data)  # (B, n, T, M)
-        masses = slice(N + len(which), N + len(which) + by_mass.shape[3])
+        masses = self.linear[len(which) :]
+        springs = self._spring_loads(steps, motion, data, smooth) if self.loads else None  # (B, E, T, X)
+        if springs is not None:
+            weight = -self.model.simulator.H.T @ springs.flatten(2)
+            by_mass[..., -self.loads :] += weight.view(B, -1, T, self.loads)
         if by_mass.shape[3]:
             by_slope = self.slope @ by_mass
             series = (by_mass[:, :, :-1], by_slope[:, :, :-1], by_mass[:, :, 1:], by_slope[:, :, 1:])
             for gain, values in zip(steps.push, series, strict=True):
                 push[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1)
-        source, scale = self._force_sources(along, point, steps, N)
-        first = load.new_zeros(B, N, N + columns)
+        first, memory = load.new_zeros(B, N, N + columns), load.new_zeros(B, memories, N + columns)
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
-        path, forces = flow.run(push, source, first)  # (B, N, T, X), (B, L, T, X)
+        memory[:, :, N + self.told :] = torch.eye(memories, dtype=torch.float64)
+        path = flow.run(push, self._force_sources(along, point, steps, N), first, memory=memory)  # (B, N + L, T, X)
         at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
         rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
-        found = (rows @ torch.cat([path, forces], dim=1).flatten(2)).view(B, len(Q), T, -1)
+        found = (rows @ path.flatten(2)).view(B, len(Q), T, -1)
+        changed = found[..., N:]
         direct = Q @ (steps.shown[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
-        found[..., linear] += direct.unsqueeze(2) * load.unsqueeze(1)
+        changed[..., linear] += direct.unsqueeze(2) * load.unsqueeze(1)
         if by_mass.shape[3]:
-            found[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1)
-        return found, scale
+            changed[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1)
+        if springs is not None:
+            loads = slice(self.first_load, self.told)
+            changed[..., loads] += (Q @ steps.shown @ springs.flatten(2)).view(B, len(Q), T, -1)
+        return found
+
+    def by_drive(
+        self, columns: Columns, steps: Steps, flow: Flow, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch
+    ) -> list[Tensor]:
+        """What each drive alone makes the whitened signals show through the laws, too, each (B, F, R, W/2).
+
+        motions: values and rates of the drives, each (B, T, W/2).
+        """
+        s, Q = self.model.simulator, self.model.compression.matrix(data.present)
+        value, rate = (torch.cat(part, dim=2) for part in zip(*motions, strict=True))  # (B, T, X)
+        B, T, X = value.shape
+        half, copies = s.W // 2, len(motions)
+        of = torch.arange(half).repeat(copies)  # the drive of every column
+        site = torch.zeros(len(self.acting), half, dtype=torch.float64)
+        site[:, s.supports // 2] = self.weights @ s.G
+        site = site[:, of]  # (L, X)
+        force, remembered = flow.along(value.unsqueeze(2) * site, rate.unsqueeze(2) * site)
+        G0, G1 = steps.discrete.G0, steps.discrete.G1
+        push = torch.zeros(B, G0.shape[1], T - 1, X, dtype=torch.float64)
+        for gain, at in ((G0, slice(0, T - 1)), (G1, slice(1, T))):
+            push += gain[:, :, 2 * of].unsqueeze(2) * value[:, None, at]
+            push += gain[:, :, 2 * of + 1].unsqueeze(2) * rate[:, None, at]
+        path = flow.run(push, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), remembered)
+        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T
+        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
+        shown = (rows @ path.flatten(2)).view(B, len(Q), T, X)
+        D = Q @ steps.discrete.D
+        for gain, given in ((D[:, :, 2 * of], value), (D[:, :, 2 * of + 1], rate)):
+            shown += gain.unsqueeze(2) * given.unsqueeze(1)
+        spectra = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
+        return list((columns.whiten @ spectra).to(torch.complex64).split(half, dim=3))
 
     def _element_loads(
         self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
@@ -265,27 +316,37 @@ class LawWindows:
         slope = torch.cat([v[:, :, k_at] * K, (self.slope @ v)[:, :, c_at] * C], dim=2)
         return load, slope, torch.cat([k_at, c_at])
 
+    def _spring_loads(self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Tensor | None:
+        """Forces of air springs by the loads that their stiffness follows, (B, E, T, X); None: none does."""
+        powers = self.model.simulator.loading.stiffness
+        if not bool(powers.any()):
+            return None
+        deflection, _ = self.element_motion(motion.states, data, smooth)
+        force = torch.as_tensor(deflection) * steps.values.stiffness[:, None]
+        return force.mT.unsqueeze(3) * powers.T[None, :, None]
+
     def _mass_loads(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch) -> Tensor:
-        """Generalised forces by the logarithms of masses, (B, n, T, M)."""
+        """Generalised forces by the logarithms of masses, then by the loads, (B, n, T, M)."""
         s = self.model.simulator
         masses = s.m_of[s.m_of.any(dim=1)]
+        exponents, pattern = masses, s.loading.pattern.new_zeros(len(masses), *s.loading.pattern.shape[1:])
+        if self.loads:
+            exponents = torch.cat([masses, s.loading.exponents])
+            pattern = torch.cat([pattern, s.loading.pattern])
         A, b_value, b_rate = s.continuous(steps.values)
         n = A.shape[1] // 2
         moved = motion.states @ A[:, n:].mT
         moved = moved + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
-        inertia = moved * steps.values.mass[:, None] - point.force @ self.pull
-        return -(inertia.unsqueeze(3) * masses.T).permute(0, 2, 1, 3)
+        moved = moved - (point.force @ self.pull) @ steps.compliance.mT
+        values = steps.values
+        return -by_inertia(moved, values.mass, values.coupling, exponents, pattern).permute(0, 2, 1, 3)
 
-    def _force_sources(
-        self, along: list[Along], point: WindowPoint, steps: Steps, before: int
-    ) -> tuple[Tensor, FloatArray]:
-        """Laws' forces by the unknowns along the given motion, (B, L, T, before + U); rms of the memories, (B, Z)."""
+    def _force_sources(self, along: list[Along], point: WindowPoint, steps: Steps, before: int) -> Tensor:
+        """Laws' forces by the unknowns along the given motion, memories apart, (B, L, T, before + U)."""
         names = [(p.element, p.quantity) for p in self.system.parameters]
         B, T = point.force.shape[:2]
         found = torch.zeros((B, len(along), T, before + self.unknowns), dtype=torch.float64)
-        scale = np.ones((B, len(self.memories)))
         at = before + len(names)
-        first_of_memories = at + len(self.free)
         for i, (acting, path) in enumerate(zip(self.acting, along, strict=True)):
             start = self.first_memory(point, i)
             changes = path.changes(self.values(point, i), acting.free, self._element(steps, i), start)
@@ -296,13 +357,7 @@ class LawWindows:
             for quantity, change in zip(("stiffness", "damping"), changes[-2:], strict=True):
                 if (element, quantity) in names:
                     found[:, i, :, before + names.index((element, quantity))] = torch.as_tensor(change)
-            if acting.law.memory:
-                at_memory = self.memories.index(i)
-                z = path.memory(*self._at(i, point, steps))[0]
-                scale[:, at_memory] = np.sqrt(np.mean(z**2, axis=1)) + 1e-9
-                shown = path.by_first_memory(*self._at(i, point, steps), scale[:, at_memory])
-                found[:, i, :, first_of_memories + at_memory] = torch.as_tensor(shown)
-        return found, scale
+        return found
 
     def smoothed(self, columns: Columns, residual: Tensor, step: Tensor, dx0: Tensor, steps: Steps) -> FloatArray:
         """What the residual after a step says of the drives' noise, as motion of the elements: (2, B, T, E)."""

@@ -19,7 +19,7 @@ the old products give a second correction, at a tenth of the price.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -73,6 +73,25 @@ class Refined:
         for name, values in changed.items():
             values[at] = getattr(others, name)
         return Refined(**changed)
+
+
+class Refines(Protocol):
+    """Windows of one system and length refined, linear or with laws."""
+
+    model: WindowModel
+    calibration: DeviationSensitivity
+
+    def refine(
+        self,
+        windows: FloatArray,
+        start: FloatArray | None = None,
+        *,
+        iterations: int = ...,
+        states: bool = False,
+        loads: bool = False,
+        weigh: BoolArray | None = None,
+    ) -> Refined:
+        """See `Refiner.refine`."""
 
 
 class Refiner:
@@ -177,7 +196,9 @@ class Refiner:
     ) -> None:
         """Evidence on deviations of the windows `which` of a chunk."""
         if len(which):
-            found = self.calibration.evidence(at.take(which), second.take(which), data.take(which))
+            at, data = at.take(which), data.take(which)
+            shown = self.model.by_drive(at, self.calibration.motions(data), data)
+            found = self.calibration.evidence(at, second.take(which), data, shown)
             at_rows = rows[which]
             progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
             progress.score[at_rows], progress.weighed[at_rows] = found.score, True

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.deviations import deviations
+from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identifier import UnusableWindow
-from tests.strut import recorded, strut
+from sprung.model.signals import Estimate
+from sprung.model.system import parse_system
+from tests.strut import TEXT, recorded, strut
 
 FRICTION = "{coulomb_friction: {force: 50, smoothing: {value: 0.02, fixed: true}}}"
 
@@ -73,3 +76,44 @@ def test_a_missing_input_and_a_wrong_shape_are_named(windows: np.ndarray) -> Non
         load_identifier(strut(FRICTION)).identify(broken)
     with pytest.raises(UnusableWindow, match="shape"):
         load_identifier(strut(FRICTION)).identify(windows[:, :, :4])
+
+
+def _pooled(estimates: list[Estimate]) -> tuple[np.ndarray, np.ndarray]:
+    """Deviations as all windows say them under the priors of the data sheets, and their standard deviations."""
+    found = [e.deviating for e in estimates if e.deviating is not None]
+    parts = deviations(strut(FRICTION))
+    information = sum(one.information for one in found) + np.diag([part.std**-2 for part in parts])
+    pull = sum(one.score + one.information @ one.point for one in found)
+    return np.linalg.solve(information, pull), np.sqrt(np.diag(np.linalg.inv(information)))
+
+
+@pytest.mark.parametrize("channel", [0, 3])
+def test_a_gain_beside_a_law_is_told(windows: np.ndarray, channel: int) -> None:
+    wrong = windows.copy()
+    wrong[:, :, channel] *= 1.02
+    identifier = load_identifier(strut(FRICTION))
+    assert isinstance(identifier, Identifier)
+    gains = _pooled(identifier.identify(wrong, weigh=np.ones(len(wrong), dtype=bool)))[0][:5]
+    assert gains[channel] - np.median(np.delete(gains, channel)) == pytest.approx(0.02, abs=0.003)
+
+
+def test_a_wrong_sensor_beside_a_law_is_taken_back(windows: np.ndarray) -> None:
+    wrong = windows[:6].copy()
+    wrong[:, :, 3] *= 1.3
+    identifier = load_identifier(strut(FRICTION))
+    assert isinstance(identifier, Identifier)
+    mended = identifier.examine(wrong, np.ones(6, dtype=bool))
+    assert sum(e.adequate for e in mended) >= 5
+    assert all({fault.channel for fault in e.faults} == {"car_a"} for e in mended if e.adequate)
+
+
+def test_a_load_beside_a_law_is_told_and_biases_nothing(windows: np.ndarray) -> None:
+    light = parse_system(TEXT.format(law=FRICTION, sensor="").replace("{mass: 400}", "{mass: 360, load: true}"))
+    estimates = load_identifier(light).identify(windows)
+    truth, load = np.log([1.0, 22 / 20, 14 / 15, 60 / 50]), np.log(400 / 360)
+    found = [e.deviating for e in estimates if e.adequate and e.deviating is not None]
+    information = sum(one.information[-1, -1] for one in found)
+    mean = sum(one.information[-1, -1] * one.point[-1] + one.score[-1] for one in found) / information
+    assert abs(mean - load) < 4 / np.sqrt(information) + 1e-3
+    values = np.mean([e.log_ratio for e in estimates if e.adequate], axis=0)
+    assert np.abs(values - truth).max() < 0.015

@@ -1,0 +1,253 @@
+"""Gauss-Newton on windows of a system with laws: a linearisation and two steps an iteration.
+
+The model is brought to its own motion again at the new point, and the old products give the second step.  Gains and
+delays are weighed where a window has converged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.calibration import DeviationSensitivity
+from sprung.model.identification.gauss_newton import WindowBatch
+from sprung.model.identification.law_flow import Flow
+from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
+from sprung.model.identification.law_window import LawWindows
+from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined
+from sprung.model.signals import FloatArray
+
+ITERATIONS = 6
+_OPENING = 1  # rounds of forces and first state before the first iteration
+_CONVERGED = 0.3  # a second step this small, in standard deviations, leaves an error far below it
+_STILL = 0.3  # a first step this small: the window stands at its minimum, whatever the second one says
+_SLACK = 2.0  # of chi-square, by which a step may be worse: neither forces nor smoothed inputs settle closer
+_STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
+
+
+@dataclass(frozen=True, slots=True)
+class Second:
+    """A second step with the products of the first."""
+
+    point: WindowPoint  # before it
+    motion: Moved
+    residual: Tensor  # whitened, (B, K, 1)
+    cost: Tensor  # (B,)
+    step: Tensor  # of the unknowns, (B, U)
+    alone: Tensor  # of the first state without that, (B, N)
+
+    @property
+    def outputs(self) -> Tensor:
+        """Simulated before it, (B, T, S')."""
+        return self.motion.outputs
+
+    def small(self, std: Tensor) -> Tensor:
+        """Whether windows have converged, (B,); std: of the unknowns, (B, U)."""
+        return (self.step.abs() / std).amax(dim=1) < _CONVERGED
+
+    def take(self, at: Tensor) -> Second:
+        """Some of the windows."""
+        motion = Moved(self.motion.states[at], self.motion.outputs[at])
+        return Second(self.point.take(at), motion, self.residual[at], self.cost[at], self.step[at], self.alone[at])
+
+    def put(self, at: Tensor, some: Second) -> None:
+        """Replace some of the windows."""
+        self.point.put(at, some.point)
+        self.motion.states[at], self.motion.outputs[at] = some.motion.states, some.motion.outputs
+        self.residual[at], self.cost[at] = some.residual, some.cost
+        self.step[at], self.alone[at] = some.step, some.alone
+
+
+class Search:
+    """Windows with the same sensors present, from log-ratios (B, P + laws' values), loads at zero.
+
+    wanted: windows (B,) whose evidence on gains and delays is computed.
+    """
+
+    def __init__(
+        self,
+        windows: LawWindows,
+        calibration: DeviationSensitivity,
+        data: WindowBatch,
+        start: FloatArray,
+        wanted: Tensor,
+    ) -> None:
+        self.windows, self.calibration, self.data, self.wanted = windows, calibration, data, wanted
+        B, U, T, N = len(start), windows.unknowns, windows.model.samples, windows.model.states_count
+        self.told, H = windows.told, len(calibration.deviations) if bool(wanted.any()) else 0
+        unknowns = torch.zeros(B, U, dtype=torch.float64)
+        unknowns[:, : start.shape[1]] = torch.as_tensor(start)
+        zero = torch.zeros(B, N, dtype=torch.float64)
+        self.point = WindowPoint(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
+        self.best = self.point.take(torch.arange(B))
+        self.cost = torch.full((B,), torch.inf, dtype=torch.float64)
+        self.covariance = torch.eye(U, dtype=torch.float64).repeat(B, 1, 1)
+        self.converged = torch.zeros(B, dtype=torch.bool)
+        self.iterations = torch.zeros(B, dtype=torch.long)
+        self.error = torch.full((B, len(data.present)), torch.nan, dtype=torch.float64)
+        self.states = torch.zeros(B, T, N, dtype=torch.float64)
+        self.outputs = torch.full((B, T, len(data.present)), torch.nan, dtype=torch.float64)
+        self.smooth = np.zeros((2, B, T, len(windows.system.elements)))
+        self.weighed = torch.zeros(B, dtype=torch.bool)
+        self.cross = torch.zeros(B, self.told, H, dtype=torch.float64)
+        self.information, self.score = torch.zeros(B, H, H, dtype=torch.float64), torch.zeros(B, H, dtype=torch.float64)
+
+    def run(self, states: bool, near: bool = False, iterations: int = ITERATIONS) -> Refined:
+        """Iterate until every window has converged, or `iterations` times; near: the start is no guess."""
+        self._open(near)
+        active = torch.arange(len(self.cost))
+        for left in reversed(range(iterations)):
+            self._iterate(active, last=left == 0)
+            active = active[~self.converged[active]]
+            if len(active) == 0:
+                break
+        return self._result(states)
+
+    def _open(self, near: bool) -> None:
+        """Linear fits with the laws' forces as given, and forces along their motion, which follows the sensors.
+
+        near: the values go back to the start then, and only the first states and forces stay.
+        """
+        w, data = self.windows, self.data
+        start = self.point
+        at = w.model.linearise(start.unknowns[:, w.linear], data)
+        step = self._limited(at.step)
+        point = self._linear_step(start, step, at.state_after(step))
+        for last in (False,) * _OPENING + (True,) * near:
+            point = replace(point, unknowns=start.unknowns) if last else point
+            steps = w.steps(point, data)
+            if not last:
+                states, _ = w.simulate(steps, point.force, point.x0, data)
+                point = replace(point, force=w.forces(point, steps, states, data, self.smooth))
+            residual = w.residual(Moved(*w.simulate(steps, point.force, point.x0, data)), data, at.whiten)
+            along = at.free @ residual
+            alone = torch.cholesky_solve(along, at.factor)
+            gradient = at.sensitivities @ residual - at.across.mT @ along
+            step = self._limited((at.covariance @ gradient).squeeze(2)) * (not last)
+            dx0 = (alone - at.across @ step.unsqueeze(2)).squeeze(2) / at.free_scale
+            point = self._linear_step(point, step, point.x0 + dx0)
+        self.point = point
+
+    def _linear_step(self, point: WindowPoint, step: Tensor, x0: Tensor) -> WindowPoint:
+        unknowns = point.unknowns.clone()
+        unknowns[:, self.windows.linear] += step
+        return replace(point, unknowns=unknowns, x0=x0)
+
+    def _iterate(self, rows: Tensor, last: bool) -> None:
+        """A linearisation and two steps of the windows `rows`; a point that is worse is taken back to a third."""
+        w, data, smooth = self.windows, self.data.take(rows), self.smooth[:, rows.numpy()]
+        point, before = self.point.take(rows), self.cost[rows]
+        steps = w.steps(point, data)
+        point, motion = w.settle(point, steps, data, smooth)
+        columns, flow = w.columns(point, steps, motion, data, smooth)
+        residual = w.residual(motion, data, columns.whiten)
+        cost, step, alone = columns.solve(residual, point.unknowns)
+        worse = ~(cost <= before * (1 + 1e-6) + _SLACK)
+        step = self._limited(step)
+        dx0 = columns.state_step(alone, step)
+        smooth = w.smoothed(columns, residual, step, dx0, steps)
+        std = torch.diagonal(columns.covariance, dim1=1, dim2=2).sqrt()
+        second = self._second(columns, flow, point.moved(step, dx0), data, smooth)
+        held = second.cost <= cost * (1 + 1e-6) + _SLACK
+        still = (step.abs() / std).amax(dim=1) < _STILL
+        going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
+        if len(going):  # the old products are good enough for one more
+            self._third(
+                going, second, columns.take(going), flow.take(going), data.take(going), smooth[:, going.numpy()]
+            )
+        done = ((second.small(std) & held) | still) & ~worse
+        ripe = ((done | last) & self.wanted[rows]).nonzero().squeeze(1)
+        if len(ripe):
+            weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)
+            self._weigh(rows[ripe], columns.take(ripe), *weighed)
+        there, more, motion = second.point, self._limited(second.step), second.motion
+        forward = there.moved(more, columns.state_step(second.alone, more)).where(held, point.moved(step / 3, dx0 / 3))
+        best = self.best.take(rows)
+        self.point.put(rows, best.towards(point, 1 / 3).where(worse, forward))
+        self.best.put(rows, best.where(worse, point))
+        self.cost[rows] = torch.where(done & held, second.cost, torch.where(worse, before, cost))
+        self.smooth[:, rows.numpy()] = smooth
+        self.converged[rows], self.covariance[rows], self.states[rows] = done, columns.covariance, motion.states
+        self.iterations[rows] += 1
+        shown = torch.as_tensor(np.flatnonzero(data.present))
+        self.outputs[rows[:, None], :, shown] = motion.outputs.mT
+        self.error[rows[:, None], shown] = (data.measured - motion.outputs).square().mean(dim=1).sqrt()
+
+    def _second(
+        self, columns: Columns, flow: Flow, there: WindowPoint, data: WindowBatch, smooth: FloatArray
+    ) -> Second:
+        """The step from `there` with products from nearby."""
+        w = self.windows
+        there, motion = w.settle(there, w.steps(there, data), data, smooth, flow)
+        residual = w.residual(motion, data, columns.whiten)
+        return Second(there, motion, residual, *columns.solve(residual, there.unknowns))
+
+    def _third(
+        self, at: Tensor, second: Second, columns: Columns, flow: Flow, data: WindowBatch, smooth: FloatArray
+    ) -> None:
+        """One more step of the windows `at`, whose products are given, where it makes nothing worse."""
+        old = second.take(at)
+        step = self._limited(old.step)
+        there = old.point.moved(step, columns.state_step(old.alone, step))
+        new = self._second(columns, flow, there, data, smooth)
+        better = (new.cost <= old.cost * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
+        second.put(at[better], new.take(better))
+
+    def _weigh(
+        self, rows: Tensor, columns: Columns, steps: Steps, flow: Flow, after: Second, data: WindowBatch
+    ) -> None:
+        """Evidence on gains and delays of the windows `rows`."""
+        shown = self.windows.by_drive(columns, steps, flow, self.calibration.motions(data), data)
+        found = self.calibration.evidence(columns, after, data, shown)
+        self.cross[rows] = found.cross[:, : self.told]
+        self.information[rows], self.score[rows], self.weighed[rows] = found.information, found.score, True
+
+    def _limited(self, step: Tensor) -> Tensor:
+        """Steps of log-ratios no larger than `_STEP_LIMIT`; the whole step is shortened."""
+        largest = step[:, : self.told].abs().amax(dim=1, keepdim=True)
+        return step * (_STEP_LIMIT / largest.clamp_min(_STEP_LIMIT))
+
+    def _result(self, states: bool) -> Refined:
+        w, data = self.windows, self.data
+        found, covariance = self.point.unknowns[:, : self.told], self.covariance[:, : self.told, : self.told]
+        std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
+        identifiable = std < IDENTIFIABLE_STD
+        P = len(w.system.parameters)
+        weak = (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = data.take(weak)
+            noise = w.model.noise_share(w.model.linearise(found[weak][:, w.linear], chosen), chosen)
+            identifiable[weak, :P] &= noise[:, :P] < NOISE_SHARE
+        signals = len(w.model.compression.matrix(data.present))
+        taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)
+        freedom = 2 * w.model.bins * signals - taken
+        chi_square = self.cost / freedom.clamp_min(1)
+        covariance = covariance * chi_square.clamp_min(1)[:, None, None]
+        both = identifiable[:, :, None] & identifiable[:, None, :]
+        prior = torch.eye(self.told, dtype=torch.float64) * PRIOR_STD**2
+        prior[w.linear, w.linear] = 1 / w.model.precision[: len(w.linear)]
+        B = len(found)
+        rms = np.full((B, len(data.present)), np.nan)
+        rms[:, data.present] = data.measured.square().mean(dim=1).sqrt()
+        return Refined(
+            log_ratio=torch.where(identifiable, found, 0.0).numpy(),
+            covariance=torch.where(both, covariance, prior).numpy(),
+            identifiable=identifiable.numpy(),
+            converged=self.converged.numpy(),
+            iterations=self.iterations.numpy(),
+            chi_square=chi_square.numpy(),
+            freedom=freedom.numpy(),
+            error=self.error.numpy(),
+            rms=rms,
+            states=self.states.numpy() if states else np.zeros((B, 0, self.states.shape[2])),
+            outputs=self.outputs.numpy() if states else np.zeros((B, 0, len(data.present))),
+            excitation=np.full(B, np.inf),  # told by the windows
+            weighed=self.weighed.numpy(),
+            cross=torch.where(identifiable[:, :, None], self.cross, 0.0).numpy(),
+            information=(self.information / chi_square.clamp_min(1)[:, None, None]).numpy(),
+            score=(self.score / chi_square.clamp_min(1)[:, None]).numpy(),
+        )
