@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentTask, covariance, fitted, spread
+from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.piece import SURFACE
@@ -99,6 +100,10 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
     carried = bool(found.steps) and share is not None and share >= one.task.rules.named
     if left and not carried:
+        tell("what is left, as a formula")
+        told = _with_formula(judged)
+        if told is not None:
+            return told
         tell("what is left, as an unnamed force")
         judged = replace(_with_surface(judged), named=False)
     return judged
@@ -127,6 +132,17 @@ def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
     task = one.task
     most = task.rules.declared * float(np.std(task.force))
     return float(np.hypot(max(task.noise, min(one.declared, most)), min(fit.motion_noise, most)))
+
+
+def _with_formula(judged: Judged) -> Judged | None:
+    """The force that no law explains as a formula, where one explains as much as a law has to."""
+    with np.errstate(all="ignore"):  # trial formulas overflow
+        found = formula_search(judged.record.task, judged.record.given)
+    if found is None:
+        return None
+    told = replace(judged, found=found, final=found.final, floor=noise_floor(judged.record, found.final))
+    share = told.errors.explained()
+    return told if share is not None and share >= judged.record.task.rules.named else None
 
 
 def _with_surface(judged: Judged) -> Judged:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, spread
+from sprung.model.diagnosis.component.formula import given_piece
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.formula import EFFECT
 from sprung.model.laws.gas import PRELOAD
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
@@ -32,6 +35,9 @@ def given_model(system: System, element: str, notes: list[str]) -> ComponentMode
 
 
 def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
+    if placed.law.name == EFFECT and isinstance(placed.law, ElementLaw):
+        formula = given_piece(placed.law, placed.values)
+        return formula, () if formula is None else formula.shape_of(placed.values)
     for piece in PIECES:
         if piece.law.name == placed.law.name and len(piece.law.parameters) == len(placed.values):
             return piece, piece.shape_of(placed.values)
@@ -62,7 +68,8 @@ def identified_laws(
             LawParameter(spec.name, float(value), float(s) if np.isfinite(s) else 0.0, spec.unit)
             for spec, value, s in zip(law.parameters, numbers, sigma, strict=True)
         )
-        found.append(IdentifiedLaw(element, law.name, parameters))
+        texts = (law.formula, law.memory_formula) if law.name == EFFECT else ("", "")
+        found.append(IdentifiedLaw(element, law.name, parameters, formula=texts[0], memory=texts[1]))
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     if abs(fit.preload) > deviation:
         parameter = LawParameter("force", sign * fit.preload, deviation, "N")

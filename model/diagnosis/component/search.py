@@ -92,7 +92,7 @@ def search(
         if current.fit.at_noise:
             break
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
-        ranked = _next_laws(current.fit, pieces, rules)
+        ranked = next_laws(current.fit, pieces, rules)
         if number == 0:
             for trial in ranked:
                 screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
@@ -122,7 +122,7 @@ def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules)
     return sorted(ranked, key=lambda r: -r.evidence)
 
 
-def _next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> list[Ranked]:
+def next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: ComponentRules) -> list[Ranked]:
     """Models with one more law, refined, best first."""
     used = {piece.effect for piece in current.model.pieces}
     kinds = {piece.kind for piece in current.model.pieces if piece.dissipates}
@@ -225,7 +225,7 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     best = chosen
     for index in range(given, len(model.pieces) - 1):
         rest = fitted(chosen.fit.task, model.without(index))
-        for rival in _next_laws(rest, pieces, rules)[:2]:
+        for rival in next_laws(rest, pieces, rules)[:2]:
             same = _rank([rival.fit, best.fit], rest, rules)
             if same[0].fit is rival.fit and same[0].evidence > same[1].evidence + rules.naming_margin:
                 best = same[0]

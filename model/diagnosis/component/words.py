@@ -7,6 +7,7 @@ import itertools
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
+from sprung.model.diagnosis.component.formula import FormulaPiece
 from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
@@ -35,7 +36,10 @@ def finding_of(
     freedom = len(piece.signs) + len(piece.shapes)
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
     told = ", ".join(f"{q.name.replace('_', ' ')} {value_words(q)}" for q in shown[:3])
-    sentence = f"{element}: {piece.title}, {told}"
+    formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
+    sentence = f"{element}: {f'a force {formula}' if formula else piece.title}, {told}"
+    if memory:
+        sentence += f", z' = {memory}"
     if family is not None:
         sentence += f" ({family.replace('_', ' ')} fit almost equally well)"
     if base.element.damping > 0 and fit.element.damping < 0.1 * base.element.damping:
@@ -60,6 +64,8 @@ def finding_of(
         "would tell them apart",
         sentence=sentence,
         quoted=quoted,
+        formula=formula,
+        memory=memory,
     )
 
 

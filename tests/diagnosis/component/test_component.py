@@ -312,3 +312,20 @@ def test_a_law_of_the_system_file_is_no_finding_and_what_is_beside_it_is() -> No
     assert laws(found) == ["cubic_stiffness"]
     friction = next(law for law in found.laws if law.effect == "coulomb_friction")
     assert friction.parameters[0].value == pytest.approx(60, rel=0.05)
+
+
+def test_a_force_of_no_law_is_told_as_its_formula_and_goes_into_the_system_file(tmp_path: Path) -> None:
+    _, d, v = sweep()
+    found = report(K * d + C * v + 6e4 * d * np.abs(v) + 3e6 * d**2, d)
+    assert found.verdict == "unknown_physics"
+    first = found.findings[0]
+    assert (first.effect, first.formula) == ("formula", "a * d**2 + b * d * abs(v)")
+    assert [p.value for p in first.parameters] == pytest.approx([3e6, 6e4], rel=0.01)
+    file = tmp_path / "damper.yaml"
+    file.write_text(TEXT, encoding="utf-8")
+    improved = tmp_path / "improved.yaml"
+    write_improved(improved, file, system(), found)
+    assert "a * d**2 + b * d * abs(v)" in improved.read_text(encoding="utf-8")
+    values = np.column_stack([d, K * d + C * v + 6e4 * d * np.abs(v) + 3e6 * d**2])
+    noisy = values + np.random.default_rng(3).normal(0, [1e-6, 1.0], values.shape)
+    assert diagnose(load_system(improved), RigRecording(noisy)).verdict == "consistent"

@@ -1,0 +1,156 @@
+"""A component's force that no law explains as a formula: shapes of the grammar, alone and in pairs.
+
+The same grammar as beside a vehicle (`model.laws.grammar`): along the measured motion every shape is a column with an
+amplitude, its own length, rate or time a shape to be searched.  Deflections count from the middle of the travel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, covariance, refined, spread
+from sprung.model.diagnosis.component.piece import Piece, Seen, Shape
+from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
+from sprung.model.diagnosis.selection.evidence import chance
+from sprung.model.laws import ElementLaw, Motion, Observed, SpringDamper
+from sprung.model.laws.formula import EFFECT
+from sprung.model.laws.grammar import Shape as Form
+from sprung.model.laws.grammar import forms, formula_cost, law_of
+from sprung.model.signals import FloatArray
+
+_WIDE = 20.0  # times the usual size of a length or rate, either way
+_PARTNERS = 3  # shapes that others are tried beside
+_CLEARLY = 5.0  # deviations of an amplitude; less is no part of a formula
+_SERVES = 0.5  # of the held-out power that one shape leaves, which a second one may leave
+_UNIT = SpringDamper(1.0, 1.0)
+_OFF = 2.0  # factor by which an amplitude is tried for being one
+
+
+@dataclass(frozen=True)
+class FormulaPiece(Piece):
+    """A formula as a part of a component's force."""
+
+    parts: int = 0  # complexity
+
+    @property
+    def key(self) -> str:
+        """Apart from other formulas."""
+        return f"{EFFECT} {self.law.formula} {self.law.memory_formula}"
+
+
+def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 0) -> FormulaPiece:
+    """A formula whose parameters a, b, c are amplitudes; grid: trial values of the others, (trials, values)."""
+    amplitudes = [i for i, spec in enumerate(law.parameters) if spec.name in "abc"]
+    others = [i for i in range(len(law.parameters)) if i not in amplitudes]
+
+    def parameters(strengths: FloatArray, shape: Shape, element: SpringDamper) -> tuple[float, ...]:
+        values = dict(zip(amplitudes, map(float, strengths), strict=True)) | dict(zip(others, shape, strict=True))
+        return tuple(values[i] for i in range(len(law.parameters)))
+
+    def limits(seen: Seen) -> list[tuple[float, float]]:
+        sizes = {"m": seen.travel, "m/s": seen.rate_rms}
+        return [
+            (sizes[unit] / _WIDE, sizes[unit] * _WIDE) if unit in sizes else (seen.step, seen.seconds)
+            for unit in (law.parameters[i].unit for i in others)
+        ]
+
+    return FormulaPiece(
+        law=law,
+        shapes=tuple(law.parameters[i].name for i in others),
+        grid=lambda seen: np.zeros((1, 0)) if grid is None else grid,
+        limits=limits,
+        signs=(0,) * len(amplitudes),
+        parameters=parameters,
+        shape_of=lambda values: tuple(values[i] for i in others),
+        kind="hysteresis" if law.memory else "static",
+        parts=parts,
+    )
+
+
+def given_piece(law: ElementLaw, values: Sequence[float]) -> FormulaPiece | None:
+    """A formula of a system file; None: one with a state, or not linear in amplitudes a, b, c."""
+    piece = formula_piece(law)
+    if not piece.signs or law.memory:
+        return None
+    d, v = np.linspace(-1e-3, 1.1e-3, 7), np.linspace(0.013, -0.01, 7)
+    shape = piece.shape_of(values)
+
+    def force(strengths: FloatArray) -> FloatArray:
+        numbers = piece.parameters(strengths, shape, _UNIT)
+        return np.asarray(law.force(Motion(d, v, 0.0, ()), numbers, _UNIT), dtype=float)
+
+    one = np.array([values[i] for i, spec in enumerate(law.parameters) if spec.name in "abc"])
+    return piece if np.allclose(force(_OFF * one), _OFF * force(one), rtol=1e-9, atol=1e-12) else None
+
+
+def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
+    """A formula beside spring, damper and the laws that the file gives; None: none is more than chance.
+
+    Two shapes together are tried of those that did best alone.
+    """
+    rules = task.rules
+    quick, fine = task.every(max(1, len(task.force) // rules.search)), task.every(max(1, len(task.force) // rules.fit))
+    base, seen = refined(quick, given), _observed(task)
+    single = {piece.key: (form, piece) for form in forms() for piece in [_single(form, seen)]}
+    alone = [one for one in next_laws(base, tuple(piece for _, piece in single.values()), rules) if _told(one)]
+    alone.sort(key=_worth, reverse=True)
+    pairs = [
+        _pair(single[one.last.key][0], one.fit.model.shapes[-1], form, piece, task.seen)
+        for one in alone[:_PARTNERS]
+        for key, (form, piece) in single.items()
+        if key != one.last.key and not (form.memory and single[one.last.key][0].memory)
+    ]
+    if not alone or _worth(alone[0]) <= 0:
+        return None
+    enough = _SERVES * alone[0].fit.held_out
+    together = [one for one in next_laws(base, tuple(pairs), rules) if _told(one) and one.fit.held_out < enough]
+    chosen, before = max([alone[0], *together], key=_worth), Ranked(base, 0.0, 0.0, 0.0)
+    freedom = chosen.fit.model.count - base.model.count
+    p_value = chance(chosen.gain, freedom, len(single))
+    if p_value > rules.alpha or chosen.fit.held_out >= base.held_out:
+        return None
+    step = Step(chosen, before, (), p_value)
+    return Search(refined(fine, base.model), refined(fine, chosen.fit.model), (step,), {EFFECT: chosen.gain})
+
+
+def _worth(one: Ranked) -> float:
+    """Evidence less what the formula's parts cost."""
+    piece = one.last
+    return one.evidence - formula_cost(piece.parts if isinstance(piece, FormulaPiece) else 0)
+
+
+def _single(form: Form, seen: Observed) -> FormulaPiece:
+    law = law_of((form,))
+    return formula_piece(law, law.shapes(seen)[:, 1:], form.parts)
+
+
+def _pair(one: Form, shape: Shape, other: Form, piece: FormulaPiece, seen: Seen) -> FormulaPiece:
+    """A shape at the values that it had alone, and another at any of its trial values."""
+    trials = piece.grid(seen)
+    rows = np.column_stack([np.tile(np.array(shape, dtype=float), (len(trials), 1)), trials])
+    return formula_piece(law_of((one, other)), rows, one.parts + other.parts)
+
+
+def _told(one: Ranked) -> bool:
+    """Whether the record tells every amplitude."""
+    index = len(one.fit.model.pieces) - 1
+    sigma, _ = spread(one.fit, index, *covariance(one.fit))
+    named = zip(one.fit.values(index).items(), sigma, strict=True)
+    return all(abs(value) > _CLEARLY * s for (name, (value, _)), s in named if name in "abc")
+
+
+def _observed(task: ComponentTask) -> Observed:
+    d, v = task.motion.deflection - task.motion.middle, task.motion.rate
+    shares = np.linspace(0, 1, 101)
+    return Observed(
+        deflection=np.quantile(np.abs(d), shares),
+        rate=np.quantile(np.abs(v), shares),
+        deflection_rms=float(np.std(d)),
+        rate_rms=float(np.std(v)),
+        stiffness=1.0,
+        damping=1.0,
+        seconds=len(d) * task.motion.step,
+    )
