@@ -62,7 +62,7 @@ class Second:
         self.step[at], self.alone[at] = some.step, some.alone
 
 
-class Search:
+class LawSearch:
     """Windows with the same sensors present, from log-ratios (B, P + laws' values), loads at zero.
 
     wanted: windows (B,) whose evidence on gains and delays is computed.

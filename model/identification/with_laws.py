@@ -16,7 +16,7 @@ import torch
 from sprung.model.chunks import alike, share
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.law_forces import Acting
-from sprung.model.identification.law_search import ITERATIONS, Search
+from sprung.model.identification.law_search import ITERATIONS, LawSearch
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refined, in_order
@@ -93,7 +93,7 @@ class LawRefiner:
         def work(at: IntArray) -> Refined:
             with torch.no_grad():
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
-                search = Search(model, self.calibration, data, begin[at], torch.as_tensor(wanted[at]))
+                search = LawSearch(model, self.calibration, data, begin[at], torch.as_tensor(wanted[at]))
                 found = search.run(states, near, iterations)
                 return replace(found, excitation=self.model.excitation(windows[at]))
 
