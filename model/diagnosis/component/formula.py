@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, covariance, refined, spread
-from sprung.model.diagnosis.component.piece import Piece, Seen, Shape
+from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, Piece, Seen, Shape
 from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.laws import ElementLaw, Motion, Observed, SpringDamper
@@ -65,7 +65,7 @@ def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 
         signs=(0,) * len(amplitudes),
         parameters=parameters,
         shape_of=lambda values: tuple(values[i] for i in others),
-        kind="hysteresis" if law.memory else "static",
+        kind=HYSTERESIS if law.memory else STATIC,
         parts=parts,
     )
 
