@@ -60,6 +60,15 @@ class RecordRules:
 
 
 @dataclass(frozen=True)
+class FitRules:
+    """What is known before a recording."""
+
+    prior: float = rule(
+        1.0, "deviation of a log-ratio to nominal; derived: a factor e, no vehicle is further", 0.7, 2.0
+    )
+
+
+@dataclass(frozen=True)
 class ScreeningRules:
     """Which trials are scored."""
 
@@ -273,6 +282,7 @@ class Rules:
     """The rules of every stage, in the order in which they decide."""
 
     record: RecordRules = RecordRules()
+    fit: FitRules = FitRules()
     setup: SetupRules = SetupRules()
     screening: ScreeningRules = ScreeningRules()
     evidence: EvidenceRules = EvidenceRules()

@@ -32,7 +32,6 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
-PRIOR = 1.0  # standard deviation of a log-ratio to nominal: keeps what nothing tells near its nominal value
 # Fall of the objective, twice a log-likelihood, below which a fit is done per standard deviation that it moved; below
 # which a step that fails has nothing to find; and beyond which a fit is no basis of comparisons: a tenth of the
 # margin by which one law is preferred to another
@@ -143,7 +142,7 @@ def optimise(
     """
     if problem.memory is None:
         return _optimised(problem, start, iterations, tolerance, whitener)
-    others = (iterations, tolerance, None if whitener is None else whitener.factor)
+    others = (iterations, tolerance, problem.rules.fit.prior, None if whitener is None else whitener.factor)
     key = key_of(problem.system, problem.part, problem.noise, start, *others)
     known: Fit = problem.memory.recall(key, lambda: _optimised(problem, start, iterations, tolerance, whitener))
     return known
@@ -153,7 +152,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
     state = _state(problem, *_begun(problem, start, whitener))
     damping, left, count = _DAMPING[0], np.inf, 0
     for count in range(1, iterations + 1):
-        step, sigma, promised = _step(state.lin, state.point, damping)
+        step, sigma, promised = _step(problem, state.lin, state.point, damping)
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
         trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
         proposed = _state(problem, trial, working)
@@ -190,13 +189,12 @@ def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[P
 def _state(problem: Problem, point: Point, working: Working) -> _State:
     """The model linearised at a point.  Objective: twice the negative log-posterior, up to a constant."""
     lin = linearise(problem, point, working)
-    return _State(
-        replace(point, warm_start=warm_start_of(lin.forces)), working, lin, _value(lin.residual, lin.log_det, point)
-    )
+    value = _value(problem, lin.residual, lin.log_det, point)
+    return _State(replace(point, warm_start=warm_start_of(lin.forces)), working, lin, value)
 
 
-def _value(residual: FloatArray, log_det: float, point: Point) -> float:
-    return float(residual @ residual + log_det + np.sum((point.theta / PRIOR) ** 2))
+def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point) -> float:
+    return float(residual @ residual + log_det + np.sum((point.theta / problem.rules.fit.prior) ** 2))
 
 
 def _value_under(problem: Problem, state: _State, working: Working) -> float:
@@ -207,25 +205,26 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
     forward = state.lin.forward.driven_by(inputs.part, point.warm_start)
     shown = problem.shown(forward, law_forces(forward, point, inputs))
     free = problem.free_columns(forward) @ point.state
-    return _value(working.whitener(problem.part.sensors - shown - free, problem.part), state.lin.log_det, point)
+    residual = working.whitener(problem.part.sensors - shown - free, problem.part)
+    return _value(problem, residual, state.lin.log_det, point)
 
 
-def _normal(lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
+def _normal(problem: Problem, lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
     """Matrix of the normal equations with the prior of theta, columns scaled, and the scales."""
     P = len(point.theta)
     normal = lin.jacobian.T @ lin.jacobian
-    normal[np.arange(P), np.arange(P)] += 1 / PRIOR**2
+    normal[np.arange(P), np.arange(P)] += 1 / problem.rules.fit.prior**2
     scale = scale_of(normal, len(point.state))
     return normal * scale * scale[:, None], scale
 
 
-def _step(lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray, float]:
+def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray, float]:
     """Gauss-Newton step, standard deviations of theta and term parameters, and the fall that a full step promises."""
     P = len(point.theta)
-    scaled, scale = _normal(lin, point)
+    scaled, scale = _normal(problem, lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
-    gradient[:P] -= point.theta / PRIOR**2
+    gradient[:P] -= point.theta / problem.rules.fit.prior**2
     step, variance, promised = _solved(scaled, scale, gradient, damping)
     held = held_back(point, step)
     if held.any():  # the others go on as if it were given
@@ -252,7 +251,7 @@ def _finish(problem: Problem, state: _State, left: float, count: int) -> Fit:
     point, lin = state.point, state.lin
     P = len(point.theta)
     free = lin.jacobian.shape[1] - len(point.state)
-    scaled, scale = _normal(lin, point)
+    scaled, scale = _normal(problem, lin, point)
     inverse = np.linalg.pinv(scaled, rcond=1e-14, hermitian=True)
     covariance = (inverse * scale * scale[:, None])[:free, :free]
     slopes = np.concatenate([np.ones(P), *[t.slopes for t in point.terms]]) if point.terms else np.ones(P)
