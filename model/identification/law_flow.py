@@ -37,8 +37,9 @@ class Flow:
         K = self.slopes[0].unsqueeze(3) * rows[0] + self.slopes[1].unsqueeze(3) * rows[1]  # (B, T, L, N)
         self.at_first = K[:, 0]
         after = K[:, 1:]
-        self.memory_size = np.stack([slopes[i].memory_size for i in memories], axis=1) if memories else None  # (B, Z)
+        self.memory_size = torch.zeros(len(K), 0, dtype=torch.float64)  # (B, Z)
         if memories:
+            self.memory_size = torch.as_tensor(np.stack([slopes[i].memory_size for i in memories], axis=1))
             by_memory = stacked("by_memory")[:, :, memories]  # (B, T, Z)
             d0, d1, v0, v1, keep = (
                 stacked(name)[:, :, memories].unsqueeze(3) for name in ("by_d0", "by_d1", "by_v0", "by_v1", "keep")

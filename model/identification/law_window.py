@@ -218,7 +218,7 @@ class LawWindows:
         precision = torch.full((len(J), self.unknowns), 1 / PRIOR_STD**2, dtype=torch.float64)
         precision[:, self.linear] = self.model.precision[: len(self.linear)]
         if self.memories:
-            precision[:, self.told :] = torch.as_tensor(1 / (_MEMORY_STD * flow.memory_size) ** 2)
+            precision[:, self.told :] = (_MEMORY_STD * flow.memory_size) ** -2.0
         covariance = torch.linalg.inv(information + torch.diag_embed(precision))
         told = (information, covariance, precision)
         return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told), flow
