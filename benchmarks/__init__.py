@@ -55,6 +55,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.setups",
         "wrong set-ups on simulated recordings: signs, channels, nodes, scales, positions, bodies",
     ),
+    "naming": (
+        "sprung.benchmarks.naming",
+        "component tests of what rigs do, listed or not: right, unknown, wrong, missed",
+    ),
     "sensitivity": (
         "sprung.benchmarks.sensitivity",
         "what a diagnosis says when one of its deciding numbers is another",

@@ -3,8 +3,9 @@
 For every known record in DIR (benchmarks/real_records.py): the verdict, the laws with their values, the held-out error
 before and after, the noise floor, what is left unexplained; beside a linear and a plain Bouc-Wen model fitted by SciPy
 to the same first 70 % and judged on the same rest.  Errors are rms over the force's deviation.  `--out` draws the
-measured and modelled loops of the held-out part.  Without measured inputs: natural frequencies over time beside the
-spectral peaks, and beside what was measured of the cause and no diagnosis saw.
+measured and modelled loops of the held-out part, the force that a slide misses, frequencies over time.  Without
+measured inputs: natural frequencies over time beside the spectral peaks, and beside what was measured of the cause and
+no diagnosis saw.
 """
 
 from __future__ import annotations
@@ -18,11 +19,12 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from sprung.benchmarks.emps import force_errors, identified
-from sprung.benchmarks.real_picture import loops
+from sprung.benchmarks.real_picture import frequencies, loops, missing_force
 from sprung.benchmarks.real_records import MeasuredRecord, records
 from sprung.benchmarks.real_reference import bouc_wen, linear
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import component_records
+from sprung.model.signals import FloatArray
 
 HALF, PADDED = 0.5, 16  # of the first natural frequency, where peaks are sought from; finer bins
 SURE = 0.02  # deviation over the frequency up to which a window counts
@@ -45,10 +47,15 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             best = min(line["reference"].values())
             line["met"] = line["held_out"] <= best or report.verdict == "unknown_physics"
         if record.witness is not None and report.track:
-            line["track"] = followed(record, report)
+            peaks, beside = peaks_and_witness(record, report)
+            line["track"] = followed(report, peaks, beside)
+            if out is not None:
+                line["picture"] = str(frequencies(report, record.name, out, peaks, beside))
         if record.system.name == "emps":  # columns force and position
             found = identified(report.to_dict(), "augmented")
             line["force_rmse"] = force_errors(record.values, record.sample_rate, found)
+            if out is not None:
+                line["picture"] = str(missing_force(report, record.name, out))
         if out is not None and record.component:
             line["picture"] = str(loops(report, record.name, out))
         yield line
@@ -70,11 +77,11 @@ def said(report: Report) -> dict[str, Any]:
     }
 
 
-def followed(record: MeasuredRecord, report: Report) -> dict[str, Any]:
-    """The lowest natural frequency beside the spectral peak of every window, and both beside the witness."""
+def peaks_and_witness(record: MeasuredRecord, report: Report) -> tuple[FloatArray, FloatArray]:
+    """Spectral peak (Hz) of every window of a report, and the median of the witness in it."""
     assert record.witness is not None
     low, high = HALF * report.track[0].frequency[0], 2 * report.track[0].frequency[0]
-    found, peaks, beside, sure = [], [], [], []
+    peaks, beside = [], []
     for point in report.track:
         at = slice(round(point.begin * record.sample_rate), round(point.end * record.sample_rate))
         series = record.values[at, 0] - record.values[at, 0].mean()
@@ -82,10 +89,15 @@ def followed(record: MeasuredRecord, report: Report) -> dict[str, Any]:
         frequency = np.fft.rfftfreq(PADDED * len(series), 1 / record.sample_rate)
         inside = (frequency > low) & (frequency < high)
         peaks.append(float(frequency[inside][np.argmax(power[inside])]))
-        found.append(point.frequency[0])
-        sure.append(point.adequate and point.deviation[0] < SURE * point.frequency[0])
         beside.append(float(np.median(record.witness[at])))
-    one, other, rank = np.array(found)[sure], np.array(peaks)[sure], np.array(beside)[sure]
+    return np.array(peaks), np.array(beside)
+
+
+def followed(report: Report, peaks: FloatArray, witness: FloatArray) -> dict[str, Any]:
+    """The lowest natural frequency beside the spectral peak of every window, and both beside the witness."""
+    found = np.array([point.frequency[0] for point in report.track])
+    sure = np.array([p.adequate and p.deviation[0] < SURE * p.frequency[0] for p in report.track])
+    one, other, rank = found[sure], peaks[sure], witness[sure]
     return {
         "windows": len(found),
         "sure": len(one),

@@ -16,9 +16,9 @@ KINDS = {  # by the unit a signal has: kind of sensor, SI unit
 }
 WORDS = {  # in names of signals without a unit
     "acceleration": ("acc", "beschl", "ax", "ay", "az"),
-    "displacement": ("disp", "dist", "weg", "stroke", "lvdt", "pos", "travel", "hub"),
+    "displacement": ("disp", "dist", "weg", "stroke", "lvdt", "pos", "travel", "hub", "d", "x"),
     "velocity": ("vel", "speed", "geschw"),
-    "force": ("force", "forc", "kraft", "load", "cell"),
+    "force": ("force", "forc", "kraft", "load", "cell", "f"),
 }
 PLAIN = re.compile(r"^[A-Za-z/][\w/.-]*$")
 YAML_WORDS = ("y", "n", "yes", "no", "on", "off", "true", "false", "null")
@@ -81,6 +81,11 @@ def skeleton(inspection: Inspection, name: str, time: dict[str, object]) -> str:
     if unknown:
         lines += ["# Not used yet, for neither unit nor name tells what they measure:"]
         lines += [f"#   {_identifier(s.name)}: {{{_address(s, None)}}}" for s in unknown]
+    if unknown and test:
+        lines += [
+            "# A valve's current or a temperature that parameters may follow: list it under `signals:`, with its unit,"
+        ]
+        lines += ["# and in the element's `depends_on: [NAME]`"]
     return "\n".join(lines) + "\n"
 
 
@@ -96,13 +101,18 @@ def _test(motions: list[Signal], forces: list[Signal], kinds: Kinds) -> list[str
     lines = [
         "bodies: {}  # a component test: no mass moves",
         "inputs:",
-        f"  rod: {{kind: support, {moved}}}",
+        f"  rod: {{kind: support, {moved}}}{_si(*(by_quantity[q] for q in order))}",
         "elements:",
         "  component: {upper: rod, lower: ground, stiffness: 1.0e+4, damping: 1.0e+3}  # TODO: N/m, N s/m",
         "sensors:",
-        f"  cell: {{kind: force, element: component, {_address(forces[0], kinds[forces[0].name][1])}}}",
+        f"  cell: {{kind: force, element: component, {_address(forces[0], kinds[forces[0].name][1])}}}{_si(forces[0])}",
     ]
     return lines + [f"#   {_identifier(s.name)}: {{{_address(s, kinds[s.name][1])}}}  # another one" for s in rest]
+
+
+def _si(*signals: Signal) -> str:
+    """A reminder where no unit was read."""
+    return "" if all(signal.unit for signal in signals) else "  # TODO: unit (mm, in, kN ...), where it is not SI"
 
 
 def _vehicle(usable: list[Signal], kinds: Kinds) -> list[str]:

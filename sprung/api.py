@@ -127,12 +127,14 @@ def open_recording(
 def load_record(path: str | Path, system: System, dbc: str | Path | None = None, start: int | None = None) -> Record:
     """A whole recording on one even grid, as `diagnose` wants it; arguments and errors as of `open_recording`.
 
+    Columns are the system's channels, then the `signals` of its file, which parameters of components may follow.
+
     >>> import sprung
     >>> record = sprung.load_record("ride.mcap", sprung.load_system())
     >>> record.values.shape, record.sample_rate, record.lost
     ((2000, 28), 100.0, 0)
     """
-    return open_record(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
+    return open_record(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start, signals=True)
 
 
 def simulate(

@@ -10,7 +10,7 @@ from sprung.model.diagnosis.component.fit import ComponentFit, ComponentTask, co
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
-from sprung.model.diagnosis.component.piece import SURFACE
+from sprung.model.diagnosis.component.piece import SURFACE, Lag
 from sprung.model.diagnosis.component.search import (
     Progress as Told,
 )
@@ -22,6 +22,7 @@ from sprung.model.diagnosis.component.search import (
 )
 from sprung.model.diagnosis.component.words import (
     finding_of,
+    late_finding,
     leftover_words,
     preload_finding,
     reversed_finding,
@@ -95,10 +96,12 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, tell=tell, given=one.given)
     base, final = found.base, found.final
-    judged = Judged(one, found, base, final, noise_floor(one, final), turned)
+    judged = Judged(one, found, base, final, final.floor, turned)
     share = judged.errors.explained(rules)
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
-    carried = bool(found.steps) and share is not None and share >= one.task.rules.named
+    # three laws imitate much that is none of them: the more there are, the less they may leave
+    least = 1 - (1 - one.task.rules.named) / max(1, len(found.steps))
+    carried = bool(found.steps) and share is not None and share >= least
     if left and not carried:
         tell("what is left, as a formula")
         told = _with_formula(judged)
@@ -123,24 +126,13 @@ def _turned(task: ComponentTask) -> bool:
     return found
 
 
-def noise_floor(one: ComponentRecord, fit: ComponentFit) -> float:
-    """Bounded noise of the force, N: the cell's, and that of the motion through spring and damper.
-
-    The cell's is what the record shows apart from any model, at standstill and at its highest frequencies; what was
-    declared counts where the record shows less, up to a fiftieth of the force.
-    """
-    task = one.task
-    most = task.rules.declared * float(np.std(task.force))
-    return float(np.hypot(max(task.noise, min(one.declared, most)), min(fit.motion_noise, most)))
-
-
 def _with_formula(judged: Judged) -> Judged | None:
     """The force that no law explains as a formula, where one explains as much as a law has to."""
     with np.errstate(all="ignore"):  # trial formulas overflow
         found = formula_search(judged.record.task, judged.record.given)
     if found is None:
         return None
-    told = replace(judged, found=found, final=found.final, floor=noise_floor(judged.record, found.final))
+    told = replace(judged, found=found, final=found.final, floor=found.final.floor)
     share = told.errors.explained()
     return told if share is not None and share >= judged.record.task.rules.named else None
 
@@ -211,9 +203,12 @@ def _findings(one: Judged) -> list[Finding]:
     if one.reversed:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
     for index, step in enumerate(one.found.steps if one.named else (), len(one.record.given.pieces)):
-        findings.append(
-            finding_of(one.record.element, one.final, one.base, index, step, spread(one.final, index, full, names))
-        )
+        sigma = spread(one.final, index, full, names)
+        if isinstance(one.final.model.pieces[index], Lag):
+            late, std = one.final.model.late, float(sigma[0][0])
+            findings.append(late_finding(one.record.sensor, one.record.element, late, std, step))
+        else:
+            findings.append(finding_of(one.record.element, one.final, one.base, index, step, sigma))
     first = None if one.named else next(iter(one.found.steps), None)
     unnamed = one.surface or first
     if unnamed is not None:

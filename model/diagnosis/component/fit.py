@@ -17,10 +17,12 @@ import numpy as np
 from scipy.optimize import least_squares, lsq_linear
 
 from sprung.model.diagnosis.component.motion import ElementMotion
-from sprung.model.diagnosis.component.piece import Part, Seen, Values
+from sprung.model.diagnosis.component.piece import Lag, Part, Seen, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
-from sprung.model.laws import SpringDamper
+from sprung.model.laws import ElementLaw, SpringDamper
+from sprung.model.laws.along import force_along
 from sprung.model.laws.following import Covariate
+from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
@@ -46,10 +48,21 @@ class ComponentTask:
     rules: ComponentRules = RULES.component
     signals: tuple[Covariate, ...] = ()  # that its parameters may follow
     noise: float = 0.0  # N, of the force as the record itself shows it, apart from any model
+    declared: float = 0.0  # N, the same as the system file states it; 0: it states none
+    held: tuple[PlacedLaw, ...] = ()  # laws whose values are known and not estimated
 
     @cached_property
     def seen(self) -> Seen:
         return Seen.of(self.motion, self.rules)
+
+    def delayed(self, late: float) -> ComponentTask:
+        """The same with the motion of that long ago, s."""
+        return self if late == 0.0 else replace(self, motion=self.motion.delayed(late))
+
+    @property
+    def bounded_noise(self) -> float:
+        """The cell's noise, N: what the record shows, or was declared, up to a fiftieth of the force."""
+        return max(self.noise, min(self.declared, self.rules.declared * float(np.std(self.force))))
 
     def every(self, stride: int) -> ComponentTask:
         """The same thinned out."""
@@ -63,7 +76,19 @@ class ComponentTask:
         columns = np.column_stack([np.ones(len(self.force)), self.motion.deflection, self.motion.rate])
         known = np.array([0.0, self.nominal.stiffness or 0.0, self.nominal.damping or 0.0])
         free = np.array([True, self.nominal.stiffness is None, self.nominal.damping is None])
-        return columns[:, free], free, self.force - columns @ known
+        return columns[:, free], free, self.force - columns @ known - self._held_force
+
+    @property
+    def _held_force(self) -> FloatArray:
+        """Force of the laws that are held, N, (T,)."""
+        motion = self.motion
+        element = SpringDamper(self.nominal.stiffness or 0.0, self.nominal.damping or 0.0)
+        found = np.zeros(len(self.force))
+        for one in self.held:
+            assert isinstance(one.law, ElementLaw)
+            d = motion.deflection - motion.middle
+            found += force_along(one.law, one.values, d, motion.rate, motion.time, element)
+        return found
 
 
 @dataclass(frozen=True)
@@ -80,9 +105,15 @@ class ComponentModel:
         keep = [i for i in range(len(self.pieces)) if i != index]
         return ComponentModel(tuple(self.pieces[i] for i in keep), tuple(self.shapes[i] for i in keep))
 
+    @property
+    def late(self) -> float:
+        """By how much the force's channel is late against the motion's, s."""
+        return sum(shape[0] for piece, shape in zip(self.pieces, self.shapes, strict=True) if isinstance(piece, Lag))
+
     def columns(self, task: ComponentTask) -> FloatArray:
         """(T, m) of all pieces."""
-        found = [p.columns(task.motion, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
+        motion = task.motion.delayed(self.late)
+        found = [p.columns(motion, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
         return np.column_stack(found) if found else np.zeros((len(task.force), 0))
 
     @property
@@ -141,6 +172,12 @@ class ComponentFit:
         level = self.task.rules.at_noise * (self.task.noise**2 + self.motion_noise**2)
         return max(self.error, self.held_out) < level
 
+    @property
+    def floor(self) -> float:
+        """Bounded noise of the force, N: the cell's, and that of the motion through spring and damper."""
+        most = self.task.rules.declared * float(np.std(self.task.force))
+        return float(np.hypot(self.task.bounded_noise, min(self.motion_noise, most)))
+
     def strengths_of(self, index: int) -> FloatArray:
         counts = [len(piece.signs) for piece in self.model.pieces]
         first = sum(counts[:index])
@@ -176,8 +213,12 @@ def bounded_solution(columns: FloatArray, target: FloatArray, signs: tuple[int, 
 
 def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     """Strengths, preload, spring and damper for given shapes."""
-    base, free, force = task.linear
+    base, free, force = task.delayed(model.late).linear
     columns = np.column_stack([base, model.columns(task)])
+    if model.late != 0.0:  # before the record nobody knows the motion
+        earlier = task.motion.time - model.late
+        known = (earlier >= task.motion.time[0]) & (earlier <= task.motion.time[-1])
+        columns, force = columns * known[:, None], force * known
     signs = tuple(np.array([0, 1, 1])[free].tolist()) + model.signs
     train = slice(0, task.split)
     solved, _ = bounded_solution(columns[train], force[train], signs)
@@ -221,14 +262,17 @@ def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
 def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
     """Covariance of preload, k, c (where free), strengths and shapes, in this order, and their names."""
     task, model = fit.task, fit.model
-    base, free, _ = task.linear
+    base, free, _ = task.delayed(model.late).linear
     columns = np.column_stack([base, model.columns(task)])[: task.split]
-    moved = []
+    motion, moved = task.motion.delayed(model.late), []
     for i, (piece, shape) in enumerate(zip(model.pieces, model.shapes, strict=True)):
         for j in range(len(shape)):
             step = _RELATIVE * max(abs(shape[j]), 1e-12) * 10
+            if isinstance(piece, Lag):
+                moved.append(_per_lag(fit)[: task.split])
+                continue
             other = tuple(s + step * (k == j) for k, s in enumerate(shape))
-            change = (piece.columns(task.motion, other) - piece.columns(task.motion, shape)) @ fit.strengths_of(i)
+            change = (piece.columns(motion, other) - piece.columns(motion, shape)) @ fit.strengths_of(i)
             moved.append(change[: task.split] / step)
     jacobian = np.column_stack([columns, *moved]) if moved else columns
     scale = np.linalg.norm(jacobian, axis=0)
@@ -245,6 +289,20 @@ def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
     full = sandwich * np.outer(grow, grow) / np.outer(scale, scale)
     names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
     return full, names
+
+
+def _per_lag(fit: ComponentFit) -> FloatArray:
+    """Derivative of the modelled force by the lag, N/s, (T,)."""
+    late, step = fit.model.late, _RELATIVE * fit.task.motion.step
+
+    def force(delay: float) -> FloatArray:
+        task = fit.task.delayed(delay)
+        linear = task.motion.deflection * fit.element.stiffness + task.motion.rate * fit.element.damping
+        pieces = zip(fit.model.pieces, fit.model.shapes, strict=True)
+        found = [piece.columns(task.motion, shape) for piece, shape in pieces]
+        return np.asarray(linear + np.column_stack([*found, np.zeros((len(linear), 0))]) @ fit.strengths)
+
+    return (force(late + step) - force(late)) / step
 
 
 def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:

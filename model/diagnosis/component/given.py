@@ -17,21 +17,29 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
-def given_model(system: System, element: str, notes: list[str]) -> ComponentModel:
-    """The laws of the system file at an element with the shapes they have there; strengths are estimated anew.
+def given_model(system: System, element: str, notes: list[str]) -> tuple[ComponentModel, tuple[PlacedLaw, ...]]:
+    """The laws of the system file at an element: with the shapes they have there, to be estimated anew; and those held.
 
-    notes: gets a line for every law that a component test cannot take over.
+    Laws are held all of whose values the file fixes.  notes: gets a line for every law that is not as the file has it.
     """
-    model = ComponentModel()
+    model, held = ComponentModel(), []
     for placed in system.laws:
-        if placed.location != element or placed.law is PRELOAD:  # every component test has one
+        if placed.location != element or (placed.law is PRELOAD and not all(placed.fixed)):  # every test has one
             continue
+        if all(placed.fixed) and isinstance(placed.law, ElementLaw):
+            held.append(placed)
+            continue
+        if any(placed.fixed):
+            notes.append(
+                f"{element}: some values of {placed.law.name} are fixed in the system file, others not: component "
+                "tests hold all values of a law or none; none is held"
+            )
         piece, shape = _piece(placed)
         if piece is None:
             notes.append(f"{element}: {placed.law.name} of the system file is left out: component tests do not fit it")
             continue
         model = model.plus(piece, shape)
-    return model
+    return model, tuple(held)
 
 
 def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
@@ -54,7 +62,7 @@ def identified_laws(
     full, names: covariance of the fit; sign: -1 where the measured force was turned.  What follows a measured signal
     has no place in a system file and is left out.
     """
-    found = []
+    found = [_as_placed(held, element) for held in fit.task.held]
     for index, piece in enumerate(fit.model.pieces[:count]):
         if not isinstance(piece, Piece):
             continue
@@ -75,3 +83,9 @@ def identified_laws(
         parameter = LawParameter("force", sign * fit.preload, deviation, "N")
         found.append(IdentifiedLaw(element, PRELOAD.name, (parameter,)))
     return tuple(found)
+
+
+def _as_placed(held: PlacedLaw, element: str) -> IdentifiedLaw:
+    values = zip(held.law.parameters, held.values, held.std, strict=True)
+    parameters = tuple(LawParameter(spec.name, value, std or 0.0, spec.unit) for spec, value, std in values)
+    return IdentifiedLaw(element, held.law.name, parameters)

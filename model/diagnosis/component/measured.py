@@ -12,6 +12,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.component.given import given_model
+from sprung.model.diagnosis.component.integrated import integrated, without_slow
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 from sprung.model.diagnosis.rules import RULES, Rules
@@ -28,9 +29,22 @@ class ComponentRecord:
     element: str
     sensor: str
     task: ComponentTask
-    declared: float  # N, noise of the force as the system file states it; 0: it states none
     notes: tuple[str, ...]
     given: ComponentModel = NO_LAWS  # laws of the system file
+
+
+@dataclass(frozen=True)
+class _Wandering:
+    """What integrations of a motion left in it."""
+
+    deflection: float = 0.0  # m, noise
+    rate: float = 0.0  # m/s, noise
+    lowest: float = 0.0  # Hz, below which the motion is not known
+
+    def beside(self, other: _Wandering) -> _Wandering:
+        """Of a difference of two motions."""
+        noise = float(np.hypot(self.deflection, other.deflection)), float(np.hypot(self.rate, other.rate))
+        return _Wandering(*noise, max(self.lowest, other.lowest))
 
 
 def is_component_test(system: System, values: FloatArray, rules: Rules = RULES) -> bool:
@@ -104,8 +118,10 @@ def _record(
     rules: Rules,
 ) -> ComponentRecord:
     notes: list[str] = []
-    displacement, velocity = _deflection(system, element, values, names, sample_rate, notes)
+    displacement, velocity, left = _deflection(system, element, values, names, sample_rate, notes)
     force = _column(values, names, sensor)
+    if left.lowest > 0:
+        force = without_slow(force, sample_rate, left.lowest)
     good = np.isfinite(displacement) & np.isfinite(force) & (True if velocity is None else np.isfinite(velocity))
     first, last = _longest(good, max(1, int(rules.record.gap * sample_rate)))
     if last - first < rules.record.minimum_samples:
@@ -130,35 +146,39 @@ def _record(
             "cut out; the force's noise was measured there"
         )
     begin = (first + run.start) / sample_rate
+    motion = element_motion(d[run], None if v is None else v[run], sample_rate, begin, rules.component)
+    given, held = given_model(system, element, notes)
     task = ComponentTask(
-        motion=element_motion(d[run], None if v is None else v[run], sample_rate, begin, rules.component),
+        motion=motion.with_noise(left.deflection, left.rate),
         force=f[run],
         split=int(share * (run.stop - run.start)),
         nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
         rules=rules.component,
         signals=covariates(system, values, sample_rate, element, notes),
         noise=max(noise_at_rest(f, rests) or 0.0, white_noise(f[run])),
+        declared=system.file.sensors[sensor].noise,
+        held=held,
     )
-    given = given_model(system, element, notes)
-    return ComponentRecord(element, sensor, task, system.file.sensors[sensor].noise, tuple(notes), given)
+    return ComponentRecord(element, sensor, task, tuple(notes), given)
 
 
 def _deflection(
     system: System, element: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
-) -> tuple[FloatArray, FloatArray | None]:
-    """Motion of an element's upper end less that of its lower, (T,); its rate where both ends' are measured."""
-    ends = system.file.elements[element]
-    displacement, velocity, has_velocity = np.zeros(len(values)), np.zeros(len(values)), True
+) -> tuple[FloatArray, FloatArray | None, _Wandering]:
+    """Motion of an element's upper end less that of its lower, (T,); its rate where both ends' are known."""
+    ends, count = system.file.elements[element], len(values)
+    displacement, velocity, has_velocity, left = np.zeros(count), np.zeros(count), True, _Wandering()
     for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
         if end not in system.file.inputs:
             if end != "ground":
                 notes.append(f"{end} hardly moves under the measured force: taken for ground")
             continue
-        moved, rate = _motion_of(system, end, values, names, sample_rate, notes)
+        moved, rate, more = _motion_of(system, end, values, names, sample_rate, notes)
+        left = left.beside(more)
         displacement += sign * moved
         has_velocity &= rate is not None
         velocity += sign * (rate if rate is not None else 0.0)
-    return displacement, velocity if has_velocity else None
+    return displacement, velocity if has_velocity else None, left
 
 
 def _between(rests: list[slice], count: int, least: int) -> slice:
@@ -170,21 +190,25 @@ def _between(rests: list[slice], count: int, least: int) -> slice:
 
 def _motion_of(
     system: System, end: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
-) -> tuple[FloatArray, FloatArray | None]:
-    """Displacement of a support (T,), and its rate where that is measured."""
-    source = system.file.inputs[end]
+) -> tuple[FloatArray, FloatArray | None, _Wandering]:
+    """Displacement of a support (T,), its rate where known, and what integrations left in both."""
+    source, nothing = system.file.inputs[end], _Wandering()
     if not isinstance(source, SupportInput):
         raise DiagnosisError(f"input {end}: a component test needs its motion measured, not a force on it")
     rate = _column(values, names, f"{end}.velocity") if "velocity" in source.measured else None
     if "displacement" in source.measured:
-        return _column(values, names, f"{end}.displacement"), rate
-    if rate is None:
-        raise DiagnosisError(
-            f"input {end} is measured by its acceleration alone, whose twofold integral wanders: a component test "
-            "needs its displacement or its velocity measured"
-        )
-    notes.append(f"{end}.displacement was integrated from its velocity")
-    return _integral(rate, sample_rate), rate
+        return _column(values, names, f"{end}.displacement"), rate, nothing
+    if rate is not None:
+        notes.append(f"{end}.displacement was integrated from its velocity")
+        return _integral(rate, sample_rate), rate, nothing
+    moved = integrated(_column(values, names, f"{end}.acceleration"), sample_rate)
+    if moved is None:
+        raise TooLittleError(f"too still to decide anything: {end}.acceleration shows nothing but noise")
+    notes.append(
+        f"{end}'s motion was integrated from its acceleration; below {moved.lowest:.2g} Hz it is not known, and "
+        "nothing is said of the force there, nor of a preload"
+    )
+    return moved.displacement, moved.velocity, _Wandering(moved.displacement_noise, moved.velocity_noise, moved.lowest)
 
 
 def covariates(
@@ -198,7 +222,9 @@ def covariates(
             continue
         series = values[:, first + index] if first + index < values.shape[1] else np.full(len(values), np.nan)
         signal = Covariate.of(channel.name, channel.unit, series, sample_rate)
-        if signal is None:
+        if not np.isfinite(series).any():
+            notes.append(f"{channel.name} is not in this recording: nothing can be told to follow it")
+        elif signal is None:
             notes.append(f"{channel.name} does not change in this recording: nothing can be told to follow it")
         else:
             found.append(signal)

@@ -7,11 +7,13 @@ and what noise passes is reported: it is the errors-in-variables part of the for
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.rules import RULES, ComponentRules
@@ -42,6 +44,22 @@ class ElementMotion:
     def middle(self) -> float:
         """The position half way between the ends of the travel, m."""
         return 0.5 * float(self.deflection.max() + self.deflection.min())
+
+    def with_noise(self, deflection: float, rate: float) -> ElementMotion:
+        """With noise of other origin, m and m/s, beside its own."""
+        noise = float(np.hypot(self.deflection_noise, deflection)), float(np.hypot(self.rate_noise, rate))
+        return replace(self, deflection_noise=noise[0], rate_noise=noise[1])
+
+    def delayed(self, late: float) -> ElementMotion:
+        """The motion that long ago, s, between samples by cubic splines; at the ends it rests."""
+        if late == 0.0:
+            return self
+        earlier = self._between(np.clip(self.time - late, self.time[0], self.time[-1]))
+        return replace(self, deflection=earlier[:, 0], rate=earlier[:, 1])
+
+    @cached_property
+    def _between(self) -> CubicSpline:
+        return CubicSpline(self.time, np.column_stack([self.deflection, self.rate]))
 
     def every(self, stride: int) -> ElementMotion:
         """Every so many samples."""

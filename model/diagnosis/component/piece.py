@@ -20,6 +20,7 @@ from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.following import Covariate
 from sprung.model.laws.paths import stop_path
+from sprung.model.laws.sensor_faults import SENSOR_LAG
 from sprung.model.signals import FloatArray
 
 Values = dict[str, tuple[float, str]]  # value and unit by name
@@ -65,6 +66,8 @@ class FittedPiece:
     deflection: FloatArray  # m, (T,)
     corner: float  # the rate that one sample passes at a reversal, m/s: a knee below it is not resolved
     rules: ComponentRules
+    step: float  # s, between samples
+    seconds: float  # of the record
 
 
 @dataclass(frozen=True)
@@ -252,10 +255,43 @@ class SliderSurface:
         return {}
 
 
+@dataclass(frozen=True)
+class Lag:
+    """The force's channel late against the motion's: no force of its own, everything follows the motion earlier."""
+
+    effect: str = SENSOR_LAG.name
+    title: str = SENSOR_LAG.title
+    key: str = SENSOR_LAG.name
+    kind: PieceKind = STATIC
+    dissipates: bool = False
+    believed: Believed = lambda fitted: abs(fitted.shape[0]) > fitted.rules.late * fitted.step
+    plain: int = 0
+    shapes: tuple[str, ...] = ("time",)
+    signs: tuple[int, ...] = ()
+
+    def grid(self, seen: Seen) -> FloatArray:
+        late = np.geomspace(2e-4, _LATEST, 12)
+        return np.concatenate([late, -late])[:, None]
+
+    def limits(self, seen: Seen) -> list[tuple[float, float]]:
+        return [(-1.5 * _LATEST, 1.5 * _LATEST)]
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        return np.zeros((len(motion.deflection), 0))
+
+    def values(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        return {"time": (float(shape[0]), "s")}
+
+    def quoted(self, strengths: FloatArray, shape: Shape, element: SpringDamper) -> Values:
+        return {}
+
+
+_LATEST = 0.04  # s, of the filters and nodes of a test bench
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
 _RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
 SURFACE = SliderSurface()
-LawPiece = Piece | Following  # what is searched among
+LAG = Lag()
+LawPiece = Piece | Following | Lag  # what is searched among
 Part = LawPiece | SliderSurface
 
 

@@ -305,6 +305,7 @@ def _drift(effect: str, quantity: str) -> Piece:
         lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300), s[0]),
         lambda p: (p[1],),
         plain=1,
+        believed=lambda fitted: fitted.shape[0] > fitted.rules.drift * fitted.seconds,
     )
 
 

@@ -23,7 +23,7 @@ from sprung.model.diagnosis.component.fit import (
     refined,
     spread,
 )
-from sprung.model.diagnosis.component.piece import FittedPiece, LawPiece, Part
+from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Lag, LawPiece, Part
 from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
@@ -80,7 +80,7 @@ def search(
     given: laws that the system file puts in place; what is found comes beside them.
     """
     rules = task.rules
-    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)))
+    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), LAG)
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)
@@ -96,7 +96,7 @@ def search(
         if number == 0:
             for trial in ranked:
                 screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
-        step = _accepted(current, ranked, rules)
+        step = _accepted(current, ranked, base, rules)
         if step is None:
             break
         steps.append(step)
@@ -150,9 +150,14 @@ def next_laws(current: ComponentFit, pieces: tuple[LawPiece, ...], rules: Compon
 def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> list[tuple[float, ComponentModel]]:
     """The best trial shapes of a law beside the present ones: sum of squares left and model."""
     task = current.task
+    if isinstance(piece, Lag):
+        late = (current.model.plus(piece, (float(row[0]),)) for row in piece.grid(task.seen))
+        fits = [fitted(task, model) for model in late]
+        return sorted(((fit.error * task.split, fit.model) for fit in fits), key=lambda t: t[0])[: rules.starts]
+    task = task.delayed(current.model.late)
     base, free, force = task.linear
     train = slice(0, task.split)
-    fixed = np.column_stack([base, current.model.columns(task)])[train]
+    fixed = np.column_stack([base, current.model.columns(current.task)])[train]
     signs = tuple(np.array([0, 1, 1])[free].tolist()) + current.model.signs
     found = []
     for row in piece.grid(task.seen):
@@ -167,9 +172,12 @@ def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> li
 
 def plausible(fit: ComponentFit) -> bool:
     """Whether the last law's values are ones that it can have, and that the sampling resolves."""
-    index = len(fit.model.pieces) - 1
+    return _plausible(fit, len(fit.model.pieces) - 1)
+
+
+def _plausible(fit: ComponentFit, index: int) -> bool:
     piece, strengths = fit.model.pieces[index], fit.strengths_of(index)
-    if not np.any(np.abs(strengths) > 0):
+    if len(strengths) and not np.any(np.abs(strengths) > 0):
         return False
     task = fit.task
     return piece.believed(
@@ -181,6 +189,8 @@ def plausible(fit: ComponentFit) -> bool:
             deflection=task.motion.deflection,
             corner=task.seen.slowest_corner(task.motion),
             rules=task.rules,
+            step=task.motion.step,
+            seconds=task.seen.seconds,
         )
     )
 
@@ -198,23 +208,44 @@ def _determined(fit: ComponentFit) -> bool:
     return all(told)
 
 
-def _accepted(current: Ranked, ranked: list[Ranked], rules: ComponentRules) -> Step | None:
+def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules) -> Step | None:
     """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
     near = [r for r in ranked if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin)]
     if not near:
         return None
     # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
-    near = [r for r in near if _determined(r.fit)] or near
-    chosen, before = min(near, key=lambda r: r.fit.held_out), current
+    told = [r for r in near if _determined(r.fit)]
+    near = told or near
+    near = [r for r in near if r.last is not LAG or _explains_all(r.fit, current.fit, rules)]
+    if not near:
+        near = [next((r for r in ranked if r.last is not LAG and r.evidence > 0), ranked[0])]
+    chosen, before = _plainest(near, rules), current
     rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
     p_value = chance(chosen.gain, freedom, len(PIECES) * 10)
     if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
         return None
-    further = len(before.fit.model.pieces) > 0
-    if further and chosen.fit.held_out > (1 - rules.least_share) * before.fit.held_out:
-        return None
+    if len(before.fit.model.pieces) > 0:
+        removed = before.fit.held_out - chosen.fit.held_out
+        if not told or removed < max(rules.least_share * before.fit.held_out, rules.minor * base.held_out):
+            return None
     return Step(chosen, before, rivals, p_value)
+
+
+def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
+    """The one that serves the held-out part best; of those that serve it as well, the commonest with fewest numbers."""
+    best = min(ranked.fit.held_out for ranked in near)
+    alike = [ranked for ranked in near if ranked.fit.held_out <= rules.as_well * best]
+    return min(alike, key=lambda ranked: (ranked.last.plain, ranked.fit.model.count, ranked.fit.held_out))
+
+
+def _explains_all(lag: ComponentFit, before: ComponentFit, rules: ComponentRules) -> bool:
+    """Whether a lag leaves next to nothing: hysteresis, too, looks late, and no channel is blamed for a part of it."""
+    floor = lag.floor**2
+    return all(
+        after - floor < (1 - rules.by_lag) * max(was - floor, 0.0)
+        for after, was in ((lag.error, before.error), (lag.held_out, before.held_out))
+    )
 
 
 def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules, given: int) -> Ranked:

@@ -13,6 +13,7 @@ from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.sensor_faults import SENSOR_LAG
 from sprung.model.signals import FloatArray
 
 _DATA_SHEET_RATES = (0.05, 0.1, 0.2, 0.3, 0.52, 1.0, 1.5)  # m/s, at which damper makers quote forces
@@ -189,6 +190,28 @@ def reversed_finding(sensor: str, element: str) -> Finding:
         None,
         sentence=f"{sensor}: the force has the wrong sign against the motion of {element}, which would feed energy "
         "into the rig; it was turned for the rest of this diagnosis",
+    )
+
+
+def late_finding(sensor: str, element: str, value: float, sigma: float, step: Step) -> Finding:
+    """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics."""
+    size = LawParameter("time", abs(1e3 * value), 1e3 * sigma, "ms")
+    near, way = _family(step), "later" if value > 0 else "earlier"
+    sentence = f"{sensor}: the force comes {value_words(size)} {way} than the motion of {element}"
+    if near is not None:
+        sentence += f" ({near.replace('_', ' ')} fit almost equally well)"
+    rival = next(iter(step.rivals), None)
+    return Finding(
+        sensor,
+        SENSOR_LAG.name,
+        (LawParameter("time", value, sigma, "s"),),
+        step.p_value,
+        bic(step.gain, 1, int(step.chosen.count)),
+        runner_up=None if rival is None else (rival.last.effect, bic(rival.gain, 1, int(rival.count))),
+        runner_up_location=None if rival is None else element,
+        family=near,
+        advice="filters and nodes of a test bench delay their channels: give force and motion the same filter",
+        sentence=sentence,
     )
 
 

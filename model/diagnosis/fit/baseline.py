@@ -18,8 +18,10 @@ from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, tran
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import given_terms
 from sprung.model.diagnosis.rules import RULES, Rules
+from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+_STRETCHES, _FEWEST, _STEPS = (16, 8, 4, 2), 60, 8  # shares of a free decay that are fitted first; samples; iterations
 _REFITS, _SETTLED = 12, 0.05  # of force noise and fit, which weighs by it; change of the level
 _DIVERGED = (
     "the system file's structure cannot be fitted to this recording: the numbers diverge; "
@@ -62,8 +64,27 @@ def _baseline(
         # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
         problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise))
+    if not system.file.inputs:
+        start = replace(start, theta=_from_the_beginning(problem, first, declared, start))
     fit = optimise(problem, start)
     return refreshed(problem, fit)
+
+
+def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:
+    """Parameters of a free decay, (P,): from its first periods, then of stretches twice as long each time.
+
+    Frequencies that differ by more than the inverse of a stretch leave no way downhill from one to the other.
+    """
+    theta = start.theta
+    for share in _STRETCHES:
+        count = signals.samples // share
+        if count < _FEWEST:
+            continue
+        part = transform(signals.part(0, count), declared, differentiated=drifting(problem.system, problem.sensors))
+        fit = try_optimise(replace(problem, part=part), replace(start, theta=theta), _STEPS)
+        if fit is not None:
+            theta = fit.point.theta
+    return theta
 
 
 def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:

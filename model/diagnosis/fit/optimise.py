@@ -149,13 +149,17 @@ def optimise(
 
 
 def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float, whitener: Whitener | None) -> Fit:
-    state = _state(problem, *_begun(problem, start, whitener))
+    state, unforced = _state(problem, *_begun(problem, start, whitener)), not problem.system.file.inputs
+    if unforced:
+        state = _begun_anew(problem, state)
     damping, left, count = _DAMPING[0], np.inf, 0
     for count in range(1, iterations + 1):
         step, sigma, promised = _step(problem, state.lin, state.point, damping)
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
         trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
         proposed = _state(problem, trial, working)
+        if unforced:
+            proposed = _begun_anew(problem, proposed)
         if proposed.value >= state.value and promised < _NUMERICAL:
             left = promised
             break
@@ -191,6 +195,18 @@ def _state(problem: Problem, point: Point, working: Working) -> _State:
     lin = linearise(problem, point, working)
     value = _value(problem, lin.residual, lin.log_det, point)
     return _State(replace(point, warm_start=warm_start_of(lin.forces)), working, lin, value)
+
+
+def _begun_anew(problem: Problem, state: _State) -> _State:
+    """A free decay with the starting state that suits its parameters (variable projection, Golub and Pereyra 1973).
+
+    Joint steps of both only creep, since parameters act on the motion of the former starting state; and from rest,
+    where they do not act at all, they would go to where the prior is.
+    """
+    columns = state.lin.jacobian[:, -len(state.point.state) :]
+    step = np.linalg.lstsq(columns, state.lin.residual, rcond=None)[0]
+    other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
+    return other if other.value < state.value else state
 
 
 def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point) -> float:

@@ -115,10 +115,28 @@ def _best(
                     fault = _fault(hypothesis, total, left), changed, mended, other, again
                     return _sharpened(fault, declared, fitted)
                 accepted.append((_fault(hypothesis, total, left), changed, mended, other, again))
-        best = min(accepted, key=lambda one: one[0].after, default=None)
-        if best is not None and not best[0].effect.ordinary:
-            return _sharpened(best, declared, fitted_samples(signals, best[2], split))
+        accepted.sort(key=lambda one: one[0].after)
+        if accepted:
+            best = _best_sharpened(accepted, declared, signals, split)
+            if not best[0].effect.ordinary:
+                return best
     return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
+
+
+def _best_sharpened(accepted: list[_Accepted], declared: Noise, signals: Signals, split: int) -> _Accepted:
+    """The best of accepted hypotheses, least misfit first, estimated again on the structure fitted without it.
+
+    What else the channel of a wrong gain or lag may have is weighed like it: rough values rank these by chance.
+    """
+
+    def sharpened(one: _Accepted) -> _Accepted:
+        return _sharpened(one, declared, fitted_samples(signals, one[2], split))
+
+    first = accepted[0]
+    if not first[0].effect.ordinary:
+        return sharpened(first)
+    rivals = [one for one in accepted if one[0].site.location == first[0].site.location]
+    return min((sharpened(one) for one in rivals[: first[3].rules.setup.rivals]), key=lambda one: one[0].after)
 
 
 def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total: float) -> Iterator[list[Hypothesis]]:
@@ -131,14 +149,14 @@ def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total:
         for hypothesis in hypotheses(one, system, signals, rules):
             key = (hypothesis.effect, hypothesis.site.location, hypothesis.by_mass)
             share = replace(hypothesis, left=hypothesis.left / whole)
-            # under a measured force spectra at wrong resonances say nothing of its sign
+            # under a measured force spectra at wrong resonances say nothing of a sign, or which sensor is which
             always = problem.process_noise and hypothesis.unranked
             good = always or hypothesis.by_mass or share.left < rules.promising
             if good and (key not in promising or share.left < promising[key].left):
                 promising[key] = share
     by_left = sorted(promising.values(), key=lambda h: h.left)
-    few = len(promising) <= rules.few
-    forced = [h for h in by_left if few and h.left >= rules.promising and not h.by_mass]
+    forced = [h for h in by_left if h.left >= rules.promising and not h.by_mass]
+    forced = forced if len(forced) <= rules.few else []
     ranked = [h for h in by_left if h.by_mass]
     ranked += [h for h in by_left if not h.effect.ordinary and h not in (*forced, *ranked)][: rules.tried] + forced
     if ranked:

@@ -139,8 +139,8 @@ WRONG_SCALE = SetupEffect(
 SENSOR_POSITION = _moved(changes.moved_sensor, "wrong_position")
 ELEMENT_POSITION = _moved(changes.moved_element, "wrong_position")
 WRONG_BODY = SetupEffect("wrong_body", "{place}: is not fixed to what the system file says; its {detail} fits")
-ONE_GAIN = SetupEffect(SENSOR_GAIN.name, ordinary=True, undo=_rescaled)
-ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced)
+ONE_GAIN = SetupEffect(SENSOR_GAIN.name, relative=True, ordinary=True, undo=_rescaled, left=_scaled)
+ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced, left=_late)
 SETUP_EFFECTS = (
     SIGN_REVERSED, CHANNELS_SWAPPED, NODE_DELAY, WRONG_SCALE, SENSOR_POSITION, ELEMENT_POSITION, WRONG_BODY,
 )  # fmt: skip

@@ -141,7 +141,7 @@ def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiri
         names += [signals.support_names[j] for pair in supports for j in pair]
         left = one.left(_exchanged(one, sensors, supports))
         undo = changes.exchange(list(sensors), list(supports))
-        return Hypothesis(CHANNELS_SWAPPED, SetupPlace("|".join(names)), None, left, undo)
+        return Hypothesis(CHANNELS_SWAPPED, SetupPlace("|".join(names)), None, left, undo, unranked=len(names) == 2)
 
     for i, j in combinations(range(len(wired.sensors)), 2):
         if wired.kind[i] == wired.kind[j]:

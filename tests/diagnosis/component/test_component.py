@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import butter, sosfiltfilt
 
 from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
@@ -329,3 +330,37 @@ def test_a_force_of_no_law_is_told_as_its_formula_and_goes_into_the_system_file(
     values = np.column_stack([d, K * d + C * v + 6e4 * d * np.abs(v) + 3e6 * d**2])
     noisy = values + np.random.default_rng(3).normal(0, [1e-6, 1.0], values.shape)
     assert diagnose(load_system(improved), RigRecording(noisy)).verdict == "consistent"
+
+
+def test_a_law_that_the_file_fixes_is_held_and_stays_in_the_system_file() -> None:
+    _, d, v = sweep(8.0)
+    held = "laws: [{coulomb_friction: {force: {value: 60, fixed: true}, smoothing: {value: 1.0e-3, fixed: true}}}]"
+    columns = np.column_stack([d, K * d + C * v + 60 * np.tanh(v / 1e-3)])
+    columns = columns + np.random.default_rng(3).standard_normal(columns.shape) * [1e-6, 1.0]
+    found = diagnose(parse_system(TEXT.replace("damping: 1.5e3", f"damping: 1.5e3, {held}")), RigRecording(columns))
+    assert (found.verdict, laws(found)) == ("consistent", [])
+    (friction,) = [law for law in found.laws if law.effect != "preload"]
+    assert [p.value for p in friction.parameters] == [60, 1e-3]
+    columns[:, 1] += 40 * np.tanh(v / 1e-3)
+    more = diagnose(parse_system(TEXT.replace("damping: 1.5e3", f"damping: 1.5e3, {held}")), RigRecording(columns))
+    assert more.verdict == "missing_physics"
+    assert more.laws[0].parameters[0].value == 60
+    assert {q.name: q.value for q in more.findings[0].quoted}["breakaway_force"] == pytest.approx(40, rel=0.1)
+
+
+def test_a_motion_measured_by_acceleration_alone_is_integrated() -> None:
+    step, band = 1 / RATE, butter(3, [1.0, 15.0], "bandpass", fs=RATE, output="sos")
+    v = sosfiltfilt(band, np.random.default_rng(8).standard_normal(int(30 * RATE)))
+    v *= 0.15 / v.std()
+    spectrum, omega = np.fft.rfft(v), 2 * np.pi * np.fft.rfftfreq(len(v), step)
+    d = np.fft.irfft(spectrum / np.maximum(omega, 1e-9) / 1j * (omega > 1), len(v))
+    a = np.fft.irfft(1j * omega * spectrum, len(v))
+    columns = np.column_stack([a, K * d + C * v + 60 * np.tanh(v / 2e-2) + 90])
+    columns = columns + np.random.default_rng(3).standard_normal(columns.shape) * [0.05, 1.0]
+    text = TEXT.replace("displacement: {csv: d, noise: 1e-6}", "acceleration: {csv: a, noise: 0.05}")
+    found = diagnose(parse_system(text), RigRecording(columns))
+    assert laws(found) == ["coulomb_friction"]
+    values = {p.name: p.value for p in found.augmented}
+    assert values["damper.stiffness"] == pytest.approx(K, rel=0.02)
+    assert values["damper.damping"] == pytest.approx(C, rel=0.02)
+    assert any("integrated from its acceleration" in note for note in found.advice)

@@ -72,6 +72,8 @@ def wrong(values: FloatArray, kind: str) -> FloatArray:
         out[:, at] = values[:-4, at]
     elif kind == "reversed sensor":
         out[:, 2] *= -1
+    elif kind == "exchanged":
+        out[:, [1, 3]] = values[:, [3, 1]]
     elif kind == "kN":
         out[:, 0] /= 1000
     elif kind == "g":
@@ -85,6 +87,7 @@ def wrong(values: FloatArray, kind: str) -> FloatArray:
         ("late node", "node_delay", "a1|a2|a3", 0.08),
         ("late force", "node_delay", "shaker", 0.08),
         ("reversed sensor", "sign_reversed", "a2", None),
+        ("exchanged", "channels_swapped", "a1|a3", None),
         ("kN", "wrong_scale", "shaker", 1e-3),
         ("g", "wrong_scale", "a1|a2|a3", 1 / 9.80665),
     ],

@@ -1,0 +1,86 @@
+"""Motion of a support whose acceleration alone is measured: integrated twice, down to where it stands out of the noise.
+
+Noise of variance N per bin becomes N / w^4 in the deflection, so what is below the lowest frequency of the test is not
+motion but wandering, and is cut off, of the force too: springs and dampers do not mind.  The ends, where the filter
+still remembers that nothing came before, are left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter1d
+
+from sprung.model.diagnosis.component.motion import white_noise
+from sprung.model.signals import FloatArray
+
+_STANDS_OUT = 300.0  # power over that of the noise from which a frequency belongs to the test
+_RAMP = 0.6  # of the lowest frequency, from where the filter opens
+_SETTLED = 1.5  # periods of the lowest frequency that are lost at either end
+_LEAST_PERIODS = 4.0  # of the lowest frequency within a recording
+
+
+@dataclass(frozen=True)
+class Integrated:
+    """Motion from an acceleration; not a number at the ends."""
+
+    displacement: FloatArray  # m, (T,)
+    velocity: FloatArray  # m/s, (T,)
+    displacement_noise: float  # m
+    velocity_noise: float  # m/s
+    lowest: float  # Hz, below which the motion is not known
+
+
+def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | None:
+    """Motion from an acceleration (T,); None: it shows nothing but noise."""
+    good = np.isfinite(acceleration)
+    at = np.arange(len(acceleration))
+    series = np.interp(at, at[good], acceleration[good])
+    series = series - series.mean()
+    whole, frequency = _mirrored(series, sample_rate)
+    spectrum = np.fft.rfft(whole)
+    noise = white_noise(series)
+    lowest = _lowest(spectrum, frequency, noise, len(whole), _LEAST_PERIODS * sample_rate / len(series))
+    if lowest is None:
+        return None
+    passed = _passed(frequency, lowest)
+    omega = 2 * np.pi * np.maximum(frequency, _RAMP * lowest)  # below nothing is passed
+    here = slice(len(series) - 1, 2 * len(series) - 1)
+    velocity, displacement = (
+        np.fft.irfft(spectrum * passed / (1j * omega) ** power, len(whole))[here] for power in (1, 2)
+    )
+    deviations = [noise * float(np.sqrt(2 * np.sum((passed / omega**p) ** 2) / len(whole))) for p in (1, 2)]
+    lost = int(_SETTLED * sample_rate / lowest)
+    known = good & (at >= lost) & (at < len(series) - lost)
+    return Integrated(
+        np.where(known, displacement, np.nan), np.where(known, velocity, np.nan), deviations[1], deviations[0], lowest
+    )
+
+
+def without_slow(series: FloatArray, sample_rate: float, lowest: float) -> FloatArray:
+    """A force (T,) without what is below the lowest frequency of its motion; gaps stay gaps."""
+    good = np.isfinite(series)
+    at = np.arange(len(series))
+    whole, frequency = _mirrored(np.interp(at, at[good], series[good]), sample_rate)
+    fast = np.fft.irfft(np.fft.rfft(whole) * _passed(frequency, lowest), len(whole))
+    return np.where(good, fast[len(series) - 1 : 2 * len(series) - 1], np.nan)
+
+
+def _mirrored(series: FloatArray, sample_rate: float) -> tuple[FloatArray, FloatArray]:
+    """A series continued at both ends by its mirror image, and the frequencies of its spectrum, Hz."""
+    whole = np.concatenate([series[:0:-1], series, series[-2::-1]])
+    return whole, np.fft.rfftfreq(len(whole), 1 / sample_rate)
+
+
+def _passed(frequency: FloatArray, lowest: float) -> FloatArray:
+    ramp: FloatArray = np.clip((frequency / lowest - _RAMP) / (1 - _RAMP), 0.0, 1.0)
+    return np.asarray(0.5 - 0.5 * np.cos(np.pi * ramp))
+
+
+def _lowest(spectrum: np.ndarray, frequency: FloatArray, noise: float, count: int, least: float) -> float | None:
+    """The lowest frequency, Hz, of the band that stands out of the noise."""
+    power = np.abs(spectrum) ** 2 / count
+    smooth = uniform_filter1d(median_filter(power, size=5), size=max(5, count // 1000) | 1)
+    out = np.flatnonzero((smooth > _STANDS_OUT * max(noise**2, 1e-300)) & (frequency >= least))
+    return float(frequency[out[0]]) if len(out) else None

@@ -1,0 +1,60 @@
+"""Simulated rigs under sine, sweep, random and earthquake-like motion: named with their values or unknown."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sprung.benchmarks.naming import MOTIONS, RIGS, forces, judged, levels, moved
+
+SEED = 20_261
+
+
+def tried(name: str, motion: str) -> dict[str, object]:
+    return judged(RIGS[name], motion, [SEED, list(RIGS).index(name), MOTIONS.index(motion)])
+
+
+@pytest.mark.parametrize(
+    ("name", "motion"),
+    [("nothing", "sine"), ("stribeck", "quake"), ("lugre", "sine"), ("friction_backlash", "sweep")],
+)
+def test_what_is_there_is_named(name: str, motion: str) -> None:
+    line = tried(name, motion)
+    assert line["judged"] == "right", line
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize("name", RIGS)
+def test_no_rig_is_called_something_else_or_clear(name: str, motion: str) -> None:
+    line = tried(name, motion)
+    assert line["judged"] in ("right", "unknown"), line
+
+
+def test_steel_starts_along_its_spring_and_ends_near_its_yield_force() -> None:
+    random = np.random.default_rng(1)
+    step = RIGS["steel (Menegotto-Pinto)"].made(random).step
+    path = np.linspace(0, 0.02, 4001)
+    force = np.array([step(x, 0.1, 5e-5) for x in path.tolist()])
+    again = np.random.default_rng(1)
+    k, slip, b = again.uniform(2e5, 5e5), again.uniform(500, 1500), again.uniform(0.02, 0.06)
+    assert force[20] / path[20] == pytest.approx(k, rel=0.01)
+    assert force[-1] == pytest.approx(slip + b * k * (path[-1] - slip / k), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "name", ["self-centring", "steel (Menegotto-Pinto)", "rubber (Berg, fractional)", "oil (relief, cavitation)"]
+)
+def test_a_rig_that_no_catalogue_has_takes_energy_and_gives_none(name: str) -> None:
+    """Over a whole number of cycles of a steady sine; spring and damper of the bench taken out."""
+    rig, d = RIGS[name], 0.01 * np.sin(2 * np.pi * np.arange(4000) / 200)
+    signal = levels(np.random.default_rng(0))
+    loop = forces(rig, d, 7, signal) - forces(RIGS["nothing"], d, 7, signal)
+    last = slice(2000, 3001)
+    assert np.trapezoid(loop[last], d[last]) > 0
+
+
+def test_the_motions_stay_within_the_travel() -> None:
+    for motion in MOTIONS:
+        d = moved(motion, np.random.default_rng(2))
+        assert 0.018 < np.abs(d).max() <= 0.02 + 1e-12

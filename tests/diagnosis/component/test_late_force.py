@@ -1,0 +1,71 @@
+"""A force channel that a filter or a node delays: said of the channel, not of the component."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfilt, sosfiltfilt
+
+from sprung.model.diagnosis.component.motion import element_motion
+from tests.diagnosis.component.test_component import RATE, C, K, laws, report
+
+SHIFT = 4  # of the finer samples
+FINER = 10
+
+
+def random_motion(seconds: float = 20.0) -> tuple[np.ndarray, np.ndarray]:
+    """Deflection and rate at ten times the rate of the record: random motion up to 6 Hz."""
+    count = int(seconds * RATE * FINER)
+    band = butter(3, [0.3, 6.0], "bandpass", fs=RATE * FINER, output="sos")
+    d = sosfiltfilt(band, np.random.default_rng(4).standard_normal(count + 40_000))[20_000:-20_000]
+    d *= 0.008 / d.std()
+    return d, np.gradient(d, 1 / (RATE * FINER))
+
+
+def test_a_force_that_comes_late_is_the_channels_fault_and_no_series_stiffness() -> None:
+    d, v = random_motion()
+    late = np.roll(K * d + C * v, 9 * SHIFT)[::FINER]
+    found = report(late, d[::FINER], noise=2.0)
+    assert found.verdict == "sensor_fault"
+    (lag,) = [f for f in found.findings if f.effect != "preload"]
+    assert (lag.location, lag.effect) == ("cell", "sensor_lag")
+    (time,) = lag.parameters
+    assert time.value == pytest.approx(9 * SHIFT / (RATE * FINER), abs=max(5 * time.std, 1e-4))
+    assert found.unexplained.share == 0.0
+    values = {p.name: p for p in found.augmented}
+    assert values["damper.stiffness"].value == pytest.approx(K, rel=0.01)
+    assert values["damper.damping"].value == pytest.approx(C, rel=0.01)
+
+
+def test_a_filter_of_the_force_is_a_lag() -> None:
+    d, v = random_motion()
+    filtered = sosfilt(butter(4, 70.0, fs=RATE * FINER, output="sos"), K * d + C * v)[::FINER]
+    found = report(filtered, d[::FINER], noise=2.0)
+    assert [(f.location, f.effect) for f in found.findings if f.effect != "preload"] == [("cell", "sensor_lag")]
+
+
+def test_compressible_oil_is_not_called_late() -> None:
+    d, v = random_motion()
+    force, state, step, stiff = np.empty(len(d)), 0.0, 1 / (RATE * FINER), 3e5
+    for i, rate in enumerate(v.tolist()):
+        state += step * stiff * (rate - state / C)
+        force[i] = state
+    found = report((K * d + force)[::FINER], d[::FINER], noise=2.0)
+    assert "series_stiffness" in (found.findings[0].family or found.findings[0].effect)
+
+
+def test_in_a_sine_test_nothing_tells_a_lag() -> None:
+    t = np.arange(int(20 * RATE)) / RATE
+    d, late = 0.01 * np.sin(2 * np.pi * 1.3 * t), 2 * np.pi * 1.3 * (t - 0.004)
+    found = report(0.01 * (K * np.sin(late) + C * 2 * np.pi * 1.3 * np.cos(late)), d)
+    assert laws(found) == []
+    assert found.verdict == "consistent"
+
+
+def test_a_delayed_motion_is_the_motion_of_then() -> None:
+    t = np.arange(int(5 * RATE)) / RATE
+    motion = element_motion(0.01 * np.sin(9 * t), None, RATE)
+    late = motion.delayed(0.0037)
+    inside = slice(100, -100)
+    assert late.deflection[inside] == pytest.approx(0.01 * np.sin(9 * (t - 0.0037))[inside], abs=1e-6)
+    assert late.rate[inside] == pytest.approx(0.09 * np.cos(9 * (t - 0.0037))[inside], abs=3e-5)
