@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,10 +14,12 @@ from sqlalchemy import Connection
 from sprung.model.system import System, parse_system
 from sprung.service.engine import Engine, engine_like
 from sprung.service.errors import UserError
-from sprung.service.store import vehicle_models
+from sprung.service.store import Store, vehicle_models
 from sprung.service.store.vehicle_models import SERVICE_FILE
 
 log = logging.getLogger("sprung.engine")
+LATELY_SECONDS = 10.0  # for which it is taken for granted that nobody gave a vehicle another model
+MOST_LATELY = 10_000  # vehicles
 KEPT = 16  # engines of single vehicles in memory; one that is asked for again is loaded in a second
 
 
@@ -44,6 +47,7 @@ class Engines:
         self._own = own
         self._kept = kept
         self._held: OrderedDict[tuple[str, int], ServedModel] = OrderedDict()
+        self._lately: OrderedDict[str, tuple[float, ServedModel]] = OrderedDict()
         self._broken: dict[tuple[str, int], str] = {}
         self._lock = threading.Lock()
 
@@ -53,6 +57,27 @@ class Engines:
         A version that cannot be used any more, since the service's system file has become another one, is logged and
         the service's file takes its place.
         """
+        served = self._usable(connection, vehicle)
+        with self._lock:
+            self._lately[vehicle] = (time.monotonic(), served)
+            self._lately.move_to_end(vehicle)
+            while len(self._lately) > MOST_LATELY:
+                self._lately.popitem(last=False)
+        return served
+
+    def lately(self, store: Store, vehicle: str) -> ServedModel:
+        """As `of`, out of memory where that was asked a few seconds ago.
+
+        For identifying only: whoever stores looks again in his transaction (`ModelChanged`).
+        """
+        with self._lock:
+            at, served = self._lately.get(vehicle, (-LATELY_SECONDS, self.shared))
+        if time.monotonic() - at < LATELY_SECONDS:
+            return served
+        with store.read() as connection:
+            return self.of(connection, vehicle)
+
+    def _usable(self, connection: Connection, vehicle: str) -> ServedModel:
         version = vehicle_models.current_version(connection, vehicle) if self._own else SERVICE_FILE
         try:
             return self.version(connection, vehicle, version)

@@ -20,8 +20,8 @@ from sprung.service.tokens import Actor
 T = TypeVar("T")
 
 
-def get_core(request: Request) -> Core:
-    """The core of the application that serves this request."""
+async def get_core(request: Request) -> Core:
+    """The core of the application that serves this request.  Not a plain function: those are called in a thread."""
     core: Core = request.app.state.core
     return core
 
@@ -29,7 +29,7 @@ def get_core(request: Request) -> Core:
 CoreOf = Annotated[Core, Depends(get_core)]
 
 
-def get_actor(request: Request) -> Actor:
+async def get_actor(request: Request) -> Actor:
     """Whom the guard found; `local` where nobody needs to sign in."""
     found: Actor = request.scope.get("sprung.actor") or Actor()
     return found

@@ -34,6 +34,7 @@ from sprung.service.api.guard import Guard
 from sprung.service.api.head import HeadAsGet
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.queries import only_known_parameters
+from sprung.service.api.twice import no_key_twice
 from sprung.service.core import Core
 from sprung.service.pages import routes as fleet_page
 from sprung.service.pages import vehicle as vehicle_page
@@ -92,12 +93,13 @@ def create_app(
         health,
         docs,
     )
+    checks = [Depends(only_known_parameters), Depends(no_key_twice)]
     for router in (
         *(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)),
         admin.pages,
         signin.pages,
     ):
-        app.include_router(router, responses=PROBLEMS, dependencies=[Depends(only_known_parameters)])
+        app.include_router(router, responses=PROBLEMS, dependencies=checks)
     app.include_router(signin.returns)
     app.mount("/static", assets(), name="static")
     uploads = core.settings.max_upload_bytes

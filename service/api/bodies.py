@@ -10,6 +10,7 @@ from pydantic_core import from_json
 
 from sprung.model.signals import FloatArray
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
+from sprung.service.api.twice import keys_twice
 from sprung.service.engine import Engine
 from sprung.service.fleet.message import SentWindows
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
@@ -127,7 +128,19 @@ def _object(content: bytes) -> dict[str, object]:
         raise ApiProblem(422, f"body: {error}", [_wrong("body", str(error))]) from None
     if not isinstance(raw, dict):
         raise ApiProblem(422, "body: should be an object", [_wrong("body", "should be an object")])
+    # the parser keeps the last of two keys; each string has two quotation marks, and what was kept accounts for all
+    if (b"\\" in content or content.count(b'"') != 2 * _strings(raw)) and (names := keys_twice(content)):
+        raise _refused([_wrong(name[:160], "is there twice") for name in names])
     return raw
+
+
+def _strings(thing: object) -> int:
+    """Keys and strings in it, but for lists that begin with a number."""
+    if isinstance(thing, dict):
+        return len(thing) + sum(map(_strings, thing.values()))
+    if isinstance(thing, list):
+        return 0 if not thing or isinstance(thing[0], float | int) else sum(map(_strings, thing))
+    return int(isinstance(thing, str))
 
 
 def _refused(wrong: list[dict[str, str]]) -> ApiProblem:
@@ -168,10 +181,13 @@ def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], plac
             return values
         if name not in names:
             wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {system.name}"))
-        elif fault := _not_numbers(samples, system.window):
-            wrong.append(_wrong(f"{place}channels.{name}{fault[0]}", fault[1]))
+            continue
+        column = _numbers(samples, system.window)
+        if column is None:
+            at, fault = _not_numbers(samples, system.window)
+            wrong.append(_wrong(f"{place}channels.{name}{at}", fault))
         else:
-            values[:, names[name]] = samples
+            values[:, names[name]] = column
     wrong += [
         _wrong(f"{place}channels.{channel.name}", "is missing; without every input nothing can be identified")
         for channel in system.inputs
@@ -182,18 +198,31 @@ def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], plac
     return values
 
 
-def _not_numbers(samples: object, length: int) -> tuple[str, str] | None:
-    """Place and fault of samples that are no list of `length` finite numbers; None where they are."""
+def _numbers(samples: object, length: int) -> FloatArray | None:
+    """`length` finite numbers, shape (T,); None where the samples are anything else."""
+    if not isinstance(samples, list) or len(samples) != length or not set(map(type, samples)) <= {float, int}:
+        return None
+    try:
+        column = np.array(samples, dtype=float)
+    except OverflowError:  # an integer beyond all floats
+        return None
+    return column if column.min() >= -LARGEST and column.max() <= LARGEST else None
+
+
+def _not_numbers(samples: object, length: int) -> tuple[str, str]:
+    """Place and fault of samples that are no list of `length` finite numbers."""
     if not isinstance(samples, list):
         return "", "should be a list of numbers"
     if len(samples) != length:
         return "", f"has {len(samples)} samples, a window has {length}"
-    for index, value in enumerate(samples):
-        if type(value) not in (float, int):
-            return f".{index}", "should be a number"
-        if not abs(value) <= LARGEST:
-            return f".{index}", f"should be a finite number within +-{LARGEST:g}"
-    return None
+    number = next(i for i, value in enumerate(samples) if not _is_sample(value))
+    if type(samples[number]) not in (float, int):
+        return f".{number}", "should be a number"
+    return f".{number}", f"should be a finite number within +-{LARGEST:g}"
+
+
+def _is_sample(value: object) -> bool:
+    return type(value) in (float, int) and bool(abs(value) <= LARGEST)  # type: ignore[arg-type]
 
 
 def start_of(head: WindowHead, now: int) -> int | None:

@@ -13,10 +13,12 @@ from fastapi.responses import Response
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.api import models
-from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle, read
-from sprung.service.api.bodies import WindowBody, read_window, start_of
+from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
+from sprung.service.api.bodies import WindowBody, WindowHead, read_window, start_of
 from sprung.service.api.problems import ApiProblem
+from sprung.service.core import Core
 from sprung.service.engine import Engine
+from sprung.service.engines import ServedModel
 from sprung.service.store.windows import Solved
 from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.views import fit_dict, physical, sensor_dict
@@ -42,11 +44,7 @@ async def identify(
     answer then also has the tracked `posterior`, and `start` in the body says when the window began (the window
     is taken to end now where it does not).
     """
-    head, values = await run_in_threadpool(read_window, await request.body(), core.engine)
-    served = core.pipeline.engines.shared
-    if head.vehicle is not None:
-        named = head.vehicle
-        served = await read(core, lambda connection: core.pipeline.engines.of(connection, named))
+    head, values, served = await run_in_threadpool(_read, core, await request.body())
     engine = served.engine
     if track and head.vehicle is None:
         detail = "is needed to track"
@@ -70,6 +68,14 @@ async def identify(
         if posterior is not None:
             answer["posterior"] = _parameters(engine, posterior.log_ratio, posterior.std, None)
     return json_response(answer)
+
+
+def _read(core: Core, content: bytes) -> tuple[WindowHead, FloatArray, ServedModel]:
+    """What was sent, and what the vehicle's windows are identified with."""
+    head, values = read_window(content, core.engine)
+    if head.vehicle is None:
+        return head, values, core.pipeline.engines.shared
+    return head, values, core.pipeline.engines.lately(core.store, head.vehicle)
 
 
 def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str, Any]:

@@ -24,7 +24,7 @@ Since = Annotated[str | None, Query(max_length=40, description="RFC 3339, or sec
 Until = Annotated[str | None, Query(max_length=40, description="RFC 3339, or seconds since the epoch; exclusive")]
 
 
-def only_known_parameters(request: Request) -> None:
+async def only_known_parameters(request: Request) -> None:
     """422 for a query parameter that the route does not have: misspelt ones would be ignored in silence."""
     route = request.scope.get("route")
     if not isinstance(route, APIRoute) or not request.query_params:

@@ -24,6 +24,7 @@ from sprung.service.errors import UserError
 
 BUSY_MILLISECONDS = 15_000  # a second process waits this long for the first one's transaction
 PROBE_SECONDS = 2.0
+KEPT_READERS, MOST_READERS = 8, 32  # connections to SQLite that stay open; more while as many requests read at once
 MOST_WRITERS = 10  # transactions of one process at once on PostgreSQL; others wait
 MIGRATING = 0x5B_70_72_74  # of the advisory lock
 STATEMENT_MILLISECONDS = 60_000  # a statement that takes longer is given up: its caller tries again
@@ -174,7 +175,9 @@ def _sqlite_engine(url: str, database: str | None) -> Engine:
     if not database or database == ":memory:":
         raise UserError(f"store {url}: give a file, as in sqlite:////var/lib/sprung/sprung.db")
     Path(database).expanduser().parent.mkdir(parents=True, exist_ok=True)
-    engine = create_engine(url, connect_args={"timeout": BUSY_MILLISECONDS / 1000})
+    engine = create_engine(
+        url, pool_size=KEPT_READERS, max_overflow=MOST_READERS, connect_args={"timeout": BUSY_MILLISECONDS / 1000}
+    )
     event.listen(engine, "connect", _on_sqlite_connect)
     event.listen(engine, "begin", _on_sqlite_begin)
     return engine

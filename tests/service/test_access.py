@@ -171,7 +171,7 @@ def test_the_settings_token_allows_everything(engine: Engine, tmp_path: Path) ->
 def test_no_secret_is_kept(core: Core, tmp_path: Path) -> None:
     text, _ = core.tokens.create("boss", ["admin"])
     core.close()
-    secret = text.rsplit("_", 1)[1].encode()
+    secret = text.split("_", 2)[2].encode()  # which may hold an underscore itself
     assert not any(secret in path.read_bytes() for path in tmp_path.rglob("*") if path.is_file())
 
 

@@ -153,6 +153,35 @@ def test_inputs_without_any_sensor_are_refused(client: TestClient, body: dict[st
     refused(client.post("/identify", json=body), 422)
 
 
+@pytest.mark.parametrize(
+    ("key", "again"),
+    [
+        ("car_1l", '"car_1l": [0.0], "car_1l"'),
+        ("car_1l", '"c\\u0061r_1l": [0.0], "car_1l"'),
+        ("channels", '"channels": {}, "channels"'),
+        ("vehicle", '"vehicle": "another", "vehicle"'),
+    ],
+)
+def test_a_key_that_is_there_twice_is_refused(client: TestClient, body: dict[str, Any], key: str, again: str) -> None:
+    content = json.dumps(body).replace(f'"{key}"', again, 1)
+    problem = refused(client.post("/identify", content=content), 422)
+    assert {"field": key, "detail": "is there twice"} in problem["errors"]
+
+
+def test_every_route_refuses_a_key_that_is_there_twice(client: TestClient, body: dict[str, Any]) -> None:
+    client.post("/identify?track=true", json=body)
+    post = {"content-type": "application/json"}
+    twice = '{"text": "one", "text": "two"}'
+    problem = refused(client.post("/vehicles/demo-0001/notes", content=twice, headers=post), 422)
+    assert problem["errors"] == [{"field": "text", "detail": "is there twice"}]
+    assert client.post("/vehicles/demo-0001/notes", content='{"text": "one"}', headers=post).status_code < 300
+
+
+def test_names_with_escapes_are_no_repetition(client: TestClient, body: dict[str, Any]) -> None:
+    content = json.dumps(body).replace("car_1l", "c\\u0061r_1l")
+    assert client.post("/identify", content=content).status_code == 200
+
+
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 5000])
 def test_what_is_no_json_object_is_refused(client: TestClient, content: bytes) -> None:
     refused(client.post("/identify", content=content), 422)
