@@ -20,6 +20,7 @@ from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, Parameter
 from sprung.model.laws.formula import formula_law
 from sprung.model.signals import FloatArray
 
+DECAYS = "v - z / tau"  # rate of the hidden state
 _AMPLITUDE = 1e18  # of any unit
 _INNER = {  # name: (unit, least, most, trial values over the rms of its motion, meaning)
     "L": ("m", 1e-9, 1e3, (0.2, 0.35, 0.6, 1.0, 1.5, 2.2), "length"),
@@ -148,7 +149,7 @@ def law_of(forms: tuple[Shape, ...]) -> ElementLaw:
         names += [amplitude, *renamed.values()]
         units |= {amplitude: form.unit, **{new: _INNER[name][0] for name, new in renamed.items()}}
     remembers = any(form.memory for form in forms)
-    law = formula_law(" + ".join(texts), "v - z / tau" if remembers else "", tuple(names), units)
+    law = formula_law(" + ".join(texts), DECAYS if remembers else "", tuple(names), units)
     return replace(
         law,
         parameters=tuple(specs),
@@ -156,7 +157,7 @@ def law_of(forms: tuple[Shape, ...]) -> ElementLaw:
         strength=0 if len(forms) == 1 else None,
         prior_cost=formula_cost(sum(form.parts for form in forms)),
         shapes=(lambda seen: _trials(forms[0], seen)) if len(forms) == 1 else law.shapes,
-        path=_filtered(law, names.index("tau")) if remembers else None,
+        path=filtered(law, names.index("tau")) if remembers else None,
     )
 
 
@@ -187,7 +188,7 @@ def _trials(form: Shape, seen: Observed) -> FloatArray:
     return grid([0.1 * size], *inner)
 
 
-def _filtered(law: ElementLaw, tau: int) -> Callable[[Motion, Values], FloatArray]:
+def filtered(law: ElementLaw, tau: int) -> Callable[[Motion, Values], FloatArray]:
     """Force along an evenly sampled motion: z' = v - z / tau is a first-order filter of the deflection."""
 
     def path(motion: Motion, p: Values) -> FloatArray:

@@ -181,6 +181,10 @@ def diagnose(
         Path | None,
         typer.Option("--laws", metavar="FILE", help="Python file with laws of your own; it is run: trust it."),
     ] = None,
+    write_laws: Annotated[
+        Path | None,
+        typer.Option("--write-laws", metavar="FILE", help="Write formulas that were found as laws for --laws."),
+    ] = None,
     json_lines: Json = False,
 ) -> int:
     """What the model leaves out: where, which law, how much better the simulation fits with it."""
@@ -188,7 +192,7 @@ def diagnose(
     hand_over_often()
     from sprung.service.cli.diagnose import Asked, run
 
-    return run(file, system, dbc, Asked(out, name, start, write_system, laws), json_lines)
+    return run(file, system, dbc, Asked(out, name, start, write_system, laws, write_laws), json_lines)
 
 
 @app.command()

@@ -20,6 +20,7 @@ from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import spooled
 from sprung.service.diagnosing import load_excerpt
 from sprung.service.improved import write_improved
+from sprung.service.own_laws import write_laws
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class Asked:
     start: str | None = None  # when time counts from 0
     write_system: Path | None = None
     laws: Path | None = None  # of a user's own
+    write_laws: Path | None = None  # formulas as such
 
 
 def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, json_lines: bool) -> int:
@@ -61,6 +63,10 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
         source = (system_file or MANCHESTER).read_text(encoding="utf-8")
         write_improved(asked.write_system, source, system, report)
         print(f"sprung: {asked.write_system}: the system with what was found", file=sys.stderr)
+    if asked.write_laws is not None:
+        count = write_laws(asked.write_laws, report)
+        told = f"{count} of them, for --laws; give them names" if count else "no formula was found; nothing is written"
+        print(f"sprung: {asked.write_laws}: {told}", file=sys.stderr)
     if json_lines:
         print(json.dumps(report.to_dict(), allow_nan=False), flush=True)
     else:

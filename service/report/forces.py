@@ -136,7 +136,8 @@ def _map_figure(report: Report, finding: int) -> Figure:
         y_factor, y_unit = _unit(v, "m/s")
         scale, unit = _unit(force, "N")
         top = float(np.nanmax(np.abs(force))) * scale or 1.0
-        drawn = [(panels[0], force, "RdBu_r", -top, "force without a law")]
+        formula = report.findings[finding].formula
+        drawn = [(panels[0], force, "RdBu_r", -top, formula or "force without a law")]
         if spread is not None:
             drawn.append((panels[1], spread, "Greys", 0.0, "its standard deviation"))
         for axes, values, colours, low, title in drawn:

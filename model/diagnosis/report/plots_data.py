@@ -12,9 +12,11 @@ from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, Motion
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import StaticLaw
+from sprung.model.laws.expression import MOTION, parse
+from sprung.model.laws.formula import EFFECT
 from sprung.model.laws.spline import SurfaceLaw
 from sprung.model.signals import FloatArray
 
@@ -80,6 +82,8 @@ def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArra
         drawn_map = term.law.latent.map((_BINS, _BINS))
         result[f"{key}.map_d"], result[f"{key}.map_v"] = drawn_map.deflection, drawn_map.rate
         result[f"{key}.map_force"], result[f"{key}.map_std"] = drawn_map.force, drawn_map.std
+    elif _of_both(term):
+        result.update(_formula_map(course, term, key, d, v))
     else:
         result[f"{key}.curve_law"] = drawn
     if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):
@@ -103,6 +107,36 @@ def _surface(
         f"{key}.map_d": axis_d,
         f"{key}.map_v": axis_v,
         f"{key}.map_force": np.einsum("i,ivd->vd", np.array(term.parameters), values),
+        f"{key}.map_std": np.sqrt(np.maximum(variance, 0)),
+    }
+
+
+def _of_both(term: Term) -> bool:
+    """Whether a term is a formula in deflection and rate: a curve over one of them says too little of it."""
+    law = term.law
+    if law.name != EFFECT or not isinstance(law, ElementLaw) or law.memory:
+        return False
+    return {"d", "v"} <= parse(law.formula, {*law.names, *MOTION}).names
+
+
+def _formula_map(course: Investigation, term: Term, key: str, d: FloatArray, v: FloatArray) -> dict[str, NDArray[Any]]:
+    """A formula's force over deflection and rate, with the standard deviation that its values have."""
+    axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
+    motion, element = Motion(*np.meshgrid(axis_d, axis_v), 0.0, ()), course.fit.forward.element_of(term)
+
+    def force(values: FloatArray) -> FloatArray:
+        return np.asarray(term.element_law.force(motion, tuple(values.tolist()), element), dtype=float)
+
+    place = course.fit.place([other.key for other in course.fit.point.terms].index(term.key))
+    block, values = course.fit.covariance[place, place], np.array(term.parameters)
+    steps = np.maximum(1e-6 * np.abs(values), 1e-12)
+    slopes = np.stack([(force(values + step) - force(values - step)) for step in np.diag(steps)])
+    slopes = slopes / (2 * steps[:, None, None])
+    variance = np.einsum("ivd,ij,jvd->vd", slopes, block, slopes)
+    return {
+        f"{key}.map_d": axis_d,
+        f"{key}.map_v": axis_v,
+        f"{key}.map_force": force(values),
         f"{key}.map_std": np.sqrt(np.maximum(variance, 0)),
     }
 

@@ -8,8 +8,13 @@ from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.own import load_laws
 from sprung.model.system import parse_system
+from sprung.service.cli.export import export
 from sprung.service.improved import improved_text
+from sprung.service.own_laws import write_laws
+from sprung.service.report.forces import force_figure
 
 
 @pytest.fixture(scope="module")
@@ -59,3 +64,35 @@ def test_what_a_later_formula_explains_is_no_finding_of_its_own():
     record = MadeRecord(clean + noise * np.random.default_rng(8).standard_normal(clean.shape))
     report = diagnose(quarter_car(), record, Options())
     assert [(f.location, f.effect, f.formula) for f in report.findings] == [("secondary", "formula", "a * z**3")]
+
+
+def test_a_formula_of_deflection_and_rate_is_drawn_as_a_map(told):
+    d, v = np.meshgrid(told.evidence["finding.0.map_d"], told.evidence["finding.0.map_v"])
+    force, std = told.evidence["finding.0.map_force"], told.evidence["finding.0.map_std"]
+    (a,) = told.findings[0].parameters
+    assert force == pytest.approx(a.value * d * np.abs(v), rel=0.02)  # from the part that was fitted
+    assert std == pytest.approx(a.std * np.abs(d * v), rel=0.5)
+    figure = force_figure(told, 0)
+    assert figure is not None and "a * d * abs(v)" in figure.axes[0].get_title(loc="left")
+
+
+def test_a_formula_becomes_a_law_of_ones_own(told, tmp_path):
+    path = tmp_path / "my_laws.py"
+    assert write_laws(path, told) == 1
+    (law,) = load_laws(path, tuple(one.name for one in CATALOGUE))
+    assert law.name == "secondary_law_1" and law.strength == 0 and law.listed
+    other = simulate(lambda d, v: 2e6 * d * abs(v), seconds=15.0, seed=6)
+    catalogue = (*CATALOGUE, law)
+    report = diagnose(quarter_car(), other, Options(catalogue=catalogue))
+    assert report.verdict == "missing_physics"
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("secondary", "secondary_law_1")
+    assert finding.parameters[0].value == pytest.approx(2e6, abs=5 * finding.parameters[0].std)
+
+
+def test_a_formula_goes_into_every_export(told, tmp_path):
+    system = parse_system(improved_text(SYSTEM, quarter_car(), told))
+    for name in ("vehicle.mo", "vehicle.fmu", "tables"):
+        export(system, tmp_path / name)
+    assert "abs(v)" in (tmp_path / "vehicle.mo").read_text(encoding="utf-8")
+    assert any((tmp_path / "tables").glob("*.csv"))
