@@ -47,7 +47,7 @@ sensors:
 """
 LAW = "laws: [{coulomb_friction: {force: {value: 58, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"
 FOUND = FILE.replace("damping: 1400}", f"damping: 1400, {LAW}}}")
-SECONDS = 11
+SECONDS = 16
 
 
 def found(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
