@@ -164,7 +164,7 @@ def test_a_force_of_the_wrong_sign_is_a_wrong_sign_and_no_physics() -> None:
 
 
 def test_standstill_is_cut_out_and_tells_the_noise() -> None:
-    _, d, v = sweep()
+    _, d, v = sweep(20.0)
     still = int(3 * RATE)
     d, v = np.concatenate([np.full(still, d[0]), d]), np.concatenate([np.zeros(still), v])
     found = report(K * d + C * v, d, noise=2.0)
