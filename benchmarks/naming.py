@@ -403,9 +403,9 @@ RIGS: dict[str, RigKind] = {
     "damper_blowoff": RigKind(frozenset({"damper_blowoff"}), _valve),
     "friction by current": RigKind(frozenset({"coulomb_friction"}), _coulomb, signal=True, hysteretic=True),
     "hysteresis by current": RigKind(frozenset({"bouc_wen"}), _bouc_wen, signal=True, hysteretic=True),
-    "magneto-rheological (tanh)": RigKind(_ANY, _magneto_rheological, hysteretic=True),
-    "steel (Menegotto-Pinto)": RigKind(frozenset({"bouc_wen"}), _menegotto_pinto, hysteretic=True),
+    "magneto-rheological after Kwok": RigKind(_ANY, _magneto_rheological, hysteretic=True),
+    "steel after Menegotto and Pinto": RigKind(frozenset({"bouc_wen"}), _menegotto_pinto, hysteretic=True),
     "self-centring": RigKind(frozenset(), _self_centring, hysteretic=True),
-    "rubber (Berg, fractional)": RigKind(_HYSTERESIS | {"series_stiffness"}, _rubber, hysteretic=True),
-    "oil (relief, cavitation)": RigKind(frozenset({"damper_blowoff", "bouc_wen", "series_stiffness"}), _oil),
+    "rubber after Berg": RigKind(_HYSTERESIS | {"series_stiffness"}, _rubber, hysteretic=True),
+    "oil that cavitates": RigKind(frozenset({"damper_blowoff", "bouc_wen", "series_stiffness"}), _oil),
 }

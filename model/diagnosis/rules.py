@@ -244,6 +244,9 @@ class ComponentRules:
     drift: float = rule(0.05, "of the record, within which a change is no drift but its beginning; chosen", 0.03, 0.1)
     as_well: float = rule(1.05, "of the held-out power, up to which a plainer law serves as well; chosen", 1.02, 1.1)
     by_lag: float = rule(0.95, "of the excess power, that a late channel explains; chosen", 0.9, 0.98)
+    above: float = rule(
+        2.25, "times the floor's power, from which a channel is blamed; derived: as the verdict", 1.5, 4.0
+    )
     late: float = rule(
         0.1, "samples, from which a channel is late; derived: sampling at a time is no better", 0.05, 0.3
     )

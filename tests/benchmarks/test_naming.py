@@ -33,7 +33,7 @@ def test_no_rig_is_called_something_else_or_clear(name: str, motion: str) -> Non
 
 def test_steel_starts_along_its_spring_and_ends_near_its_yield_force() -> None:
     random = np.random.default_rng(1)
-    step = RIGS["steel (Menegotto-Pinto)"].made(random).step
+    step = RIGS["steel after Menegotto and Pinto"].made(random).step
     path = np.linspace(0, 0.02, 4001)
     force = np.array([step(x, 0.1, 5e-5) for x in path.tolist()])
     again = np.random.default_rng(1)
@@ -43,7 +43,7 @@ def test_steel_starts_along_its_spring_and_ends_near_its_yield_force() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["self-centring", "steel (Menegotto-Pinto)", "rubber (Berg, fractional)", "oil (relief, cavitation)"]
+    "name", ["self-centring", "steel after Menegotto and Pinto", "rubber after Berg", "oil that cavitates"]
 )
 def test_a_rig_that_no_catalogue_has_takes_energy_and_gives_none(name: str) -> None:
     """Over a whole number of cycles of a steady sine; spring and damper of the bench taken out."""

@@ -264,7 +264,7 @@ class Lag:
     key: str = SENSOR_LAG.name
     kind: PieceKind = STATIC
     dissipates: bool = False
-    believed: Believed = lambda fitted: abs(fitted.shape[0]) > fitted.rules.late * fitted.step
+    believed: Believed = lambda fitted: fitted.rules.late * fitted.step < abs(fitted.shape[0]) < 1.4 * _LATEST
     plain: int = 0
     shapes: tuple[str, ...] = ("time",)
     signs: tuple[int, ...] = ()

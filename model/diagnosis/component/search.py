@@ -210,7 +210,11 @@ def _determined(fit: ComponentFit) -> bool:
 
 def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules) -> Step | None:
     """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
-    near = [r for r in ranked if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin)]
+    near = [
+        r
+        for r in ranked
+        if r.evidence > max(0.0, ranked[0].evidence - rules.naming_margin) or (r.evidence > 0 and r.fit.at_noise)
+    ]
     if not near:
         return None
     # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
@@ -218,7 +222,9 @@ def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: 
     near = told or near
     near = [r for r in near if r.last is not LAG or _explains_all(r.fit, current.fit, rules)]
     if not near:
-        near = [next((r for r in ranked if r.last is not LAG and r.evidence > 0), ranked[0])]
+        near = [r for r in ranked if r.last is not LAG and r.evidence > 0][:1]
+    if not near:
+        return None
     chosen, before = _plainest(near, rules), current
     rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
@@ -233,15 +239,20 @@ def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: 
 
 
 def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
-    """The one that serves the held-out part best; of those that serve it as well, the commonest with fewest numbers."""
+    """The one that serves the held-out part best; of those that serve it as well, the commonest with fewest numbers.
+
+    Where nothing is left but noise, what fits even better fits the noise.
+    """
     best = min(ranked.fit.held_out for ranked in near)
-    alike = [ranked for ranked in near if ranked.fit.held_out <= rules.as_well * best]
+    alike = [ranked for ranked in near if ranked.fit.held_out <= rules.as_well * best or ranked.fit.at_noise]
     return min(alike, key=lambda ranked: (ranked.last.plain, ranked.fit.model.count, ranked.fit.held_out))
 
 
 def _explains_all(lag: ComponentFit, before: ComponentFit, rules: ComponentRules) -> bool:
     """Whether a lag leaves next to nothing: hysteresis, too, looks late, and no channel is blamed for a part of it."""
     floor = lag.floor**2
+    if before.held_out < rules.above * floor:
+        return False
     return all(
         after - floor < (1 - rules.by_lag) * max(was - floor, 0.0)
         for after, was in ((lag.error, before.error), (lag.held_out, before.held_out))
