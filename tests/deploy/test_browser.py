@@ -9,24 +9,41 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 import uvicorn
 
-from sprung.model.system import System
+from sprung.model.system import MANCHESTER, System
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
+from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import Ran, add_circumstances
-from tests.service_fakes import START, make_window
+from sprung.service.worker import Emit
+from tests.oidc_provider import provider_settings, running_provider
+from tests.service_fakes import REPORT, START, make_window
 
 CHROMIUM = shutil.which("chromium")
 PAGES = {"fleet": "/", "vehicle": "/pages/vehicles/car-17", "work": "/pages/work", "signin": "/signin"}
 MOST_BYTES = 300_000  # of the first load of the vehicle's page
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
+
+
+@contextmanager
+def serving(core: Core) -> Iterator[str]:
+    """The address of the service around a core."""
+    server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
+    thread = threading.Thread(target=server.run, daemon=True)
+    thread.start()
+    while not server.started:
+        thread.join(0.05)
+    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
+    server.should_exit = True
+    thread.join(20)
 
 
 @pytest.fixture(scope="module")
@@ -38,20 +55,18 @@ def served(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterator
 
     engine = Engine(system, FakeIdentifier(system), make_tracker(system), MANCHESTER_DBC)
     core = build_core(Settings(data_dir=tmp_path_factory.mktemp("data")), engine)
-    server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
-    thread = threading.Thread(target=server.run, daemon=True)
-    thread.start()
-    while not server.started:
-        thread.join(0.05)
+    with serving(core) as address:
+        _rides(core, system)
+        yield address, core
+
+
+def _rides(core: Core, system: System) -> None:
     core.pipeline.process("car-17", [make_window(system, i) for i in range(80)])
     core.pipeline.process("car-17", [make_window(system, 80 + i, 0.3) for i in range(60)])
     core.pipeline.process("car-18", [make_window(system, i) for i in range(80)])
     ran = [Ran(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40}) for i in range(140)]
     with core.store.write() as connection:
         add_circumstances(connection, "car-17", ran, START)
-    yield f"http://127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", core
-    server.should_exit = True
-    thread.join(20)
 
 
 @pytest.fixture(scope="module")
@@ -167,6 +182,66 @@ def test_an_alarm_is_acknowledged_by_keys(address: str, browser: Any) -> None:
     page.goto(address + PAGES["vehicle"])
     assert "acknowledged" in page.inner_text("main")
     page.close()
+
+
+LAW = "laws: [{coulomb_friction: {force: {value: 300, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"
+SPRING = "stiffness: 4.3e+5, damping: 2.0e+4}"  # of the secondary suspension
+
+
+def friction_found(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """A diagnosis that takes no time and knows the answer: dry friction in one of the secondary dampers."""
+    request.out.mkdir(parents=True)
+    (request.out / "report.html").write_text("<!doctype html><!-- back --><h1>dry friction</h1>")
+    (request.out / "system.yaml").write_text(MANCHESTER.read_text().replace(SPRING, f"{SPRING[:-1]}, {LAW}}}", 1))
+    return DiagnosisResult("missing_physics", REPORT)
+
+
+def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
+    served: tuple[str, Core], browser: Any, tmp_path: Path
+) -> None:
+    address, core = served
+    core.diagnosis_jobs.task = friction_found
+    (tmp_path / "ride.csv").write_text("time,car_1l\n" + "1790000000.0,0.0\n" * 100_000)
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(f"{address}/pages/work")
+    page.set_input_files("#file", tmp_path / "ride.csv")
+    page.fill("#vehicle", "car-18")
+    page.select_option("#what", "/diagnose")
+    page.get_by_role("button", name="Upload").click()
+    page.locator("progress#sent").wait_for()
+    page.locator("#outcome:has-text('diagnosis')").wait_for()
+    kept(page, "upload")
+    page.wait_for_selector("a:has-text('report: missing physics')", timeout=60_000)  # the page has come anew
+    page.click("a:has-text('report: missing physics')")
+    assert page.inner_text("h1") == "dry friction"
+    page.get_by_role("link", name="use").click()
+
+    dialog = page.locator("dialog#usemodel[open]")
+    dialog.wait_for()
+    assert "Use this model for car-18" in dialog.inner_text()
+    kept(page, "use-this-model")
+    page.keyboard.press("Escape")  # thought better of it
+    assert core.pipeline.state("car-18").used and page.locator("dialog[open]").count() == 0
+    page.get_by_role("button", name="Use this model").first.click()
+    page.keyboard.press("Enter")
+    page.wait_for_selector("#models:has-text('coulomb_friction')", timeout=60_000)
+    assert "the vehicle's own" in page.inner_text("main").replace("’", "'")
+    page.close()
+
+
+def test_people_sign_in_with_their_organisation(engine: Engine, browser: Any, tmp_path: Path) -> None:
+    with running_provider() as provider:
+        core = build_core(provider_settings(provider, tmp_path), engine)
+        with serving(core) as address:
+            page = browser.new_page(viewport={"width": 1400, "height": 900})
+            page.goto(f"{address}/pages/work")
+            assert "/signin" in page.url
+            kept(page, "signin-organisation")
+            page.get_by_role("link", name="Sign in with your organisation").click()
+            page.wait_for_url(f"{address}/pages/work")
+            assert page.inner_text("h1") == "Work"
+            assert "anna" in (page.get_by_role("button", name="Sign out").get_attribute("title") or "")
+            page.close()
 
 
 def kept(page: Any, name: str) -> None:

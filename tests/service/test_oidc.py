@@ -1,14 +1,10 @@
-"""Signing in at an OpenID Connect provider: a small real one, over HTTP, that misbehaves as it is told."""
+"""Signing in at an OpenID Connect provider."""
 
 from __future__ import annotations
 
 import base64
-import hashlib
 import json
-import threading
-import time
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -26,87 +22,18 @@ from sprung.service.oidc import Provider
 from sprung.service.settings import Settings
 from sprung.service.store import audit
 from sprung.service.tokens import Refused
-
-jwt = pytest.importorskip("jwt")
-ec = pytest.importorskip("cryptography.hazmat.primitives.asymmetric.ec")
-KEY, STRANGER = ec.generate_private_key(ec.SECP256R1()), ec.generate_private_key(ec.SECP256R1())
-GROUPS = {"works": ["operate"], "north": ["read", "ingest", "fleet:north-"], "boss": ["admin"]}
-
-
-class FakeProvider(ThreadingHTTPServer):
-    """Configuration, keys and the token endpoint; `claims` go into the next identity."""
-
-    def __init__(self) -> None:
-        super().__init__(("127.0.0.1", 0), Answers)
-        self.issuer = f"http://127.0.0.1:{self.server_port}"
-        self.claims: dict[str, Any] = {}
-        self.codes: dict[str, dict[str, str]] = {}  # what the browser was sent with, by code
-        self.key: Any = KEY
-        self.asked: list[str] = []
-        self.broken = False
-
-    def token(self, **claims: Any) -> str:
-        """Signed by the key of the moment."""
-        usual = {"iss": self.issuer, "aud": "sprung", "sub": "7", "iat": time.time(), "exp": time.time() + 300}
-        held = usual | {"preferred_username": "anna", "groups": ["works"]} | claims
-        kept = {name: value for name, value in held.items() if value is not None}
-        text: str = jwt.encode(kept, self.key, "ES256", headers={"kid": "one"})
-        return text
-
-
-class Answers(BaseHTTPRequestHandler):
-    server: FakeProvider
-
-    def do_GET(self) -> None:
-        self.server.asked.append(self.path)
-        if self.path == "/.well-known/openid-configuration":
-            names = {"authorization_endpoint": "/authorize", "token_endpoint": "/token", "jwks_uri": "/keys"}
-            self.say({"issuer": self.server.issuer} | {n: self.server.issuer + path for n, path in names.items()})
-        else:
-            public = json.loads(jwt.algorithms.ECAlgorithm.to_jwk(KEY.public_key()))
-            self.say({"keys": [public | {"kid": "one", "use": "sig"}]})
-
-    def do_POST(self) -> None:
-        form = parse_qs(self.rfile.read(int(self.headers["content-length"])).decode())
-        sent = self.server.codes.pop(form["code"][0], None)
-        challenge = base64.urlsafe_b64encode(hashlib.sha256(form["code_verifier"][0].encode()).digest()).rstrip(b"=")
-        if sent is None or challenge.decode() != sent["code_challenge"] or form["client_secret"] != ["hush"]:
-            self.say({"error": "invalid_grant"}, 400)
-        else:
-            self.say({"id_token": self.server.token(**{"nonce": sent["nonce"]} | self.server.claims)})
-
-    def say(self, thing: object, status: int = 200) -> None:
-        self.send_response(500 if self.server.broken else status)
-        self.end_headers()
-        self.wfile.write(json.dumps(thing).encode())
-
-    def log_message(self, *_: object) -> None:
-        """Nothing."""
+from tests.oidc_provider import KEY, STRANGER, FakeProvider, jwt, provider_settings, running_provider
 
 
 @pytest.fixture
 def provider() -> Iterator[FakeProvider]:
-    running = FakeProvider()
-    threading.Thread(target=running.serve_forever, args=(0.01,), daemon=True).start()
-    yield running
-    running.shutdown()
-    running.server_close()
-
-
-def settings(provider: FakeProvider, folder: Path, **more: Any) -> Settings:
-    secret = {"oidc_client_secret": "hush", "oidc_groups": GROUPS}
-    return Settings(
-        data_dir=folder,
-        min_free_bytes=0,
-        oidc_issuer=provider.issuer,
-        oidc_client_id="sprung",
-        **secret | more,  # type: ignore[arg-type]
-    )
+    with running_provider() as running:
+        yield running
 
 
 @pytest.fixture
 def client(provider: FakeProvider, engine: Engine, tmp_path: Path) -> Iterator[TestClient]:
-    core = build_core(settings(provider, tmp_path), engine)
+    core = build_core(provider_settings(provider, tmp_path), engine)
     with TestClient(create_app(core), raise_server_exceptions=False, follow_redirects=False) as running:
         yield running
 
@@ -190,7 +117,7 @@ def test_only_the_browser_that_began_comes_back(client: TestClient, provider: Fa
 
 
 def test_forged_signatures_are_refused(provider: FakeProvider, tmp_path: Path) -> None:
-    taken = Provider(settings(provider, tmp_path))
+    taken = Provider(provider_settings(provider, tmp_path))
     good = provider.token()
     assert taken.actor(good).name == "oidc:anna"
     claims = jwt.decode(good, options={"verify_signature": False})
@@ -226,7 +153,7 @@ def test_scopes_of_one_fleet_never_count_for_another(provider: FakeProvider, tmp
         "south": ["admin", "fleet:south-"],
         "north-works": ["operate", "fleet:north-"],
     }
-    taken = Provider(settings(provider, tmp_path, oidc_groups=groups, oidc_claim="realm_access.roles"))
+    taken = Provider(provider_settings(provider, tmp_path, oidc_groups=groups, oidc_claim="realm_access.roles"))
     actor = taken.actor(provider.token(realm_access={"roles": ["south", "north", "north-works"]}))
     assert (actor.scopes, actor.fleet) == ({"read", "operate"}, "north-")
 
@@ -254,6 +181,6 @@ def test_a_provider_that_is_away_is_told_and_nobody_gets_in(client: TestClient, 
 def test_settings_that_cannot_work_are_told_at_start(
     provider: FakeProvider, tmp_path: Path, wrong: dict[str, Any]
 ) -> None:
-    given = settings(provider, tmp_path).model_dump() | {"oidc_client_secret": None} | wrong
+    given = provider_settings(provider, tmp_path).model_dump() | {"oidc_client_secret": None} | wrong
     with pytest.raises(UserError, match=r"(?i)oidc"):
         Provider(Settings(**given))
