@@ -8,9 +8,12 @@ These move with oil and air, wear, gains that drift, clocks that are off, and a 
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,7 @@ from sprung.benchmarks.generator.running import run_day
 from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, channel_names, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.hours import full_hours
+from sprung.benchmarks.keeping import keep, kept
 from sprung.model.identification.deviations import CARGO, deviations
 from sprung.model.identification.identify import Identifier
 from sprung.model.signals import Conditions, Deviating, Estimate, FloatArray
@@ -189,26 +193,66 @@ def _judged(state: TrackerState, days: float, rides: tuple[int, int], began: flo
     )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Lives:
+    """Lives of one run, each taken from `folder` where it has been lived before."""
+
+    system: System
+    windows: int  # of the library
+    seed: int
+    folder: Path | None
+    part: tuple[int, int]  # every so-manieth life is ours: (which, of how many)
+
+    @cached_property
+    def pools(self) -> list[Pool]:
+        cargo = sum(part.kind in CARGO for part in deviations(self.system))
+        return [pool(window, cargo) for window in library(self.system, self.windows, self.seed)]
+
+    def ours(self, number: int) -> bool:
+        return number % self.part[1] == self.part[0] - 1
+
+    def life(self, days: float, seed: int, *, measured: bool, fault: str | None = None) -> Life:
+        file = None if self.folder is None else self.folder / f"life-{seed}.json"
+        settings = [days, seed, measured, fault, self.windows, self.seed, POOLED, FAULTS, asdict(Service())]
+        settings = json.loads(json.dumps(settings))  # as they are read back
+        told = kept(file, settings)
+        if told is None:
+            lived = live(self.system, self.pools, days, seed, measured=measured, fault=fault)
+            keep(file, settings, asdict(lived))
+            return lived
+        return Life(**told)
+
+
 def run(
-    months: float = 2.0, faults: int = 6, seed: int = 1, windows: int = 48, hours: int = 0
+    months: float = 2.0,
+    faults: int = 6,
+    seed: int = 1,
+    windows: int = 48,
+    hours: int = 0,
+    folder: Path | None = None,
+    part: str = "1/1",
 ) -> Iterator[dict[str, Any]]:
     """Healthy vehicles for `months` in all, a month each, every other with its temperature measured; then `faults`
-    vehicles with a hidden one each; then `hours` of full simulation, see `benchmarks.hours`."""
+    vehicles with a hidden one each; then `hours` of full simulation, see `benchmarks.hours`.
+
+    folder: where vehicles that are done are kept; the same command goes on with the others (empty it when the code
+    changed).  part: "2/3": only every third vehicle, the second first, for processes beside each other with one folder.
+    """
     system = load_system()
+    which, of = (int(x) for x in part.split("/"))
     if months or faults:
-        cargo = sum(part.kind in CARGO for part in deviations(system))
-        found = [pool(window, cargo) for window in library(system, windows, seed)]
-        yield from _healthy(system, found, months, seed)
-        yield from _hidden(system, found, faults, seed)
+        lives = Lives(system, windows, seed, folder, (which, of))
+        yield from _healthy(lives, months)
+        yield from _hidden(lives, faults)
     if hours:
-        yield from full_hours(hours, seed)
+        yield from full_hours((number for number in range(hours) if number % of == which - 1), seed, folder)
 
 
-def _healthy(system: System, found: list[Pool], months: float, seed: int) -> Iterator[dict[str, Any]]:
+def _healthy(some: Lives, months: float) -> Iterator[dict[str, Any]]:
     begin, lives = time.process_time(), []
-    for number in range(max(1, round(months)) if months else 0):
+    for number in filter(some.ours, range(max(1, round(months)) if months else 0)):
         days = min(1.0, months) * MONTH / DAY
-        lives.append(live(system, found, days, 1000 * seed + number, measured=number % 2 == 0))
+        lives.append(some.life(days, 1000 * some.seed + number, measured=number % 2 == 0))
         if lives[-1].strangers:
             yield {"name": "false_alarms_of", "vehicle": number, "of": lives[-1].strangers}
     if not lives:
@@ -224,25 +268,32 @@ def _healthy(system: System, found: list[Pool], months: float, seed: int) -> Ite
     yield {"name": "unmonitored", "value": 100 * unused / rides, "unit": "% of rides", "target": "< 1"}
 
 
-def _hidden(system: System, found: list[Pool], faults: int, seed: int) -> Iterator[dict[str, Any]]:
-    rng = np.random.default_rng([seed, 9])
-    names = [p.name for p in system.parameters]
+def _hidden(some: Lives, faults: int) -> Iterator[dict[str, Any]]:
+    rng = np.random.default_rng([some.seed, 9])
+    names = [p.name for p in some.system.parameters]
     for quantity in FAULTS if faults else ():
+        of_kind = [n for n in names if n.endswith(quantity)]
+        drawn_faults = [str(rng.choice(of_kind)) for _ in range(faults // len(FAULTS))]
         lives = []
-        for number in range(faults // len(FAULTS)):
-            fault = str(rng.choice([n for n in names if n.endswith(quantity)]))
-            at = 2000 * seed + 500 * list(FAULTS).index(quantity) + number
-            lives.append(live(system, found, SETTLED_DAYS + 2.0, at, measured=number % 2 == 0, fault=fault))
+        for number in filter(some.ours, range(len(drawn_faults))):
+            at = 2000 * some.seed + 500 * list(FAULTS).index(quantity) + number
+            fault = drawn_faults[number]
+            lives.append(some.life(SETTLED_DAYS + 2.0, at, measured=number % 2 == 0, fault=fault))
             if not lives[-1].isolated:
                 yield {"name": "not_isolated", "fault": fault, "alarms": lives[-1].strangers}
-        after = [life.found_after for life in lives if life.found_after is not None]
-        soon, isolated = sum(a <= DAY for a in after), sum(life.isolated for life in lives)
-        note = {"quantity": quantity, "of": len(lives), "change": f"{100 * (FAULTS[quantity] - 1):.0f} %"}
-        yield {"name": "found_in_a_day", "value": 100 * soon / len(lives), "unit": "%", "target": ">= 98"} | note
-        yield {"name": "isolated", "value": 100 * isolated / len(lives), "unit": "%", "target": ">= 98"} | note
-        if after:
-            yield {
-                "name": "hours_to_alarm",
-                "value": float(np.median(after)) / 3600,
-                "largest": max(after) / 3600,
-            } | note
+        if lives:
+            yield from _found(lives, {"quantity": quantity, "change": f"{100 * (FAULTS[quantity] - 1):.0f} %"})
+
+
+def _found(lives: list[Life], note: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    after = [life.found_after for life in lives if life.found_after is not None]
+    soon, isolated = sum(a <= DAY for a in after), sum(life.isolated for life in lives)
+    note = note | {"of": len(lives)}
+    yield {"name": "found_in_a_day", "value": 100 * soon / len(lives), "unit": "%", "target": ">= 98"} | note
+    yield {"name": "isolated", "value": 100 * isolated / len(lives), "unit": "%", "target": ">= 98"} | note
+    if after:
+        yield {
+            "name": "hours_to_alarm",
+            "value": float(np.median(after)) / 3600,
+            "largest": max(after) / 3600,
+        } | note

@@ -7,16 +7,19 @@ time was not monitored, and how the errors of parameters and loads compare with 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.timetable import Service, draw_timetable
-from sprung.benchmarks.generator.vehicle import read_vehicle
+from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
+from sprung.benchmarks.keeping import keep, kept
 from sprung.benchmarks.through import through
-from sprung.service.engine import load_engine
+from sprung.service.engine import Engine, load_engine
 from sprung.service.settings import settings_with
 
 HOUR = 3600.0
@@ -25,33 +28,47 @@ SETTLED = 60.0  # s of the day after which values are held against the truth
 SILENT = 3.0  # stated deviations
 
 
-def full_hours(hours: int, seed: int) -> Iterator[dict[str, Any]]:
-    """One vehicle each; a row as each is done."""
-    engine, vehicle = load_engine(settings_with({})), read_vehicle(SYSTEM)
-    for number in range(hours):
-        begin = time.process_time()
-        timetable = draw_timetable(vehicle, Service(), HOUR, 10_000 * seed + number, start=6 * HOUR)
-        ran, unused, scores, loads, state = 0, 0, [], [], None
-        for moment in through(engine, vehicle, timetable):
-            state = moment.state
-            if timetable.at(timetable.speed, moment.time) < RUNNING:
-                continue
-            ran, unused = ran + 1, unused + (not moment.used or state.misfit_since is not None)
-            if moment.time > SETTLED and ran % 60 == 0:
-                mean, std = engine.tracker.posterior(state)
-                scores.append((mean - timetable.log_ratio(vehicle, moment.time)) / std)
-                for value, deviation in engine.tracker.loads(state).values():
-                    truth = float(np.log1p(timetable.at(timetable.load, moment.time)))
-                    loads.append(((value - truth) / deviation, value - truth))
-        score, load = np.array(scores), np.array(loads).reshape(-1, 2)
-        assert state is not None
-        alarms = [f"{a.kind} {a.parameter}" for a in state.alarms]
-        yield {
-            "name": "full_hour", "vehicle": number, "windows_running": ran, "unmonitored_%": 100 * unused / ran,
-            "false_alarms": [a for a in alarms if not a.startswith("sensor")],
-            "sensor_alarms": [a for a in alarms if a.startswith("sensor")],
-            "rms_error_over_std": float(np.sqrt(np.mean(score**2))),
-            "beyond_3_%": 100 * float(np.mean(np.abs(score) > SILENT)), "largest": float(np.abs(score).max()),
-            "load_rms_error_%": 100 * float(np.sqrt(np.mean(load[:, 1] ** 2))),
-            "load_rms_over_std": float(np.sqrt(np.mean(load[:, 0] ** 2))), "cpu_seconds": time.process_time() - begin,
-        }  # fmt: skip
+def full_hours(numbers: Iterable[int], seed: int, folder: Path | None = None) -> Iterator[dict[str, Any]]:
+    """One vehicle each; a row as each is done, taken from `folder` where it has run before."""
+    for number in numbers:
+        file = None if folder is None else folder / f"hour-{seed}-{number}.json"
+        told = kept(file, [seed, number])
+        if told is None:
+            told = _hour(number, seed)
+            keep(file, [seed, number], told)
+        yield told
+
+
+@cache
+def _product() -> tuple[Engine, Vehicle]:
+    return load_engine(settings_with({})), read_vehicle(SYSTEM)
+
+
+def _hour(number: int, seed: int) -> dict[str, Any]:
+    begin = time.process_time()
+    engine, vehicle = _product()
+    timetable = draw_timetable(vehicle, Service(), HOUR, 10_000 * seed + number, start=6 * HOUR)
+    ran, unused, scores, loads, state = 0, 0, [], [], None
+    for moment in through(engine, vehicle, timetable):
+        state = moment.state
+        if timetable.at(timetable.speed, moment.time) < RUNNING:
+            continue
+        ran, unused = ran + 1, unused + (not moment.used or state.misfit_since is not None)
+        if moment.time > SETTLED and ran % 60 == 0:
+            mean, std = engine.tracker.posterior(state)
+            scores.append((mean - timetable.log_ratio(vehicle, moment.time)) / std)
+            for value, deviation in engine.tracker.loads(state).values():
+                truth = float(np.log1p(timetable.at(timetable.load, moment.time)))
+                loads.append(((value - truth) / deviation, value - truth))
+    score, load = np.array(scores), np.array(loads).reshape(-1, 2)
+    assert state is not None
+    alarms = [f"{a.kind} {a.parameter}" for a in state.alarms]
+    return {
+        "name": "full_hour", "vehicle": number, "windows_running": ran, "unmonitored_%": 100 * unused / ran,
+        "false_alarms": [a for a in alarms if not a.startswith("sensor")],
+        "sensor_alarms": [a for a in alarms if a.startswith("sensor")],
+        "rms_error_over_std": float(np.sqrt(np.mean(score**2))),
+        "beyond_3_%": 100 * float(np.mean(np.abs(score) > SILENT)), "largest": float(np.abs(score).max()),
+        "load_rms_error_%": 100 * float(np.sqrt(np.mean(load[:, 1] ** 2))),
+        "load_rms_over_std": float(np.sqrt(np.mean(load[:, 0] ** 2))), "cpu_seconds": time.process_time() - begin,
+    }  # fmt: skip
