@@ -133,6 +133,8 @@ class Attribution:
         if weather is None or not model.groups:
             return []
         odd = weathers.unusual(weather, model, self.names, share)
+        if not odd.any():
+            return []
         out, told = [], set()
         for g in np.flatnonzero(odd).tolist():
             quantity = self.kinds[int(np.flatnonzero(model.group == g)[0])]

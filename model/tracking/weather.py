@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -40,7 +41,7 @@ NEAR = 0.025  # of a kind's middle: elements within this, or within their errors
 RANGE = {"damping": 0.2, "stiffness": 0.12}  # what weather alone may do, where nobody measures it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class WeatherModel:
     """Constants of one system."""
 
@@ -50,9 +51,18 @@ class WeatherModel:
     kind_mean: FloatArray  # of kinds, shape (G, 1 + K)
     kind_std: FloatArray  # shape (G, 1 + K)
 
-    @property
+    @cached_property
     def groups(self) -> int:
         return int(self.group.max(initial=-1)) + 1
+
+    @cached_property
+    def members(self) -> tuple[IntArray, ...]:
+        """Parameters of every kind."""
+        return tuple(np.flatnonzero(self.group == g) for g in range(self.groups))
+
+    def of_kinds(self, values: FloatArray) -> FloatArray:
+        """The value (G,) of each parameter's kind, 0 where it has none, shape (P,)."""
+        return np.append(values, 0.0)[self.group]  # group -1 is the last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +139,7 @@ def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather
     mean[rows, 0] = 0.0
     covariance[rows, 0, :] = covariance[rows, :, 0] = 0.0
     covariance[rows, 0, 0] = model.std[rows, 0] ** 2
-    whole = np.array([bool(rows[model.group == g].all()) for g in range(model.groups)], dtype=bool)
+    whole = np.array([bool(rows[members].all()) for members in model.members], dtype=bool)
     fresh = {n: np.where(whole, 0.0, getattr(weather, n)) for n in ("common", "variance", "settled", "slack")}
     return replace(weather, mean=mean, covariance=covariance, **fresh)
 
@@ -153,9 +163,8 @@ def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning:
         moved = np.where(taken, np.where(known, at, 0.0) - weather.reference, 0.0) / np.maximum(weight, 1)
         weather = replace(weather, reference=weather.reference + moved, weight=weight)
     x = np.concatenate([[0.0 if learning else 1.0], np.where(known, at - weather.reference, 0.0)])
-    kinds = np.append(weather.kind_mean[:, 1:] @ x[1:], 0.0)  # a kind's own offset is part of what it has in common
-    effect = weather.mean @ x + kinds[model.group]
-    return replace(weather, effect=effect, doubt=np.einsum("i,pij,j->p", x, weather.covariance, x))
+    kinds = weather.kind_mean[:, 1:] @ x[1:]  # a kind's own offset is part of what it has in common
+    return replace(weather, effect=weather.mean @ x + model.of_kinds(kinds), doubt=(weather.covariance @ x) @ x)
 
 
 def learned(
@@ -181,15 +190,22 @@ def learned(
     if not model.groups or not np.isfinite(at).any():
         return weather
     middle, noise, fit = (np.zeros(model.groups) for _ in range(3))
-    for g in range(model.groups):
-        rows = np.flatnonzero((model.group == g) & usable)
+    without = left - weather.mean @ x
+    for g, members in enumerate(model.members):
+        rows = members[usable[members]]
         if len(rows) >= FEWEST:
-            middle[g], fit[g] = np.median(left[rows] - weather.mean[rows] @ x), 1.0
-            noise[g] = 1.57 * variance[rows].mean() / len(rows)
+            middle[g], fit[g] = _median(without[rows]), 1.0
+            noise[g] = 1.57 * variance[rows].sum() / len(rows) ** 2
     mean, covariance = _regressed(
         weather.kind_mean, weather.kind_covariance, x, middle, _floored(noise, OF_KINDS, seconds), fit > 0
     )
     return replace(weather, kind_mean=mean, kind_covariance=covariance)
+
+
+def _median(values: FloatArray) -> float:
+    """Of a few values: NumPy's own spends most of its time on what they may be."""
+    ordered, half = np.sort(values), len(values) // 2
+    return float(ordered[half]) if len(values) % 2 else 0.5 * float(ordered[half - 1] + ordered[half])
 
 
 def _floored(variance: FloatArray, correlated: tuple[float, float], seconds: float) -> FloatArray:
@@ -223,15 +239,16 @@ def together(
     common, spread = weather.common.copy(), weather.variance.copy()
     rest = min(RESTED**2 * max(elapsed - 60.0, 0.0), MOST_RESTED**2)
     spread += COMMON_WALK**2 * min(elapsed, 60.0) + rest
-    for g in range(model.groups):
-        rows = np.flatnonzero((model.group == g) & usable)
+    reach = np.maximum(NEAR, 3 * np.sqrt(variance))
+    for g, members in enumerate(model.members):
+        rows = members[usable[members]]
         if len(rows) < FEWEST:
             continue
-        middle = float(np.median(left[rows]))
-        near = np.abs(left[rows] - middle) < np.maximum(NEAR, 3 * np.sqrt(variance[rows]))
-        if near.mean() < MOST_OF:
+        middle = _median(left[rows])
+        near = np.abs(left[rows] - middle) < reach[rows]
+        if np.count_nonzero(near) < MOST_OF * len(rows):
             continue
-        noise = 1.57 * float(variance[rows].mean()) / len(rows)  # of a median
+        noise = 1.57 * float(variance[rows].sum()) / len(rows) ** 2  # of a median
         gain = spread[g] / (spread[g] + noise)
         common[g] += gain * (middle - common[g])
         spread[g] *= 1 - gain
@@ -245,23 +262,21 @@ def together(
 
 def shared(weather: Weather, model: WeatherModel) -> FloatArray:
     """What each parameter has in common with its kind, shape (P,)."""
-    return np.where(model.group >= 0, np.append(weather.common, 0.0)[model.group], 0.0)
+    return model.of_kinds(weather.common)
 
 
 def usual(weather: Weather, model: WeatherModel) -> FloatArray:
     """The slow part of it, which is weather, shape (P,)."""
-    return np.where(model.group >= 0, np.append(weather.settled, 0.0)[model.group], 0.0)
+    return model.of_kinds(weather.settled)
 
 
 def unusual(weather: Weather, model: WeatherModel, names: Sequence[str], share: float = 1.0) -> BoolArray:
     """Kinds that moved faster than weather does, or further, shape (G,); `share` of the limits."""
-    out = np.zeros(model.groups, dtype=bool)
-    for g in range(model.groups):
-        quantity = names[int(np.flatnonzero(model.group == g)[0])].rpartition(".")[2]
-        certain = 4.0 * math.sqrt(float(weather.variance[g]))
-        fast = abs(weather.common[g] - weather.settled[g]) > share * (FAST + weather.slack[g]) + certain
-        out[g] = fast or abs(weather.common[g]) > share * RANGE.get(quantity, 0.1) + certain
-    return out
+    quantities = [names[members[0]].rpartition(".")[2] for members in model.members]
+    most = np.array([RANGE.get(quantity, 0.1) for quantity in quantities])
+    certain = 4.0 * np.sqrt(weather.variance)
+    fast = np.abs(weather.common - weather.settled) > share * (FAST + weather.slack) + certain
+    return np.asarray(fast | (np.abs(weather.common) > share * most + certain))
 
 
 def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
@@ -303,4 +318,4 @@ def _spread(
 def _kinds(model: WeatherModel) -> list[IntArray]:
     """Rows of parameters that are pooled: those of a kind, and every other alone."""
     alone = [np.array([i]) for i in np.flatnonzero(model.group < 0)]
-    return [np.flatnonzero(model.group == g) for g in range(model.groups)] + alone
+    return [*model.members, *alone]
