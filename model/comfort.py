@@ -10,6 +10,7 @@ Weightings are applied in the frequency domain: a digital filter at 100 Hz canno
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -112,12 +113,13 @@ def comfort_sensors(system: System) -> tuple[int, ...]:
 class RideQuality:
     """Collects minutes from windows that overlap, in the order of their times; gaps begin a new minute."""
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, most: int | None = None) -> None:
+        """most: minutes that are kept, the latest; None: all."""
         self.rate = system.sample_rate
         self.sensors = comfort_sensors(system)
         self.columns = [len(system.inputs) + i for i in self.sensors]
         self.names = tuple(system.sensors[i] for i in self.sensors)
-        self.minutes: list[Minute] = []
+        self.minutes: deque[Minute] = deque(maxlen=most)
         self._held = np.empty((0, len(self.columns)))
         self._next: int | None = None  # ns, of the sample that continues what is held
 

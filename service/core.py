@@ -34,6 +34,7 @@ from sprung.service.operations import Operations
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch
 from sprung.service.recordings import RecordingJobs
+from sprung.service.rides import RideCollector, Rides
 from sprung.service.ring import Rings
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status
@@ -56,6 +57,7 @@ class Core:
     compute: Compute
     pipeline: Pipeline
     board: Board
+    rides: Rides
     metrics: Metrics
     jobs: Jobs
     diagnoses: Diagnoses
@@ -111,6 +113,13 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     compute = Compute(settings.compute_queue)
     board = Board(engine, settings.vehicles_in_memory)
     metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
+    rides = Rides(settings.parameter_series_vehicles)
+    metrics.registry.register(RideCollector(rides))
+
+    def forget(vehicle: str) -> None:
+        board.forget(vehicle)
+        rides.forget(vehicle)
+
     rings = Rings(
         settings.ring_vehicles,
         settings.ring_seconds,
@@ -131,7 +140,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     }
     jobs = Jobs(store, kinds, settings.job_queue)
     diagnoses = Diagnoses(settings, store, rings, jobs)
-    listeners += [diagnoses.on_batch, hub.on_batch]
+    listeners += [rides.on_batch, diagnoses.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
     batcher = Batcher(engine, compute, settings.compute_queue, metrics.observe)
     core = Core(
@@ -141,6 +150,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         compute,
         pipeline,
         board,
+        rides,
         metrics,
         jobs,
         diagnoses,
@@ -148,7 +158,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         housekeeping,
         hub,
         Condition(settings, store),
-        Operations(settings, pipeline, board, archive),
+        Operations(settings, pipeline, forget, archive),
         batcher,
         notices,
         Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),

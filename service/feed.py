@@ -10,11 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
-import numpy as np
-
 from sprung.model import comfort
 from sprung.model.signals import Tally
 from sprung.model.tracking.tracker import TrackerState
+from sprung.service import rides
 from sprung.service.compute import Priority
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch, Identified
@@ -169,10 +168,7 @@ def comfort_dict(pipeline: Pipeline, fed: Fed) -> dict[str, Any]:
     told = ride_dict(fed.ride) if fed.ride is not None else {"minutes": 0, "sensors": {}}
     if fed.state is None:
         return told | {"cost": None}
-    reports = pipeline.engine.tracker.report(fed.state)
-    now = np.array([report.log_ratio for report in reports])
-    then = np.array([np.log((report.baseline or report.value) / report.nominal) for report in reports])
-    return told | {"cost": comfort.cost(pipeline.engine.system, now, then)}
+    return told | {"cost": rides.cost(pipeline.engine, fed.state)}
 
 
 def _count(fed: Fed, batch: Batch) -> Batch:

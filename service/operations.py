@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from sqlalchemy import Connection
 
-from sprung.service.board import Board
 from sprung.service.engines import ServedModel
 from sprung.service.errors import NotFound
 from sprung.service.pipeline import Pipeline
@@ -27,11 +26,14 @@ MOST_ALARMS = 10_000
 class Operations:
     """Safe to share between threads."""
 
-    def __init__(self, settings: Settings, pipeline: Pipeline, board: Board, archive: Archive | None = None) -> None:
+    def __init__(
+        self, settings: Settings, pipeline: Pipeline, forget: Callable[[str], None], archive: Archive | None = None
+    ) -> None:
+        """forget: takes a vehicle out of what metrics and pages show."""
         self._settings = settings
         self._pipeline = pipeline
         self._store = pipeline.store
-        self._board = board
+        self._forget = forget
         self._archive = archive
 
     def acknowledge(self, actor: str, vehicle: str, alarm: int | None = None) -> int:
@@ -154,7 +156,7 @@ class Operations:
             marks.retire(connection, vehicle, now if retired else None)
             audit.record(connection, actor, "retire" if retired else "return", vehicle, None, now)
         if retired:
-            self._board.forget(vehicle)
+            self._forget(vehicle)
 
     def remove(self, actor: str, vehicle: str) -> None:
         """Delete a vehicle with all its data: windows, alarms, reports, uploaded files.  Raises NotFound."""
@@ -162,7 +164,7 @@ class Operations:
             self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
             removed = marks.remove(connection, vehicle)
             audit.record(connection, actor, "delete", vehicle, None, now_ns())
-        self._board.forget(vehicle)
+        self._forget(vehicle)
         if self._archive is not None:
             self._archive.remove(vehicle)
         for name in removed.upload_files:

@@ -23,6 +23,7 @@ from torch import Tensor, nn
 from sprung.model.chunks import chunks, share
 from sprung.model.identification.features import ForceBalance
 from sprung.model.signals import FloatArray, IntArray
+from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
@@ -36,7 +37,7 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class EstimatorOutput:
-    log_ratio: FloatArray  # shape (B, P)
+    log_ratio: FloatArray  # shape (B, P), or (B, P + X) with what describes loads
     covariance: FloatArray  # predicted, shape (B, P, P)
 
 
@@ -73,6 +74,20 @@ class EstimatorNet(nn.Module):
         """What the noise adds to the weighted normal equations, as far as it is taken out, (P + 1, P + 1)."""
         weight = torch.exp(2 * self.log_weight)
         return (weight @ self.noise.flatten(1)).reshape(self.noise.shape[1:]) * torch.sigmoid(self.compensation)
+
+    def load(self, target: Tensor, regressors: Tensor, by_load: Tensor, prior: Tensor) -> Tensor:
+        """What loads change, (B, X), for rows (B, R), (B, R, P), (B, R, X); `prior`: its standard deviations (X,)."""
+        weight = torch.exp(self.log_weight)[:, None]
+        rows = torch.cat([regressors, by_load, target.unsqueeze(2)], dim=2) * weight
+        products = rows.mT @ rows
+        P, size = self.architecture.parameters, rows.shape[2] - 1
+        normal, right = products[:, :size, :size], products[:, :size, size]
+        # An upper bound of the rows' variance: what springs and dampers alone leave of the target.
+        ridge = 1e-6 * torch.diagonal(normal, dim1=1, dim2=2) + 1e-12
+        alone = torch.linalg.solve(normal[:, :P, :P] + torch.diag_embed(ridge[:, :P]), right[:, :P])
+        left = (products[:, size, size] - (alone * right[:, :P]).sum(dim=1)).clamp_min(1e-12) / rows.shape[1]
+        ridge = torch.cat([ridge[:, :P], left[:, None] / prior**2], dim=1)
+        return torch.linalg.solve(normal + torch.diag_embed(ridge), right)[:, P:]
 
     def forward(self, target: Tensor, regressors: Tensor, noise_taken: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """log-ratio (B, P) and covariance (B, P, P) from rows (B, R) and (B, R, P)."""
@@ -125,15 +140,26 @@ class Estimator:
         self.system, self.net, self.digest = system, net.double().eval(), digest
         self.samples = net.architecture.samples
         self.features = ForceBalance(system, self.samples)
+        self.load_prior = torch.as_tensor([term.std for term in load_terms(system)], dtype=torch.float64)
         with torch.no_grad():
             self.noise_taken = self.net.noise_taken()
 
-    def estimate(self, windows: FloatArray, workers: int = 1) -> EstimatorOutput:
-        """Log-ratios and predicted covariances of windows (B, T, C); `workers`: see `model.chunks`."""
+    def estimate(self, windows: FloatArray, workers: int = 1, *, loads: bool = False) -> EstimatorOutput:
+        """Log-ratios and predicted covariances of windows (B, T, C); `workers`: see `model.chunks`.
+
+        loads: what describes the system's loads is told, too, and follows the P parameters in `log_ratio`.
+        """
 
         def work(at: IntArray) -> tuple[FloatArray, FloatArray]:
             with torch.no_grad():
-                log_ratio, covariance = self.net(*self.features(windows[at]), self.noise_taken)
+                if loads:
+                    target, regressors, by_load = self.features.with_loads(windows[at])
+                    change = self.net.load(target, regressors, by_load, self.load_prior)
+                    target = target - (by_load @ change.unsqueeze(2)).squeeze(2)
+                    log_ratio, covariance = self.net(target, regressors, self.noise_taken)
+                    log_ratio = torch.cat([log_ratio, self.features.simulator.loading.terms_of(change)], dim=1)
+                else:
+                    log_ratio, covariance = self.net(*self.features(windows[at]), self.noise_taken)
             finite = torch.isfinite(log_ratio).all(dim=1)
             return torch.where(finite[:, None], log_ratio, torch.zeros_like(log_ratio)).numpy(), covariance.numpy()
 

@@ -21,6 +21,7 @@ from sprung.model.chunks import alike
 from sprung.model.mechanics import ACCELERATION, DISPLACEMENT, VELOCITY
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.simulate.loading import by_inertia
 from sprung.model.system import System
 
 BAND = (0.015, 0.25)  # share of the sample rate that the force balance uses
@@ -72,6 +73,17 @@ class ForceBalance:
 
     def __call__(self, windows: FloatArray) -> tuple[Tensor, Tensor]:
         """target (B, R) and regressors (B, R, P) of windows (B, T, C)."""
+        target, regressors, *_ = self._rows(windows)
+        return target, regressors
+
+    def with_loads(self, windows: FloatArray) -> tuple[Tensor, Tensor, Tensor]:
+        """As the call, and regressors (B, R, X) of what describes loads, at none."""
+        target, regressors, acceleration, spring = self._rows(windows)
+        by_load = self._by_load(acceleration, spring).permute(0, 2, 1, 3)  # (B, n, 2F, X)
+        return target, regressors, by_load.flatten(1, 2)
+
+    def _rows(self, windows: FloatArray) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """target, regressors, accelerations (B, 2F, n) and nominal forces of the springs (B, 2F, E)."""
         s = self.simulator
         knots = torch.as_tensor(s.knots(windows[:, :, : len(self.system.inputs)]))
         motion = self._motion(windows[:, :, len(self.system.inputs) :])  # (B, T, n)
@@ -89,7 +101,16 @@ class ForceBalance:
             regressors = torch.cat([regressors, by_mass], dim=3)
         if len(s.forces):
             known = known - drive[:, :, s.forces] @ s.F.T
-        return -known.mT.flatten(1), regressors.flatten(1, 2)
+        return -known.mT.flatten(1), regressors.flatten(1, 2), a, spring
+
+    def _by_load(self, a: Tensor, spring: Tensor) -> Tensor:
+        """Change of the forces with each term of a load, (B, 2F, n, X), from accelerations and springs' forces."""
+        s = self.simulator
+        mass = s.nominal_m.expand(len(a), -1)
+        forces = by_inertia(a, mass, None, s.loading.exponents, s.loading.pattern)
+        if bool(s.loading.stiffness.any()):
+            forces = forces + torch.einsum("bfe,xe,en->bfnx", spring, s.loading.stiffness, s.H)
+        return forces
 
     def _motion(self, sensors: FloatArray) -> Tensor:
         """Motion of the degrees of freedom, weighted least squares over the sensors that are present."""

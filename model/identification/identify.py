@@ -65,10 +65,10 @@ class Identifier:
         if len(windows) == 0:
             return []
         begin = time.perf_counter()
-        if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
-            start = self.estimator.estimate(windows, self.workers).log_ratio
-        between = time.perf_counter()
         loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
+        if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
+            start = self.estimator.estimate(windows, self.workers, loads=loads).log_ratio
+        between = time.perf_counter()
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
         found = self._estimates(refined, states)
         if not explain:
@@ -122,7 +122,8 @@ class Identifier:
         if samples not in self._explainers:
             estimator = self.estimator
             fitting = estimator is not None and estimator.samples == samples
-            start = (lambda w: estimator.estimate(w).log_ratio) if estimator is not None and fitting else None
+            loads = bool(self.system.loads)
+            start = (lambda w: estimator.estimate(w, loads=loads).log_ratio) if estimator and fitting else None
             self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
         return self._explainers[samples]
 

@@ -278,7 +278,7 @@ class _Progress:
         B, sensors = shape
         x = torch.zeros(B, P, dtype=torch.float64)
         if start is not None:
-            x[:, : start.shape[1]] += torch.as_tensor(start)
+            x[:, : start.shape[1]] += torch.as_tensor(start[:, :P])
         return cls(
             x=x,
             best=x.clone(),

@@ -92,6 +92,15 @@ class Loading:
             return None
         return torch.einsum("bx,xij->bij", load.clamp(-_MOST, _MOST), self.pattern)
 
+    def terms_of(self, linear: Tensor) -> Tensor:
+        """Terms (B, X) of loads that change masses and couplings by `linear` (B, X) times their slopes at none."""
+        factors = (1 + linear @ self.exponents).clamp(1 - _MOST, 1 / (1 - _MOST))  # (B, n)
+        terms = factors.log() @ torch.linalg.pinv(self.exponents)
+        root = factors.sqrt()
+        scale = torch.einsum("xij,bi,bj->bx", self.pattern, 1 / root, 1 / root)
+        pairs = self.pattern.sum(dim=(1, 2))
+        return torch.where(pairs > 0, (linear * scale / pairs.clamp_min(1)).clamp(-_MOST, _MOST), terms)
+
 
 def by_inertia(
     acceleration: Tensor, mass: Tensor, coupling: Tensor | None, exponents: Tensor, pattern: Tensor

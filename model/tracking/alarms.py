@@ -2,8 +2,9 @@
 
 A sequential test that has left the baseline says that something changed, not what.  Before an alarm accuses an element,
 
-- a deviation of a measurement must have had its chance: some windows since the onset must have been weighed for it;
-  what explains the change as well is named with the alarm, and when the windows point to it, it is the alarm;
+- a deviation of a measurement must have had its chance: some windows since the onset must have been weighed for it, and
+  while their evidence for one rises, the next are waited for; what explains the change as well is named with the alarm,
+  and when the windows point to it, it is the alarm;
 - all elements of a kind that moved together are one message: oil that warms, rubber that stiffens in the cold.
 """
 
@@ -238,7 +239,8 @@ class Attribution:
         calibration = state.calibration
         if calibration.recent[-1] == 0:  # estimates that never speak of deviations
             return ()
-        if calibration.recent[0] < since and (now - since) * 1e-9 < PATIENCE:
+        undecided = calibration.recent[0] < since or calibration.ratio.max(initial=0.0) >= dev.POINTING
+        if undecided and (now - since) * 1e-9 < PATIENCE:
             return None
         moved = np.log1p(drift.change[i])
         found = []
@@ -281,7 +283,7 @@ class Attribution:
         apart = state.belief.mean[-H:] - state.calibration.reference
         others = ~np.isin(np.arange(H), members)
         off = float(np.mean((apart - self.model.common(apart, others))[members]))
-        std = float(np.sqrt(np.diag(state.belief.covariance)[-H:][members].mean()))
+        std = float(np.sqrt(np.mean(self.model.relative_std(state.belief.covariance[-H:, -H:])[members] ** 2)))
         if abs(off) + 2 * std < dev.JUMPED[kind]:
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak

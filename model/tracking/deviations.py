@@ -21,6 +21,8 @@ FORGETTING = 0.9  # of the evidence for a jump, per window that is weighed
 EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
 MOST = 5.0  # standard deviations that one window counts at most: two windows at least
 RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped
+POINTING = 6.0  # log-likelihood ratio from which a deviation may be what moves parameters: alarms wait for the next
+# windows; chance alone reaches it in some direction about once in ten weighed windows
 RISING = 3.0  # log-likelihood ratio at which a jump is taken to have begun
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
 SETTLED = 600.0  # s of used windows in which the gains of the learning phase go on being refined
@@ -63,6 +65,17 @@ class DeviationModel:
             out[at] = np.median(values[telling]) if at.any() else 0.0
         return out
 
+    def relative_std(self, covariance: FloatArray) -> FloatArray:
+        """Standard deviations (H,) of deviations less what their channels share, from their covariance (H, H).
+
+        What all clocks share may be open by milliseconds while every channel's place among them is known.
+        """
+        apart = np.eye(self.size)
+        for kind in ("gain", "delay"):
+            at = np.array([k == kind for k in self.kinds], dtype=float)
+            apart -= np.outer(at, at) / max(at.sum(), 1.0)
+        return np.sqrt(((apart @ covariance) * apart).sum(axis=1).clip(0.0))
+
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     """Delays of one clock share most of their variance; everything else is independent."""
@@ -99,6 +112,11 @@ class DeviationRecord:
     since: IntArray  # ns, when the evidence began to rise, shape (V,)
     excess: FloatArray  # part of chi-square that known deviations explain, mean over windows, shape (1,)
     recent: IntArray  # ns, the last windows that were weighed, shape (3,); 0: none
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Log-likelihood ratio of a jump along each direction, shape (V,)."""
+        return np.asarray(self.slope**2 / (2 * np.maximum(self.curvature, 1e-12)))
 
 
 def start(parameters: int, model: DeviationModel) -> DeviationRecord:
@@ -222,8 +240,7 @@ def _judged(
     slope = keep * old + along * bounded
     curvature = keep * calibration.curvature + information
     ratio = slope**2 / (2 * curvature)
-    before = calibration.slope**2 / (2 * np.maximum(calibration.curvature, 1e-12))
-    since = np.where((ratio >= RISING) & (before < RISING), time, calibration.since)
+    since = np.where((ratio >= RISING) & (calibration.ratio < RISING), time, calibration.since)
     best = int(np.argmax(ratio)) if len(ratio) else -1
     jump = None
     if best >= 0 and ratio[best] >= EVIDENCE:

@@ -240,7 +240,7 @@ class Tracker:
         H = self.model.size
         if H == 0 or state.calibration.recent[-1] == 0:
             return tuple(stuck)
-        value, std = state.belief.mean[-H:], np.sqrt(np.diag(state.belief.covariance)[-H:])
+        value, std = state.belief.mean[-H:], self.model.relative_std(state.belief.covariance[-H:, -H:])
         least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
         off = value - self.model.common(value)
         chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)

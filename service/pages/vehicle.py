@@ -67,6 +67,7 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
             hints=hints(row, view, values["active"], values["reasons"], silent, sensors),
             side=side_view(system, parameters, sensors),
             plan=plan_view(system, parameters),
+            ride=core.rides.latest(id),
             sensors=sensors,
             data=page_data(system, view, values["alarms"], values["marks"]),
         )

@@ -68,3 +68,23 @@ def test_every_window_of_a_day_goes_through_once_and_in_order():
     assert len(moments) == (4200 - 100) // 50 + 1
     last = moments[-1].state
     assert last.used + last.rejected + last.idle == len(moments)
+
+
+def test_vehicles_that_are_done_are_not_lived_again(windows, monkeypatch, tmp_path):
+    monkeypatch.setattr(day, "library", lambda *_: [])
+    monkeypatch.setattr(day.Lives, "pools", windows)
+    lived = []
+
+    def live(_system, _windows, days, seed, **_):
+        lived.append(seed)
+        return day.Life(days, 100, 0, [], 0, None, False)
+
+    monkeypatch.setattr(day, "live", live)
+    first = list(day.run(3, 0, 7, folder=tmp_path, part="1/2"))
+    assert lived == [7000, 7002]
+    assert first[0]["rides"] == 200
+    again = list(day.run(3, 0, 7, folder=tmp_path))
+    assert lived == [7000, 7002, 7001]
+    assert again[0]["rides"] == 300
+    list(day.run(3, 0, 8, folder=tmp_path, part="1/3"))
+    assert lived[-1] == 8000  # another seed is another run

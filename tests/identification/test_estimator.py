@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from test_system import QUARTER_CAR
 
 from sprung.model.identification import training
@@ -14,6 +15,7 @@ from sprung.model.identification.excitation import draw_log_ratios, simulate_run
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.identification.training import TrainingSettings, train
+from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system, parse_system
 
 TINY = TrainingSettings(records=100, windows_per_record=2, steps=30, batch=64, checkpoint_every=10, recording_steps=6)
@@ -136,3 +138,33 @@ def test_progress_goes_from_simulation_through_training(small_car, tmp_path):
     training.train(small_car, tmp_path, settings=TINY, progress=lambda *a: seen.append(a[0]))
     assert seen[0] == "simulate"
     assert seen[-1] == "train"
+
+
+@pytest.mark.parametrize("terms", [(0.25, -0.05, -0.03, 0.02), (-0.25, 0.04, 0.03, -0.01)])
+def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
+    system = vehicle[0]
+    rng = np.random.default_rng(78)
+    truth = np.hstack([draw_log_ratios(system, 48, 0.2, rng), np.tile(terms, (48, 1))])
+    windows = simulate_runs(system, truth, system.window, rng).values
+    identifier = load_identifier(system)
+    start = identifier.estimator.estimate(windows, loads=True).log_ratio
+    assert start.shape == (48, 28)
+    error = np.sqrt(np.mean((start - truth) ** 2, axis=0))
+    assert error[:24].max() < 0.06
+    assert np.all(error[24:] < [0.06, 0.06, 0.06, 0.03])
+    found = identifier.examine(windows, np.zeros(48, dtype=bool))
+    assert np.mean([e.iterations for e in found]) < 1.3
+    ignorant = identifier.identify(windows, start[:, :24] * 0, explain=True)
+    std = np.sqrt([np.diag(e.covariance) for e in found])
+    off = np.array([a.log_ratio - b.log_ratio for a, b in zip(found, ignorant, strict=True)])
+    assert np.quantile(np.abs(off) / std, 0.99) < 0.1  # where it starts does not show in where it ends
+
+
+def test_linear_changes_of_masses_become_the_terms_of_a_load():
+    system = load_system()
+    loading = LinearSimulator(system).loading
+    terms = torch.tensor([[0.25, -0.08, 0.06, 0.02]], dtype=torch.float64)
+    factors = loading.factors(terms)[0, :3]
+    both = loading.coupling(terms)[0, 0, 2] * (factors[0] * factors[2]).sqrt()
+    linear = torch.stack([factors[0] - 1, factors[1] - factors[0], factors[2] - factors[0], both])[None]
+    np.testing.assert_allclose(loading.terms_of(linear).numpy(), terms.numpy(), atol=1e-12)

@@ -1,0 +1,99 @@
+"""Which deviations of measurements are told, how sure they are, and that alarms of springs wait for them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sprung.model.identification.deviations import Deviation
+from sprung.model.signals import Deviating
+from sprung.model.tracking import deviations as dev
+from sprung.model.tracking.tracker import Tracker, TrackerState
+from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
+
+SECOND = 1_000_000_000
+DELAYS = [Deviation(f"c{i}", "delay", 5e-3, 0) for i in range(4)]
+LOADED = [*DELAYS, Deviation("car", "load", 0.15, -1), Deviation("car", "roll_inertia", 0.1, -1)]
+STD = np.full(6, 0.01)
+
+
+def make(deviations=DELAYS):
+    return Tracker([TrackedParameter(f"element_{i}.damping") for i in range(6)], None, deviations)
+
+
+def told(rng, size, truth, information=(1e-4) ** -2):
+    """A window that is weighed: delays `truth` (H,), relative to their mean only, move no parameter."""
+    apart = np.eye(size) - np.pad(np.ones((4, 4)) / 4, (0, size - 4))
+    M = information * apart
+    score = M @ truth + np.sqrt(information) * apart @ rng.normal(size=size)
+    covariance = correlated(rng, STD)
+    value = np.linalg.cholesky(covariance) @ rng.normal(size=6)
+    found = Deviating(np.zeros(size), covariance, np.zeros((6, size)), M, score, 300.0, True)
+    return estimate(value, covariance, deviating=found)
+
+
+def test_a_channel_is_known_among_others_although_their_common_clock_is_open():
+    rng, tracker = np.random.default_rng(1), make()
+    truth = np.array([1e-3, 0.0, 0.0, 0.0])
+    state = tracker.initial_state()
+    for k in range(40):
+        state = tracker.update(state, told(rng, 4, truth), EPOCH + k * SECOND)
+    alone = np.sqrt(np.diag(state.belief.covariance)[-4:])
+    relative = tracker.model.relative_std(state.belief.covariance[-4:, -4:])
+    assert np.all(alone > 2e-3)  # what all of them share cannot be known
+    assert np.all(relative < 1e-4)
+    (fault,) = tracker.sensors(state)
+    assert (fault.channel, fault.kind) == ("c0", "delay")
+    assert fault.value == pytest.approx(1e-3, abs=3e-4)
+    assert abs(fault.value - 1e-3) < 4 * fault.std + 2.6e-4  # a quarter of it is in the mean of four
+
+
+def test_relative_deviations_are_those_of_the_closed_form():
+    rng, model = np.random.default_rng(2), dev.model_of(LOADED)
+    factor = rng.normal(size=(6, 6))
+    covariance = factor @ factor.T
+    draws = rng.multivariate_normal(np.zeros(6), covariance, 40_000)
+    apart = draws.copy()
+    apart[:, :4] -= draws[:, :4].mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(model.relative_std(covariance), apart.std(axis=0), rtol=0.03)
+
+
+def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor():
+    rng, tracker = np.random.default_rng(3), make()
+    state = tracker.initial_state()
+    for k in range(40):
+        state = tracker.update(state, told(rng, 4, np.zeros(4)), EPOCH + k * SECOND)
+    now = EPOCH + 40 * SECOND
+    since = np.full(6, EPOCH + 36 * SECOND)
+    changed = replace(state.changes, active=np.array([1, 0, 0, 0, 0, 0], dtype=np.int8), up_since=since)
+    recent = np.full(3, EPOCH + 37 * SECOND)
+
+    def opened(slope, at=now):
+        calibration = replace(state.calibration, slope=slope, curvature=np.ones_like(slope), recent=recent)
+        asked = replace(state, changes=changed, calibration=calibration)
+        drift = tracker._fusion.drift(asked)
+        return [a.kind for a in tracker._attribution.after(asked, drift, None, at)]
+
+    quiet = np.zeros(len(tracker.model.directions))
+    rising = quiet.copy()
+    rising[1] = 4.0  # a log-likelihood ratio of 8
+    assert opened(quiet) == ["change"]
+    assert opened(rising) == []
+    assert opened(rising, now + 30 * SECOND) == ["change"]  # not for ever
+
+
+def test_a_state_that_did_not_know_how_loads_are_spread_goes_on():
+    rng, old = np.random.default_rng(4), make(LOADED[:5])
+    state = old.initial_state()
+    for k in range(40):
+        state = old.update(state, told(rng, 5, np.array([1e-3, 0, 0, 0, 0.0])), EPOCH + k * SECOND)
+    state = TrackerState.from_dict(state.to_dict())
+    new = make(LOADED)
+    after = new.update(state, told(rng, 6, np.array([1e-3, 0, 0, 0, 0, 0.0])), EPOCH + 40 * SECOND)
+    assert after.used == state.used + 1
+    assert len(after.belief.mean) == 12 + 6
+    assert after.calibration.cross.shape == (6, 6)
+    before, now = old.report(state), new.report(after)
+    assert [r.baseline for r in now] == pytest.approx([r.baseline for r in before], rel=1e-3)
+    assert [f.channel for f in new.sensors(after)] == ["c0"]
+    assert TrackerState.from_dict(after.to_dict()).to_dict() == after.to_dict()
