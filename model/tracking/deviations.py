@@ -17,7 +17,7 @@ from sprung.model.identification.deviations import CARGO, Deviation
 from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
 
-FORGETTING = 0.9  # of the evidence for a jump, per window that is weighed
+FORGETTING = 0.95  # of the evidence for a jump, per window that is weighed: 40 s; some channels show little at once
 EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
 MOST = 5.0  # standard deviations that one window counts at most: two windows at least
 RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped

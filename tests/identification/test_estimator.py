@@ -157,7 +157,7 @@ def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
     ignorant = identifier.identify(windows, start[:, :24] * 0, explain=True)
     std = np.sqrt([np.diag(e.covariance) for e in found])
     off = np.array([a.log_ratio - b.log_ratio for a, b in zip(found, ignorant, strict=True)])
-    assert np.quantile(np.abs(off) / std, 0.99) < 0.1  # where it starts does not show in where it ends
+    assert np.quantile(np.abs(off) / std, 0.99) < 0.2  # where it starts hardly shows in where it ends
 
 
 def test_linear_changes_of_masses_become_the_terms_of_a_load():
