@@ -7,7 +7,9 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 SOURCES := sprung noxfile.py docs/imports.py model replay service benchmarks tests
-DEMO := .demo/day.blf
+# seconds of the demo's working day
+DAY ?= 1200
+DEMO := .demo/$(DAY)/day.blf
 PORT ?= 8000
 PYTEST ?=
 # processes that the tests are shared among
@@ -53,9 +55,9 @@ $(VENV)/.installed-dev: $(VENV)/.installed requirements-dev.lock requirements-de
 fleet-demo: install-fleet
 	$(BIN)/sprung fleet demo --port $(PORT)
 
-# twenty minutes of a working day, always the same
+# a piece of a working day, always the same
 $(DEMO): | install
-	$(BIN)/python -m sprung.benchmarks.generator --day 1200 --seed 11 --clock 0.0002 --formats blf --out $(@D) \
+	$(BIN)/python -m sprung.benchmarks.generator --day $(DAY) --seed 11 --clock 0.0002 --formats blf --out $(@D) \
 		--fault secondary_2r.damping,420,0.7,240 --fault bogie1_1l.gain,780,1.06,180
 
 demo: install $(DEMO)
