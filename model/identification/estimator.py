@@ -87,7 +87,8 @@ class EstimatorNet(nn.Module):
         alone = torch.linalg.solve(normal[:, :P, :P] + torch.diag_embed(ridge[:, :P]), right[:, :P])
         left = (products[:, size, size] - (alone * right[:, :P]).sum(dim=1)).clamp_min(1e-12) / rows.shape[1]
         ridge = torch.cat([ridge[:, :P], left[:, None] / prior**2], dim=1)
-        return torch.linalg.solve(normal + torch.diag_embed(ridge), right)[:, P:]
+        solved: Tensor = torch.linalg.solve(normal + torch.diag_embed(ridge), right)
+        return solved[:, P:]
 
     def forward(self, target: Tensor, regressors: Tensor, noise_taken: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """log-ratio (B, P) and covariance (B, P, P) from rows (B, R) and (B, R, P)."""

@@ -74,7 +74,7 @@ class DeviationModel:
         for kind in ("gain", "delay"):
             at = np.array([k == kind for k in self.kinds], dtype=float)
             apart -= np.outer(at, at) / max(at.sum(), 1.0)
-        return np.sqrt(((apart @ covariance) * apart).sum(axis=1).clip(0.0))
+        return np.asarray(np.sqrt(((apart @ covariance) * apart).sum(axis=1).clip(0.0)))
 
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
