@@ -189,6 +189,7 @@ class SetupRules:
     few: int = rule(16, "hypotheses that spectra cannot rank, up to which all are fitted; chosen", 8, 24)
     rivals: int = rule(3, "hypotheses of one channel that are estimated again; chosen", 2, 5)
     part_steps: int = rule(8, "of the fit of a missing part; chosen: it then stands within 1 %", 5, 12)
+    bins: int = rule(400, "that rank what may be wrong with the file; derived: a misfit known to 5 %", 200, 2000)
     asked: float = rule(0.2, "of another body that least squares must ask for; derived: a right one is 1", 0.1, 0.4)
     above: float = rule(1.3, "times the fastest mode, from where masses alone are told; chosen", 1.15, 1.6)
     by_mass: float = rule(0.5, "of the misfit there, that an explanation may leave; chosen", 0.35, 0.65)

@@ -5,13 +5,13 @@ Spring and damper values absorb much of a wrong set-up: what a change leaves bes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.record.spectra import ComplexArray, ThinnedGrid
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -31,10 +31,14 @@ class Weighed:
 class SetupScores:
     """Changes of the set-up weighed on the residual of a fit, or of the nominal values."""
 
-    def __init__(self, problem: Problem, fit: Fit, nominal: bool = False) -> None:
+    def __init__(self, problem: Problem, fit: Fit, nominal: bool = False, most: int | None = None) -> None:
+        """most: bins that are looked at, evenly spread over those that are compared; None: all of them."""
         self.problem, part = problem, problem.part
         self.theta = np.zeros_like(fit.point.theta) if nominal else fit.point.theta
-        self.band = slice(1, part.grid.band.stop)
+        stride = 1 if most is None else max(1, part.grid.band.stop // most)
+        self.grid = ThinnedGrid(part.grid.samples, part.grid.step, part.grid.start, stride)
+        self.every = slice(0, part.grid.band.stop, stride)
+        self.band = slice(stride, part.grid.band.stop, stride)  # the same without zero frequency
         self.weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(part.sensors[self.band]) ** 2, axis=0), 1e-300))
         self.shown = self._shown(problem.system, self.theta)
         columns = [
@@ -65,7 +69,8 @@ class SetupScores:
 
     def _shown(self, system: System, theta: FloatArray) -> ComplexArray:
         forward = Forward(system, self.problem.part, self.problem.sensors, theta)
-        return forward.linear_sensors[self.band]
+        plant = replace(forward.plant, grid=self.grid)
+        return plant.sensors(forward.support[self.every], forward.force[self.every])[1:]
 
     def _flat(self, spectrum: ComplexArray) -> FloatArray:
         flat = (spectrum * self.weight).ravel()

@@ -33,7 +33,7 @@ def structure_hypotheses(problem: Problem, fit: Fit, rules: SetupRules) -> Itera
     """
     system = problem.system
     for nominal in (False, True):
-        scores = SetupScores(problem, fit, nominal)
+        scores = SetupScores(problem, fit, nominal, rules.bins)
         for name in system.elements:
             yield from _elsewhere(scores, system, name, rules)
             yield from _attached(scores, system, name, rules)

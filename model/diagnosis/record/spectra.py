@@ -113,6 +113,19 @@ class Grid:
         return np.concatenate([real.reshape(flat), imag.reshape(flat)])
 
 
+@dataclass(frozen=True)
+class ThinnedGrid(Grid):
+    """Every so many-th of the compared bins, from the first on: where responses are asked for, not for series."""
+
+    stride: int = 1
+
+    @cached_property
+    def omega(self) -> FloatArray:
+        """Angular frequencies of those bins, rad/s."""
+        bins = np.fft.rfftfreq(self.samples, self.step)[self.band][:: self.stride]
+        return np.asarray(2 * np.pi * bins, dtype=np.float64)
+
+
 def derivative(polynomial: FloatArray, length: float) -> FloatArray:
     """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
     result = np.zeros_like(polynomial)
