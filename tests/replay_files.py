@@ -154,3 +154,38 @@ def read(path, dbc=None, channels=CHANNELS, **options):
         index: (np.concatenate([t for t, _ in found]), np.concatenate([v for _, v in found]))
         for index, found in parts.items()
     }
+
+
+def uff58(node, direction, values, *, kind=4, even=True, binary=None, date="NONE", unit="N", times=NUMBERS / 100):
+    """One dataset 58 as its definition has it."""
+    head = [
+        f"    58{'' if binary is None else 'b'}",
+        "Signal of a test".ljust(80),
+        "NONE",
+        date,
+        "NONE",
+        "NONE",
+        f"{1:5d}{0:10d}{0:5d}{0:10d} {'NONE':>10s}{node:10d}{direction:4d} {'NONE':>10s}{0:10d}{0:4d}",
+        f"{kind:10d}{len(values):10d}{int(even):10d}{times[0]:13.5E}{0.01:13.5E}{0:13.5E}",
+        f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':>20s} {'s':>20s}",
+        f"{13:10d}{0:5d}{0:5d}{0:5d} {'Force':>20s} {unit:>20s}",
+        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
+        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
+    ]
+    if binary is not None:
+        data = np.asarray(values, dtype=f"{binary}{'f8' if kind == 4 else 'f4'}").tobytes()
+        head[0] += f"{1 if binary == '<' else 2:6d}{2:6d}{11:12d}{len(data):12d}{0:6d}{0:6d}{0:12d}{0:12d}"
+        body = data + b"\n"
+    else:
+        if not even:
+            cells = [
+                f"{t:13.5E}" + (f"{v:20.12E}" if kind == 4 else f"{v:13.5E}")
+                for t, v in zip(times, values, strict=True)
+            ]
+            per_line = 2 if kind == 4 else 3
+        else:
+            cells = [f"{v:20.12E}" if kind == 4 else f"{v:13.5E}" for v in values]
+            per_line = 4 if kind == 4 else 6
+        lines = ["".join(cells[i : i + per_line]) for i in range(0, len(cells), per_line)]
+        body = ("\n".join(lines) + "\n").encode()
+    return b"    -1\n" + "\n".join(head).encode() + b"\n" + body + b"    -1\n"

@@ -17,7 +17,8 @@ from sprung.model.system import System
 from sprung.service.layout import Layout, Point, lay_out
 from sprung.service.report import ink
 
-WIDTH = 10.5  # in
+WIDTH, NARROWEST, TALLEST = 10.5, 3.2, 5.6  # in
+WORDS_BESIDE = 3.6  # in, of what was found
 BODY = "#dfe6ec"
 LINE = "#52606d"
 
@@ -142,7 +143,11 @@ def draw_system(system: System, findings: Mapping[str, str], scores: Mapping[str
         _call_out(axes, layout, places, findings)
         left, right = axes.get_xlim()
         low, high = axes.get_ylim()
-        figure.set_size_inches(WIDTH, min(max(WIDTH * (high - low) / (right - left), 2.6), 5.6))
+        height = min(max(WIDTH * (high - low) / (right - left), 2.6), TALLEST)
+        # what is taller than wide fills its picture, with room for words at its right: half of it is seen on a phone
+        needed = height * (right - left) / (high - low) + (WORDS_BESIDE if findings else 0.3)
+        figure.set_size_inches(min(max(needed, NARROWEST), WIDTH), height)
+        axes.set_anchor("W" if findings and layout.slant == 0 else "C")
     return figure
 
 

@@ -27,7 +27,7 @@ from sprung.replay.record import load_record
 from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
 from tests.fuzz.mutate import INSIDE, mutant
-from tests.fuzz.seeds import CHECKED, GROUPED, SEEDS, START, TABLE, TIMES, VALUES
+from tests.fuzz.seeds import CHECKED, GROUPED, SEEDS, START, TABLE, TIMES, UNIVERSAL, VALUES
 from tests.replay_files import database
 
 SECONDS = 20.0  # of processor time that one mutant may take
@@ -98,7 +98,7 @@ def _one(path: Path, dbc: Any, honest: bool, outcome: MutantOutcome) -> None:
     previous = signal.signal(signal.SIGPROF, _hang)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
-        channels = GROUPED if path.suffix == ".tdms" else TABLE
+        channels = {".tdms": GROUPED, ".uff": UNIVERSAL}.get(path.suffix, TABLE)
         recording = open_recording(path, channels, dbc=dbc)
         blocks = list(recording.blocks())
         _windows(blocks)

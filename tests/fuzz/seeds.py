@@ -18,6 +18,7 @@ from tests.replay_files import (
     START,
     TIMES,
     VALUES,
+    uff58,
     write_can,
     write_csv,
     write_json,
@@ -27,6 +28,7 @@ from tests.replay_files import (
 
 TABLE = [Channel(c.name, c.unit, c.noise, c.mcap, c.can, c.csv, column=c.csv) for c in CHANNELS]
 GROUPED = [Channel(c.name, c.unit, c.noise, column=f"group/{c.csv}") for c in CHANNELS]  # as TDMS names them
+UNIVERSAL = [Channel(c.name, c.unit, c.noise, column=name) for c, name in zip(CHANNELS, ("12+Z", "7-X"), strict=True)]
 SECONDS = NUMBERS / 100
 COLUMNS = {"time": SECONDS, "left": LEFT, "right": RIGHT}
 
@@ -69,6 +71,10 @@ def _tdms(path: Path) -> None:
         writer.write_segment([ChannelObject("group", name, values) for name, values in COLUMNS.items()])
 
 
+def _uff(path: Path) -> None:
+    path.write_bytes(uff58(12, 3, LEFT, unit="m/s2", times=SECONDS) + uff58(7, -1, RIGHT, unit="m/s2", times=SECONDS))
+
+
 def _tab(path: Path) -> None:
     rows = [f"{s:.2f}\t{x}\t{y}".replace(".", ",") for s, x, y in zip(SECONDS, LEFT, RIGHT, strict=True)]
     path.write_text("\n".join(["# made for tests", "time [s]\tleft\tright", *rows]) + "\n", encoding="cp1252")
@@ -91,9 +97,10 @@ SEEDS: dict[str, tuple[str, Callable[[Path], None]]] = {  # name -> file name, w
     "parquet": ("a.parquet", _parquet),
     "hdf5": ("a.h5", _hdf5),
     "tdms": ("a.tdms", _tdms),
+    "uff": ("a.uff", _uff),
     "mf4": ("a.mf4", write_can),
 }
 CHECKED = ("mcap", "mcap-lz4", "mcap-plain", "blf")  # every sample is under a checksum that the reader verifies
 NEEDS = {"parquet": "pyarrow", "hdf5": "h5py", "tdms": "nptdms", "mf4": "asammdf"}  # optional packages
 
-__all__ = ["CHECKED", "GROUPED", "NEEDS", "SEEDS", "START", "TABLE", "TIMES", "VALUES"]
+__all__ = ["CHECKED", "GROUPED", "NEEDS", "SEEDS", "START", "TABLE", "TIMES", "UNIVERSAL", "VALUES"]

@@ -12,6 +12,7 @@ from sprung.replay import UnreadableRecording, open_recording, series
 from sprung.replay.extras import needed
 from sprung.replay.record import load_record
 from tests.replay.test_tables import SECONDS, START, VALUES, F, X, check, read
+from tests.replay_files import uff58
 
 h5py = pytest.importorskip("h5py")
 pa = pytest.importorskip("pyarrow")
@@ -47,6 +48,22 @@ def write_parquet(path):
 
 def write_json(path):
     path.write_text(json.dumps({name: values.tolist() for name, values in COLUMNS.items()}))
+
+
+def test_a_number_beyond_all_floats_costs_itself(tmp_path):
+    text = json.dumps({name: values.tolist() for name, values in COLUMNS.items()})
+    first = json.dumps(VALUES[0, 0])
+    (tmp_path / "a.json").write_text(text.replace(f'"x": [{first}', f'"x": [{"9" * 400}', 1))
+    x, f = Channel("x", "m", 1.0, column="x"), Channel("F", "N", 1.0, column="F")
+    _, values, _ = read(tmp_path / "a.json", (x, f))
+    assert np.isnan(values[0, 0])
+    np.testing.assert_array_equal(values[1:, 0], VALUES[1:, 0])
+
+
+def test_a_series_that_is_there_twice_is_refused(tmp_path):
+    (tmp_path / "a.json").write_text('{"time": [0.0, 0.01], "x": [1.0, 2.0], "x": [9.0, 9.0]}')
+    with pytest.raises(UnreadableRecording, match="'x' is there twice"):
+        read(tmp_path / "a.json", (Channel("x", "m", 1.0, column="x"),))
 
 
 WRITERS = {
@@ -150,41 +167,6 @@ def test_tdms_waveforms_have_their_own_clock(tmp_path):
         objects = [nptdms.ChannelObject("g", name, values) for name, values in COLUMNS.items()]
         writer.write_segment(objects)
     check(tmp_path / "b.tdms", (Channel("x", "m", 1.0, column="g/x"), Channel("F", "N", 1.0, column="g/F")))
-
-
-def uff58(node, direction, values, *, kind=4, even=True, binary=None, date="NONE", unit="N", times=SECONDS):
-    """One dataset 58 as its definition has it."""
-    head = [
-        f"    58{'' if binary is None else 'b'}",
-        "Signal of a test".ljust(80),
-        "NONE",
-        date,
-        "NONE",
-        "NONE",
-        f"{1:5d}{0:10d}{0:5d}{0:10d} {'NONE':>10s}{node:10d}{direction:4d} {'NONE':>10s}{0:10d}{0:4d}",
-        f"{kind:10d}{len(values):10d}{int(even):10d}{times[0]:13.5E}{0.01:13.5E}{0:13.5E}",
-        f"{17:10d}{0:5d}{0:5d}{0:5d} {'Time':>20s} {'s':>20s}",
-        f"{13:10d}{0:5d}{0:5d}{0:5d} {'Force':>20s} {unit:>20s}",
-        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
-        f"{0:10d}{0:5d}{0:5d}{0:5d} {'NONE':>20s} {'NONE':>20s}",
-    ]
-    if binary is not None:
-        data = np.asarray(values, dtype=f"{binary}{'f8' if kind == 4 else 'f4'}").tobytes()
-        head[0] += f"{1 if binary == '<' else 2:6d}{2:6d}{11:12d}{len(data):12d}{0:6d}{0:6d}{0:12d}{0:12d}"
-        body = data + b"\n"
-    else:
-        if not even:
-            cells = [
-                f"{t:13.5E}" + (f"{v:20.12E}" if kind == 4 else f"{v:13.5E}")
-                for t, v in zip(times, values, strict=True)
-            ]
-            per_line = 2 if kind == 4 else 3
-        else:
-            cells = [f"{v:20.12E}" if kind == 4 else f"{v:13.5E}" for v in values]
-            per_line = 4 if kind == 4 else 6
-        lines = ["".join(cells[i : i + per_line]) for i in range(0, len(cells), per_line)]
-        body = ("\n".join(lines) + "\n").encode()
-    return b"    -1\n" + "\n".join(head).encode() + b"\n" + body + b"    -1\n"
 
 
 UNITS_DATASET = b"    -1\n   164\n         1SI: m N s            2\n  1.0  1.0  1.0\n    -1\n"

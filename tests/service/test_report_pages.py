@@ -159,6 +159,14 @@ def test_the_drawing_stacks_the_car_on_the_bogies_on_the_wheels() -> None:
     assert level["bogie1"] == level["bogie2"] == 1
 
 
+def test_the_drawing_of_a_narrow_rig_is_no_wider_than_it_needs_to_be() -> None:
+    rig = load_system(Path(__file__).parents[2] / "benchmarks/systems/quarter_car.yaml")
+    plain, found = (draw_system(rig, {name: "some words" for name in names}, {}) for names in ([], ["strut"]))
+    width, height = plain.get_size_inches()
+    assert width < 0.7 * height  # half of a phone's screen, not the middle of a page that is wider than it
+    assert width < found.get_size_inches()[0] < draw_system(SYSTEM, {}, {}).get_size_inches()[0]
+
+
 @pytest.mark.parametrize(
     "place", ["secondary_1r", "car", "bogie1_2r", "wheel_21l.velocity", "wheel_21l|wheel_21r", "nowhere"]
 )
