@@ -72,27 +72,29 @@ def test_every_route_refuses_whoever_has_no_business_there(client: TestClient, c
     make = core.tokens.create
     everything, _ = make("boss", ["admin"])
     nothing_of_it = {scope: make(scope, [scope])[0] for scope in ("read", "ingest", "operate", "admin")}
-    _, dead = make("dead", ["admin"])
+    revoked, dead = make("dead", ["admin"])
     ended, row = make("ended", ["admin"], days=1)
     with core.store.write() as connection:
         tokens.expire(connection, row.id, 1)
         tokens.revoke(connection, dead.id, 1)
     core.tokens._forget()
     north, _ = make("north", ["admin"], fleet="north-")
-    table = routes(client)
+    table, asked = routes(client), 0
     for method, template in table:
         path, need = concrete(template), need_of(method, concrete(template))
         if path in ("/events", "/debug/profile", "/signin"):
             continue  # the first answer for ever, or for seconds; their needs are those of the table
 
         def status(token: str | None, method: str = method, path: str = path) -> int:
+            nonlocal asked
+            asked += 1
             answer = client.request(method, path, headers={} if token is None else bearer(token))
             return answer.status_code
 
         if not need.scope:
             assert status(None) not in (401, 403), (method, path)
             continue
-        for wrong in (None, "rubbish", everything[:-1] + "x", ended):
+        for wrong in (None, "rubbish", everything[:-1] + "x", ended, revoked):
             assert status(wrong) == 401, (method, path, wrong)
         for scope, text in nothing_of_it.items():
             allowed = need.scope in {
@@ -104,6 +106,7 @@ def test_every_route_refuses_whoever_has_no_business_there(client: TestClient, c
             assert status(north) == 404, (method, path)
         elif not need.by_fleet:
             assert status(north) == 403, (method, path)
+    print(f"{asked} requests on {len(table)} routes")  # with pytest -s; docs/reliability.md names them
 
 
 def test_a_route_that_nobody_thought_of_needs_the_most() -> None:
