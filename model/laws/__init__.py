@@ -43,6 +43,7 @@ from sprung.model.laws.sensor_faults import (
 )
 from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
 from sprung.model.laws.structure import MISSING_CONNECTION, SUSPENDED_MASS, WRONG_POSITION
+from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,
@@ -64,6 +65,7 @@ CATALOGUE: tuple[Law, ...] = (
     GAS_SPRING,
     PRELOAD,
     AIR_SPRING,
+    FRACTIONAL_STIFFNESS,
     ANTI_ROLL_BAR,
     WHEEL_FLAT,
     RAIL_JOINTS,

@@ -1,0 +1,78 @@
+"""Rubber: a stiffness that grows with the frequency, with damping in proportion, over decades.
+
+A fractional derivative (Bagley and Torvik, 1983), K(w) = k (j w / w1)^a with w1 of 1 Hz, as five Maxwell branches:
+
+    s^a = sin(pi a) / pi  int s / (s + e^u) e^(a u) du  ~  sum_i w_i s / (s + x_i),   w_i = sin(pi a) / pi  D x_i^a
+
+with poles x_i a factor e^D = 5 apart around 3.5 Hz.  What is left out below them is a stiffness and above them a
+damping, which the element's own take up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import lfilter
+
+from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.signals import FloatArray
+
+_APART = 5.0
+_UNIT = 2 * np.pi  # rad/s, of 1 Hz
+_POLES = _UNIT * 3.5 * _APART ** np.arange(-2.0, 3.0)  # 1/s
+
+
+def _weights(stiffness: FloatArray, order: FloatArray) -> list[FloatArray]:
+    """Stiffness of every branch."""
+    size = stiffness * np.sin(np.pi * order) / np.pi * np.log(_APART)
+    return [size * (pole / _UNIT) ** order for pole in _POLES]
+
+
+def _force(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    parts = _weights(*(np.asarray(value, dtype=float) for value in p))
+    found: FloatArray = sum((part * z for part, z in zip(parts, motion.memory, strict=True)), np.zeros(()))
+    return found
+
+
+def _rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    return np.stack([motion.rate - pole * z for pole, z in zip(_POLES, motion.memory, strict=True)])
+
+
+def _decay(p: Values, element: SpringDamper) -> FloatArray:
+    shape = np.shape(p[0])
+    return np.broadcast_to(_POLES.reshape(5, *(1 for _ in shape)), (5, *shape))
+
+
+def _path(motion: Motion, p: Values) -> FloatArray:
+    time, d = np.asarray(motion.time), np.asarray(motion.deflection)
+    step = float(time[1] - time[0])
+    force = np.zeros(len(d))
+    for pole, part in zip(_POLES, _weights(np.asarray(p[0]), np.asarray(p[1])), strict=True):
+        kept = float(np.exp(-pole * step))
+        gain = (1 - kept) / (pole * step)  # of a straight line between samples
+        force += part * lfilter([gain, -gain], [1.0, -kept], d, zi=[-gain * d[0]])[0]
+    return force
+
+
+def _shapes(seen: Observed) -> FloatArray:
+    return grid([0.1 * max(seen.stiffness, 1e-12)], [0.2, 0.35, 0.55])
+
+
+FRACTIONAL_STIFFNESS = ElementLaw(
+    name="fractional_stiffness",
+    title="a stiffness that grows with the frequency (rubber)",
+    parameters=(
+        ParameterSpec("stiffness", "N/m", 0.0, 1e12, "size of the growing part at 1 Hz", lambda s: 0.1 * s.stiffness),
+        ParameterSpec("order", "1", 0.02, 0.95, "power of the frequency", lambda seen: 0.3),
+    ),
+    force=_force,
+    shapes=_shapes,
+    absent=(0.0, 0.3),
+    looks_like="stiffer at every higher frequency and damped everywhere, without a corner; linear",
+    confused_with=("air_spring", "series_stiffness"),
+    sentence="a part of {stiffness} at 1 Hz that grows with the frequency to the power {order}",
+    memory=5,
+    memory_rate=_rate,
+    memory_decay=_decay,
+    path=_path,
+    prior_cost=RARE,
+)

@@ -1,0 +1,60 @@
+"""A stiffness that grows with the frequency as a power of it; truth from the exact response, frequency by frequency."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
+
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.laws import SpringDamper, find_law
+from sprung.model.laws.along import force_along
+
+SIZE, ORDER = 6.0e4, 0.4
+
+
+def ride(stiffness: float, order: float, seconds: float = 30.0, seed: int = 3) -> MadeRecord:
+    """Steady running on a road of random phases, 0.5 to 18 Hz, with K(w) = stiffness (j w / 2 pi)^order beside the
+    secondary spring."""
+    rng = np.random.default_rng(seed)
+    f = np.linspace(0.5, 18, 160)
+    s = 2j * np.pi * f
+    w = 6e-4 / f * np.exp(1j * rng.uniform(0, 2 * np.pi, len(f)))
+    upper = STIFFNESS["secondary"] + s * DAMPING["secondary"] + stiffness * (s / (2 * np.pi)) ** order
+    lower = STIFFNESS["primary"] + s * DAMPING["primary"]
+    system = np.array([[8000 * s**2 + upper, -upper], [-upper, 1300 * s**2 + upper + lower]])
+    car, bogie = np.linalg.solve(system.transpose(2, 0, 1), np.stack([0 * f, lower * w], axis=1)[..., None])[..., 0].T
+    wave = np.exp(2j * np.pi * np.arange(int(seconds * 100))[:, None] / 100 * f)
+    shown = np.column_stack([np.real(wave @ x) for x in (w, s * w, *[s**2 * car] * 2, *[s**2 * bogie] * 2)])
+    return MadeRecord(shown + rng.standard_normal(shown.shape) * np.array([1e-5, 5e-4, 4e-3, 4e-3, 3e-2, 3e-2]))
+
+
+def test_the_branches_follow_the_power_beside_a_spring_and_a_damper():
+    """Over the band of a suspension, what a spring and a damper take up apart."""
+    law, time = find_law("fractional_stiffness"), np.arange(0, 80, 0.002)
+    frequency = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
+    error = []
+    for f in frequency:
+        d = np.sin(2 * np.pi * f * time)
+        force = force_along(law, (1.0, 0.3), d, np.gradient(d, time), time, SpringDamper(1.0, 1.0))
+        late = time >= 40
+        wave = np.exp(-2j * np.pi * f * time[late])
+        error.append(np.sum(force[late] * wave) / np.sum(d[late] * wave) - (1j * f) ** 0.3)
+    own = np.concatenate(
+        [np.real(error) - np.mean(np.real(error)), np.imag(error) - frequency * _slope(frequency, error)]
+    )
+    assert np.sqrt(np.mean(own**2)) < 0.03
+
+
+def _slope(frequency: np.ndarray, error: list[complex]) -> float:
+    return float(frequency @ np.imag(error) / (frequency @ frequency))
+
+
+def test_a_stiffness_that_grows_with_the_frequency_is_named_with_its_power():
+    report = diagnose(quarter_car(), ride(SIZE, ORDER), Options())
+    assert report.verdict == "missing_physics"
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("secondary", "fractional_stiffness")
+    values = {p.name: p for p in finding.parameters}
+    assert values["order"].value == pytest.approx(ORDER, abs=max(0.05, 4 * values["order"].std))
+    assert report.unexplained.share < 0.05
