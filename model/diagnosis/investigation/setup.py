@@ -25,10 +25,11 @@ from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.screening.elements import element_candidates
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.screening.structures import structure_candidates
-from sprung.model.diagnosis.selection.compete import start_of
-from sprung.model.laws import StructureLaw
+from sprung.model.diagnosis.selection.compete import compete, start_of
+from sprung.model.laws import ElementLaw, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -66,11 +67,19 @@ def without_setup_faults(
 
 
 def _left_beside_a_part(problem: Problem, fit: Fit) -> float:
-    """Misfit of all sensors beside the best of the parts that a file may lack: then nothing of it is set up wrongly."""
-    laws = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
-    hits = [hit for hit, _ in structure_candidates(Projector(problem, fit), laws)]
-    best = sorted(hits, key=lambda hit: -hit.score)[: problem.rules.setup.parts]
-    fits = [try_optimise(problem, start_of(fit, hit), problem.rules.setup.part_steps) for hit in best]
+    """Misfit of all sensors beside the best of the parts that a file may lack: then nothing of it is set up wrongly.
+
+    Parts of the structure, and springs and dampers in series: linear as a wrong set-up is, and as gross.
+    """
+    rules, projector = problem.rules.setup, Projector(problem, fit)
+    structures = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
+    hits = [hit for hit, _ in structure_candidates(projector, structures)]
+    best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
+    fits = [try_optimise(problem, start_of(fit, hit), rules.part_steps) for hit in best]
+    series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.memory_decay)
+    hits = [hit for hit, _ in element_candidates(projector, series) if hit.term.law in series]
+    best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
+    fits += [trial.fit for trial in compete(problem, fit, best)]
     return min((float(np.sum(misfit(one))) for one in fits if one is not None), default=np.inf)
 
 

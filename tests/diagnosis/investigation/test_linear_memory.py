@@ -1,6 +1,8 @@
-"""A stiffness that grows with the frequency as a power of it; truth from the exact response, frequency by frequency."""
+"""Elements with a linear memory: rubber, a damper behind a spring; truth from the exact response at every frequency."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -11,17 +13,16 @@ from sprung.model.laws import SpringDamper, find_law
 from sprung.model.laws.along import force_along
 
 SIZE, ORDER = 6.0e4, 0.4
+K, C = STIFFNESS["secondary"], DAMPING["secondary"]
 
 
-def ride(stiffness: float, order: float, seconds: float = 30.0, seed: int = 3) -> MadeRecord:
-    """Steady running on a road of random phases, 0.5 to 18 Hz, with K(w) = stiffness (j w / 2 pi)^order beside the
-    secondary spring."""
+def ride(of: Callable[[np.ndarray], np.ndarray], seconds: float = 30.0, seed: int = 3) -> MadeRecord:
+    """Steady running on a road of random phases, 0.5 to 18 Hz; of: dynamic stiffness of the secondary element at s."""
     rng = np.random.default_rng(seed)
     f = np.linspace(0.5, 18, 160)
     s = 2j * np.pi * f
     w = 6e-4 / f * np.exp(1j * rng.uniform(0, 2 * np.pi, len(f)))
-    upper = STIFFNESS["secondary"] + s * DAMPING["secondary"] + stiffness * (s / (2 * np.pi)) ** order
-    lower = STIFFNESS["primary"] + s * DAMPING["primary"]
+    upper, lower = of(s), STIFFNESS["primary"] + s * DAMPING["primary"]
     system = np.array([[8000 * s**2 + upper, -upper], [-upper, 1300 * s**2 + upper + lower]])
     car, bogie = np.linalg.solve(system.transpose(2, 0, 1), np.stack([0 * f, lower * w], axis=1)[..., None])[..., 0].T
     wave = np.exp(2j * np.pi * np.arange(int(seconds * 100))[:, None] / 100 * f)
@@ -51,10 +52,18 @@ def _slope(frequency: np.ndarray, error: list[complex]) -> float:
 
 
 def test_a_stiffness_that_grows_with_the_frequency_is_named_with_its_power():
-    report = diagnose(quarter_car(), ride(SIZE, ORDER), Options())
+    report = diagnose(quarter_car(), ride(lambda s: K + C * s + SIZE * (s / (2 * np.pi)) ** ORDER), Options())
     assert report.verdict == "missing_physics"
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("secondary", "fractional_stiffness")
     values = {p.name: p for p in finding.parameters}
     assert values["order"].value == pytest.approx(ORDER, abs=max(0.05, 4 * values["order"].std))
     assert report.unexplained.share < 0.05
+
+
+@pytest.mark.slow
+def test_a_damper_that_gives_way_much_is_no_late_node():
+    report = diagnose(quarter_car(), ride(lambda s: K + C * s / (1 + C * s / 1.5e6), seed=5), Options())
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("secondary", "series_stiffness")
+    assert finding.parameters[0].value == pytest.approx(1.5e6, rel=0.02)
