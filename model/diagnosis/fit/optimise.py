@@ -204,6 +204,8 @@ def _begun_anew(problem: Problem, state: _State) -> _State:
     where they do not act at all, they would go to where the prior is.
     """
     columns = state.lin.jacobian[:, -len(state.point.state) :]
+    if not (np.isfinite(columns).all() and np.isfinite(state.lin.residual).all()):
+        return state  # gone astray: judged by its value
     step = np.linalg.lstsq(columns, state.lin.residual, rcond=None)[0]
     other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
     return other if other.value < state.value else state
