@@ -8,6 +8,7 @@ import re
 import shutil
 import socket
 import subprocess
+import sys
 import threading
 import time
 import urllib.error
@@ -33,6 +34,7 @@ from tests.service_fakes import make_window
 
 DEPLOY = Path(__file__).parents[2] / "deploy"
 RULES = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.yml").read_text())["groups"][0]["rules"]
+MKDOCS = shutil.which("mkdocs", path=str(Path(sys.executable).parent))  # CI does not activate its environment
 MAY_BE_EMPTY = {"Alarms"}  # an annotation: alarms that opened within the last minute
 
 
@@ -186,10 +188,11 @@ def test_every_query_of_panels_variables_and_rules_is_answered(prometheus: str) 
     assert {alert["metric"]["alertname"] for alert in ask(prometheus, "ALERTS")} >= {"SprungSuspensionChanged"}
 
 
-@pytest.mark.skipif(shutil.which("mkdocs") is None, reason="needs mkdocs, as `make docs` installs it")
+@pytest.mark.skipif(MKDOCS is None, reason="needs mkdocs, as `make docs` installs it")
 def test_the_site_of_the_documents_asks_no_other_host(tmp_path: Path) -> None:
     root = DEPLOY.parent
-    command = ["mkdocs", "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    assert MKDOCS is not None
+    command = [MKDOCS, "build", "--quiet", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     pages = list((tmp_path / "site").rglob("*.html"))
