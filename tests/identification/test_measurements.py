@@ -203,3 +203,15 @@ def test_a_declared_load_leaves_the_weights_usable():
     assert loaded.loads[0].declared
     assert loaded.loads[0].name == "car.load"
     assert loaded.digest == load_system().digest
+
+
+@pytest.mark.parametrize(("speed", "heard"), [(6.0, False), (35.0, True)])
+def test_gains_are_not_read_off_inputs_that_are_mostly_noise(system, identifier, speed, heard):
+    """At walking pace the model answers to the noise of the inputs, which sensors do not show: their gains would seem
+    too small."""
+    rng = np.random.default_rng(12)
+    runs = simulate_runs(system, np.zeros((12, 24)), system.window, rng, speed=(speed, 1.0001 * speed))
+    estimates = identifier.examine(runs.values, np.ones(12, dtype=bool))
+    assert all(e.deviating is None or e.deviating.whole == heard for e in estimates)
+    assert all(e.adequate for e in estimates)
+    assert not any(e.faults for e in estimates)
