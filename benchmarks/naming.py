@@ -92,10 +92,10 @@ def judged(rig: RigKind, motion: str, seed: list[int]) -> dict[str, Any]:
     record = measured(d, forces(rig, d, drawn, signal), signal if rig.signal else None, random)
     try:
         report = diagnose(SIGNALLED if rig.signal else BENCH, record, Options(file=motion))
-    except DiagnosisError as error:
-        return {"judged": "refused", "said": str(error)}
+    except DiagnosisError as refused:
+        return {"judged": "refused", "said": str(refused)}
     found = [f for f in report.findings if f.effect != "preload"]
-    line = {
+    line: dict[str, Any] = {
         "verdict": report.verdict,
         "said": {f.effect: {p.name: [p.value, p.std] for p in (*f.parameters, *f.quoted)} for f in found},
         "held_out_before": report.baseline_validation.nrmse,
@@ -154,8 +154,9 @@ def forces(rig: RigKind, deflection: Array, drawn: int, signal: Array) -> Array:
     h = 1 / (RATE * FINER)
     rate = np.gradient(fine, h)
     found = np.array([step(x, v, h) for x, v in zip(fine.tolist(), rate.tolist(), strict=True)])[::FINER]
-    linear: Array = preload + k * deflection + c * rate[::FINER]
-    return linear + (signal * found if rig.signal else found)
+    linear = preload + k * deflection + c * rate[::FINER]
+    total: Array = linear + (signal * found if rig.signal else found)
+    return total
 
 
 def _linear(random: np.random.Generator) -> tuple[float, float, float]:
@@ -253,7 +254,8 @@ def _bouc_wen(random: np.random.Generator) -> SimulatedRig:
 
     def step(x: float, v: float, h: float) -> float:
         nonlocal z
-        z += h / reach * (v - (0.7 * abs(v) * abs(z) ** (n - 1) * z + 0.3 * v * abs(z) ** n))
+        size: float = abs(z) ** (n - 1)
+        z += h / reach * (v - size * (0.7 * abs(v) * z + 0.3 * v * abs(z)))
         return force * z
 
     return SimulatedRig(step, {"yield_force": force, "yield_displacement": reach})
@@ -324,7 +326,8 @@ def _menegotto_pinto(random: np.random.Generator) -> SimulatedRig:
             x1 = (line - f0 + k * x0) / (k - b * k)
             f1 = line + b * k * x1
         e = (x - x0) / (x1 - x0)
-        last_x, last_f = x, f0 + (f1 - f0) * (b * e + (1 - b) * e / (1 + abs(e) ** r) ** (1 / r))
+        rounded: float = e / (1 + abs(e) ** r) ** (1 / r)
+        last_x, last_f = x, f0 + (f1 - f0) * (b * e + (1 - b) * rounded)
         return last_f
 
     return SimulatedRig(step)

@@ -70,7 +70,7 @@ def without_slow(series: FloatArray, sample_rate: float, lowest: float) -> Float
 def _mirrored(series: FloatArray, sample_rate: float) -> tuple[FloatArray, FloatArray]:
     """A series continued at both ends by its mirror image, and the frequencies of its spectrum, Hz."""
     whole = np.concatenate([series[:0:-1], series, series[-2::-1]])
-    return whole, np.fft.rfftfreq(len(whole), 1 / sample_rate)
+    return whole, np.asarray(np.fft.rfftfreq(len(whole), 1 / sample_rate), dtype=np.float64)
 
 
 def _passed(frequency: FloatArray, lowest: float) -> FloatArray:
