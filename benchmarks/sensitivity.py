@@ -116,7 +116,7 @@ def run(
     stage: of the rules, if only one is asked for.
     folder: where numbers that are done are kept; on the same recording and engine they are not varied again.
     part: "2/3": only every third recording, the second first, for processes beside each other with one folder.
-    write: file for what was found, which the reasons of the rules quote.
+    write: file for what was found, which the reasons of the rules quote; what it knows of more recordings stays.
     """
     count = count or {"quick": 8, "cases": 28, "full": 40}[budget]
     seconds = seconds or (60.0 if budget == "full" else 15.0)
@@ -135,7 +135,8 @@ def run(
     lines = [figure(key, one, done) for key, one in keys]
     yield from lines
     if write is not None:
-        write.write_text(quoted(lines, done, budget), encoding="utf-8")
+        before = json.loads(write.read_text(encoding="utf-8"))["numbers"] if write.exists() else {}
+        write.write_text(quoted(lines, done, budget, before), encoding="utf-8")
     yield {
         "numbers": len(lines),
         "that_change_something": sum(bool(line["changed"]) for line in lines),
@@ -223,8 +224,13 @@ def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[s
     }
 
 
-def quoted(lines: list[dict[str, Any]], done: list[dict[str, Any]], budget: str) -> str:
-    """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end."""
+def quoted(
+    lines: list[dict[str, Any]], done: list[dict[str, Any]], budget: str, before: dict[str, Any] | None = None
+) -> str:
+    """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
+
+    before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that.
+    """
     numbers = {
         f"{line['stage']}.{line['number']}": {
             "varied": [line["value"], *line["range"]],
@@ -234,6 +240,12 @@ def quoted(lines: list[dict[str, Any]], done: list[dict[str, Any]], budget: str)
         for line in lines
         if line["recordings"]
     }
+    for line in lines:
+        name = f"{line['stage']}.{line['number']}"
+        known = (before or {}).get(name)
+        same = known is not None and known["varied"] == [line["value"], *line["range"]]
+        if same and known["recordings"] > line["recordings"]:
+            numbers[name] = known
     head = {"set": f"{len(done)} recordings ({budget})", "recordings": [one["recording"] for one in done]}
     rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())
     return f'{json.dumps(head)[:-1]},\n "numbers": {{\n{rows}\n}}}}\n'

@@ -31,9 +31,9 @@ def reason(stage: str, number: Field[Any]) -> str:
     if found is None or found["varied"] != [number.default, low, high]:
         told = "not varied as it is now"
     elif found["changes"]:
-        told = f"on {_varied()['set']} changes {'; '.join(found['changes'])}"
+        told = f"on {found['recordings']} recordings changes {'; '.join(found['changes'])}"
     else:
-        told = f"on {_varied()['set']} insensitive from {low:g} to {high:g}"
+        told = f"on {found['recordings']} recordings insensitive from {low:g} to {high:g}"
     return f"{number.metadata['reason']}; {told}"
 
 

@@ -99,3 +99,13 @@ def test_what_is_quoted_of_a_run_is_json_of_every_number_that_was_varied() -> No
     assert list(found["numbers"]) == ["verdict.clear"]
     (change,) = found["numbers"]["verdict.clear"]["changes"]
     assert change == "at 2 the verdict in made: missing_physics -> consistent"
+
+
+def test_what_is_known_of_more_recordings_stays_while_the_number_is_what_it_was() -> None:
+    done = [{"recording": "made", "varied": {"verdict.clear": varied("verdict", "clear")}}]
+    lines = [figure(stage, field, done) for stage, field in RULES.constants()]
+    known = {"varied": [1.5, 1.25, 2.0], "recordings": 8, "changes": []}
+    other = known | {"varied": [1.4, 1.25, 2.0]}
+    for before, kept in (({"verdict.clear": known}, 8), ({"verdict.clear": other}, 1), ({}, 1)):
+        found = json.loads(quoted(lines, done, "quick", before))
+        assert found["numbers"]["verdict.clear"]["recordings"] == kept
