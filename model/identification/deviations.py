@@ -25,6 +25,7 @@ class Deviation:
     kind: Kind
     std: float  # what the data sheet leaves open: relative, or s; of loads see `model.simulate.loading`
     group: int  # channels that share a clock have the same number; -1 for a load
+    node: int = -1  # clocks of one node have the same number; -1: not known
 
 
 def deviations(system: System) -> tuple[Deviation, ...]:
@@ -33,11 +34,10 @@ def deviations(system: System) -> tuple[Deviation, ...]:
     if tracks or not system.bodies:
         return ()  # unmeasured tracks and component tests have identifiers of their own
     channels = system.channels
-    groups = clock_groups(system)
-    stated = system.tolerances
+    clocks = list(zip(channels, system.tolerances, clock_groups(system), nodes(system), strict=True))
     return (
-        *(Deviation(c.name, "gain", t.gain, g) for c, t, g in zip(channels, stated, groups, strict=True)),
-        *(Deviation(c.name, "delay", t.delay, g) for c, t, g in zip(channels, stated, groups, strict=True)),
+        *(Deviation(c.name, "gain", t.gain, g, n) for c, t, g, n in clocks),
+        *(Deviation(c.name, "delay", t.delay, g, n) for c, t, g, n in clocks),
         *(Deviation(term.body, term.kind, term.std, -1) for term in load_terms(system)),
     )
 
@@ -51,6 +51,16 @@ def clock_groups(system: System) -> IntArray:
         message = address.rpartition(".")[0] if address else f"\0{channel.unit}"
         groups.append(found.setdefault(message, len(found)))
     return np.array(groups, dtype=np.int64)
+
+
+def nodes(system: System) -> IntArray:
+    """Topics with one beginning come from one node: `/bogie1/acceleration`, `/bogie1/axlebox/velocity`; shape (C,)."""
+    found: dict[str, int] = {}
+    numbers = []
+    for channel in system.channels:
+        topic = (channel.mcap or "").strip("/").partition("/")
+        numbers.append(found.setdefault(topic[0], len(found)) if topic[1] else -1)
+    return np.array(numbers, dtype=np.int64)
 
 
 def named(

@@ -78,7 +78,10 @@ class DeviationModel:
 
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
-    """Delays of one clock share most of their variance; everything else is independent."""
+    """Delays of one clock share most of their variance; everything else is independent.
+
+    A jump is looked for along each deviation, along the delays of a clock, and along those of all clocks of a node.
+    """
     H = len(deviations)
     kinds = tuple(d.kind for d in deviations)
     std = np.array([d.std for d in deviations], dtype=np.float64)
@@ -94,6 +97,11 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
         members = (late & (group == number)).astype(float)
         if members.sum() > 1:
             rows.append(members)
+    node = np.array([d.node for d in deviations], dtype=np.int64)
+    for number in np.unique(node[late & (node >= 0)]):
+        members = late & (node == number)
+        if len(np.unique(group[members])) > 1:  # of one clock alone it is there already
+            rows.append(members.astype(float))
     loads = np.array([kind == "load" for kind in kinds], dtype=bool)
     cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
     return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H), loads, cargo)
@@ -129,21 +137,21 @@ def start(parameters: int, model: DeviationModel) -> DeviationRecord:
 
 
 def grown(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tuple[DeviationRecord, Belief]:
-    """Of a state of an older format, which did not know the last of the model's deviations yet."""
-    old, H = belief.deviations, model.size
+    """Of an older state, which did not know the last of the model's deviations, or of its directions, yet."""
+    old, H, V = belief.deviations, model.size, len(model.directions)
+    zeros = np.zeros(V)
+    if len(record.slope) != V:
+        record = replace(record, slope=zeros, curvature=zeros, since=zeros.astype(np.int64))
     if old >= H:
         return record, belief
     more, first = H - old, len(belief.mean)
     covariance = np.zeros((first + more, first + more))
     covariance[:first, :first] = belief.covariance
     covariance[first:, first:] = model.prior[old:, old:]
-    groups = len(model.directions) - H
     wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
     longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved")}
-    zeros = np.zeros(H + groups)
-    without_evidence = replace(record, slope=zeros, curvature=zeros, since=zeros.astype(np.int64))
     return (
-        replace(without_evidence, **wider, **longer),
+        replace(record, **wider, **longer),
         Belief(np.pad(belief.mean, (0, more)), covariance, H),
     )
 

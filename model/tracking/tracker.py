@@ -142,7 +142,8 @@ class Tracker:
     def _whole(self, state: TrackerState) -> TrackerState:
         """One of an older format, or of a pooled prior that is gone, knows nothing of weather, pressures, centres."""
         calibration, belief = dev.grown(state.calibration, state.belief, self.model)
-        state = replace(state, calibration=calibration, belief=belief) if belief is not state.belief else state
+        if calibration is not state.calibration:
+            state = replace(state, calibration=calibration, belief=belief)
         known = state.weather is not None and len(state.weather.common) == self.weather.groups
         loads = int(self.model.loads.sum())
         if known and state.cargo is not None and len(state.cargo.constant) == loads:

@@ -97,3 +97,21 @@ def test_a_state_that_did_not_know_how_loads_are_spread_goes_on():
     assert [r.baseline for r in now] == pytest.approx([r.baseline for r in before], rel=1e-3)
     assert [f.channel for f in new.sensors(after)] == ["c0"]
     assert TrackerState.from_dict(after.to_dict()).to_dict() == after.to_dict()
+
+
+def test_a_jump_is_looked_for_along_all_clocks_of_a_node_together():
+    model = dev.model_of([Deviation(f"c{i}", "delay", 5e-3, i // 2, i // 4) for i in range(6)])
+    directions = {tuple(np.flatnonzero(row)) for row in model.directions}
+    assert {(0, 1), (2, 3), (4, 5), (0, 1, 2, 3)} <= directions
+    assert len(model.directions) == 6 + 3 + 1  # the second node has one clock, which is there already
+
+
+def test_evidence_of_a_state_that_knew_fewer_directions_begins_anew():
+    rng, old = np.random.default_rng(5), make()
+    state = old.initial_state()
+    for k in range(40):
+        state = old.update(state, told(rng, 4, np.zeros(4)), EPOCH + k * SECOND)
+    new = make([Deviation(f"c{i}", "delay", 5e-3, i // 2, 0) for i in range(4)])
+    after = new.update(state, told(rng, 4, np.zeros(4)), EPOCH + 40 * SECOND)
+    assert after.used == state.used + 1
+    assert len(after.calibration.slope) == len(new.model.directions) != len(state.calibration.slope)
