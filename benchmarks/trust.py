@@ -46,7 +46,9 @@ def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[
     """Each kind of kill its share, in turn; then what each came to."""
     begun = time.monotonic()
     log = place / "kills.jsonl"
-    done = Counter(json.loads(line)["kind"] for line in log.read_text().splitlines()) if log.exists() else Counter()
+    begun_before = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
+    numbers = Counter(line["kind"] for line in begun_before)
+    done = Counter(line["kind"] for line in begun_before if not line.get("too_late"))  # what had ended was not killed
     ride = RestlessRide()
     zygote = Zygote()
     tried = {kind: make(place / kind.replace(" ", "-"), ride, zygote) for kind, make, _ in KILLS}
@@ -54,14 +56,15 @@ def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[
     goals = {kind: -(-kills * share // total) for kind, _, share in KILLS}
     while any(done[kind] < goal for kind, goal in goals.items()):
         kind = min((k for k in goals if done[k] < goals[k]), key=lambda k: done[k] / goals[k])
-        told = tried[kind].kill(random.Random(f"{seed}-{kind}-{done[kind]}"))
-        done[kind] += 1
+        told = tried[kind].kill(random.Random(f"{seed}-{kind}-{numbers[kind]}"))
+        numbers[kind] += 1
+        done[kind] += not told.get("too_late", False)
         with open(log, "a") as file:
-            file.write(json.dumps({"kind": kind, "number": done[kind]} | told) + "\n")
+            file.write(json.dumps({"kind": kind, "number": numbers[kind]} | told) + "\n")
         if seconds and time.monotonic() - begun > seconds:
             break
-    yield {"figure": "kills", "value": sum(done.values()), "asked": kills}
+    yield {"figure": "kills", "value": sum(done.values()), "asked": kills, "too_late": sum((numbers - done).values())}
     for kind, one in tried.items():
-        if done[kind]:
+        if numbers[kind]:
             yield {"figure": kind, "kills": done[kind]} | one.outcome()
     zygote.close()

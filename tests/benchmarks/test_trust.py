@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import random
 import shutil
 import sqlite3
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from sprung.benchmarks import trust
 from sprung.benchmarks.trust_disk import TRACED, ForgetfulDisk, SystemCall, system_calls
 from sprung.benchmarks.trust_kills import LastingCounts, StepKills
 from sprung.benchmarks.trust_ride import RestlessRide
@@ -122,6 +124,31 @@ def test_a_step_that_a_kill_leaves_half_done_is_counted(tmp_path: Path) -> None:
         zygote.close()
     counts = step.outcome()
     assert counts["half"] > 0 and counts["failed_afterwards"] > 0, counts  # it cannot be done again: "x"
+
+
+def test_a_kill_that_came_too_late_is_none_and_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Late:
+        def __init__(self, *_: object) -> None:
+            pass
+
+        def kill(self, rng: random.Random) -> dict[str, object]:
+            return {"too_late": rng.random() < 0.5}
+
+        def outcome(self) -> dict[str, object]:
+            return {}
+
+    class Nobody:
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(trust, "KILLS", (("late", Late, 1),))
+    monkeypatch.setattr(trust, "Zygote", Nobody)
+    first, *_ = trust.run(3, folder=str(tmp_path))
+    second, *_ = trust.run(8, folder=str(tmp_path))
+    assert (first["value"], second["value"]) == (3, 8)
+    lines = [json.loads(line) for line in (tmp_path / "kills.jsonl").read_text().splitlines()]
+    assert [line["number"] for line in lines] == list(range(1, len(lines) + 1))
+    assert second["too_late"] == len(lines) - 8 == sum(line["too_late"] for line in lines) > 0
 
 
 def test_counts_go_on_where_they_were_left(tmp_path: Path) -> None:
