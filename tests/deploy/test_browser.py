@@ -29,6 +29,7 @@ from tests.service_fakes import REPORT, START, make_window
 
 CHROMIUM = shutil.which("chromium")
 PAGES = {"fleet": "/", "vehicle": "/pages/vehicles/car-17", "work": "/pages/work", "signin": "/signin"}
+PAGES |= {"alarms": "/pages/alarms"}
 MOST_BYTES = 300_000  # of the first load of the vehicle's page
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")]
 
@@ -85,7 +86,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1400, 380])
-@pytest.mark.parametrize("name", ["fleet", "vehicle", "work", "signin"])
+@pytest.mark.parametrize("name", PAGES)
 def test_pages_stay_at_home_fit_their_screen_and_say_no_error(
     address: str, browser: Any, name: str, width: int, scheme: str
 ) -> None:
@@ -131,11 +132,12 @@ def test_the_first_load_of_a_vehicle_is_light(address: str, browser: Any) -> Non
     page.close()
 
 
-@pytest.mark.parametrize("name", ["fleet", "vehicle", "work", "signin"])
+@pytest.mark.parametrize("name", PAGES)
+@pytest.mark.parametrize("width", [1400, 380])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing_serious(address: str, browser: Any, name: str, scheme: str) -> None:
+def test_axe_finds_nothing_serious(address: str, browser: Any, name: str, width: int, scheme: str) -> None:
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")
-    context = browser.new_context(color_scheme=scheme)
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
     page = context.new_page()
     page.goto(address + PAGES[name])
     page.wait_for_timeout(700)
