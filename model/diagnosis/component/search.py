@@ -220,7 +220,9 @@ def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: 
     # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
     told = [r for r in near if _determined(r.fit)]
     near = told or near
-    near = [r for r in near if r.last is not LAG or _explains_all(r.fit, current.fit, rules)]
+    # beside a valve or a loop a lag is as well oil or rubber that gives way: only alone it is the channel's
+    alone = len(current.fit.model.pieces) == len(base.model.pieces)
+    near = [r for r in near if r.last is not LAG or (alone and _explains_all(r.fit, current.fit, rules))]
     if not near:
         near = [r for r in ranked if r.last is not LAG and r.evidence > 0][:1]
     if not near:
