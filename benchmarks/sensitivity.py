@@ -243,8 +243,9 @@ def quoted(
     for line in lines:
         name = f"{line['stage']}.{line['number']}"
         known = (before or {}).get(name)
-        same = known is not None and known["varied"] == [line["value"], *line["range"]]
-        if same and known["recordings"] > line["recordings"]:
+        if known is None or known["recordings"] <= line["recordings"]:
+            continue
+        if known["varied"] == [line["value"], *line["range"]]:
             numbers[name] = known
     head = {"set": f"{len(done)} recordings ({budget})", "recordings": [one["recording"] for one in done]}
     rows = ",\n".join(f"  {json.dumps(name)}: {json.dumps(found)}" for name, found in numbers.items())
