@@ -103,6 +103,9 @@ class SelectionRules:
     near: float = rule(45.0, "score or evidence to the best one that is close in any case; chosen", 25.0, 90.0)
     near_share: float = rule(0.3, "of the best evidence, the same; chosen", 0.15, 0.5)
     again: float = rule(0.8, "of the best score, from which a law that leaves much starts once more; chosen", 0.6, 1.0)
+    astray: float = rule(
+        1.0, "log-ratio to nominal of a parameter, from which a part is tried from nominal, too; chosen", 0.5, 1.5
+    )
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
@@ -155,6 +158,9 @@ class FormulaRules:
     fitted: int = rule(6, "formulas that are fitted; chosen", 3, 9)
     slack: float = rule(15.0, "evidence behind the unnamed force; chosen: what a formula costs more", 8.0, 25.0)
     beyond: float = rule(1.1, "times what a preferred named law explains; chosen", 1.05, 1.3)
+    leaves: float = rule(
+        0.1, "of the misfit beyond noise, that a formula may leave; chosen: a third of a force", 0.05, 0.2
+    )
     says: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
 
 

@@ -65,7 +65,8 @@ class Second:
 class LawSearch:
     """Windows with the same sensors present, from log-ratios (B, P + laws' values), loads at zero.
 
-    wanted: windows (B,) whose evidence on gains and delays is computed.
+    wanted: windows (B,) whose evidence on gains and delays is computed; weighs: whether that of any in the whole batch,
+    of which these are a piece, is: all pieces then have room for it.
     """
 
     def __init__(
@@ -75,10 +76,11 @@ class LawSearch:
         data: WindowBatch,
         start: FloatArray,
         wanted: Tensor,
+        weighs: bool,
     ) -> None:
         self.windows, self.calibration, self.data, self.wanted = windows, calibration, data, wanted
         B, U, T, N = len(start), windows.unknowns, windows.model.samples, windows.model.states_count
-        self.told, H = windows.told, len(calibration.deviations) if bool(wanted.any()) else 0
+        self.told, H = windows.told, len(calibration.deviations) if weighs else 0
         unknowns = torch.zeros(B, U, dtype=torch.float64)
         unknowns[:, : start.shape[1]] = torch.as_tensor(start)
         zero = torch.zeros(B, N, dtype=torch.float64)

@@ -93,7 +93,8 @@ class LawRefiner:
         def work(at: IntArray) -> Refined:
             with torch.no_grad():
                 data = self.model.batch(self.model.knots(windows[at]), windows[at], present[at[0]])
-                search = LawSearch(model, self.calibration, data, begin[at], torch.as_tensor(wanted[at]))
+                asked = torch.as_tensor(wanted[at]), bool(wanted.any())
+                search = LawSearch(model, self.calibration, data, begin[at], *asked)
                 found = search.run(states, near, iterations)
                 return replace(found, excitation=self.model.excitation(windows[at]))
 

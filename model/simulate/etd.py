@@ -95,7 +95,9 @@ def march(
     Q, W = (len(known) - 1) // (2 * parts), x0.shape[1]
     states, motion, forces = np.empty((Q + 1, N, W)), np.empty((Q * parts, 2 * L, W)), np.empty((Q * parts, L, W))
     memories = [np.empty((Q * parts + 1, site.law.memory, W)) for site in sites]
-    memory_steps = [MemoryStep(site.law, site.p, site.element, h) if site.law.memory else None for site in sites]
+    memory_steps = [
+        MemoryStep(site.law, site.p, site.element, h, runs=True) if site.law.memory else None for site in sites
+    ]
     x, z = x0, [np.array(value) for value in z0]
     timed = start
     stage = np.empty((4, L, W))

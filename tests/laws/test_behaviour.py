@@ -32,6 +32,7 @@ PATHS = {
     "pinched_hysteresis": (300.0, 5e-4, 0.7, 1e-3),
     "friction_backlash": (300.0, 1.5e-3, 6e5, 2e4),
     "air_spring": (3e5, 0.2),
+    "fractional_stiffness": (3e5, 0.3),
 }
 
 
@@ -84,7 +85,7 @@ def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p):
 def test_laws_that_contain_commoner_ones_must_beat_them():
     rare = {law.name for law in CATALOGUE if law.prior_cost == RARE}
     assert rare == {
-        *("air_spring", "anti_roll_bar", "wheel_flat", "rail_joints"),
+        *("air_spring", "fractional_stiffness", "anti_roll_bar", "wheel_flat", "rail_joints"),
         *("stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring"),
         *("missing_connection", "suspended_mass"),
     }

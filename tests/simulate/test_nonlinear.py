@@ -49,6 +49,7 @@ TRIALS = {  # strong effects at the strut of the toy
     "time_varying_stiffness": (-0.3, 4.0),
     "time_varying_damping": (0.8, 2.0),
     "air_spring": (1e4, 0.05),
+    "fractional_stiffness": (1e4, 0.3),
     "stribeck": (40.0, 60.0, 0.1, 0.02),
     "dahl": (60.0, 6e4),
     "lugre": (40.0, 60.0, 0.1, 6e4),

@@ -2,7 +2,8 @@
 
 Every shape of `model.laws.grammar` is one more candidate at the element where the unnamed force was found: scored with
 its own values over a grid, then in pairs.  The best few are refitted as laws beside everything else, and one is
-believed where it says as much as the unnamed force with all its freedom did, by evidence and on the held-out part.
+believed where it says as much as the unnamed force with all its freedom did, by evidence and on the held-out part, and
+leaves little of what was there: half of a force has no formula.
 """
 
 from __future__ import annotations
@@ -16,7 +17,6 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.rules import FormulaRules
 from sprung.model.diagnosis.screening.elements import TrialElement
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate, Projector
@@ -49,21 +49,29 @@ def formula_of(problem: Problem, base: Fit, unnamed: Trial, held: HeldOut) -> Tr
     motion = TrialElement.of(Projector(problem, base), unnamed.term.location)
     singles = sorted((_best(motion, form) for form in forms()), key=lambda one: -one.worth)
     alone = [_candidate(motion, (one.form,), one.values, one.score) for one in singles[: rules.fitted]]
-    found = _believed(compete(problem, base, alone), unnamed, held, rules)
+    found = _believed(problem, base, compete(problem, base, alone), unnamed, held)
     if found is None:
         pairs = [_pair(motion, one, other) for one, other in combinations(singles[: rules.partners], 2)]
         good = sorted((pair for pair in pairs if pair is not None), key=lambda hit: -_worth(hit))
-        found = _believed(compete(problem, base, good[: rules.fitted]), unnamed, held, rules)
+        found = _believed(problem, base, compete(problem, base, good[: rules.fitted]), unnamed, held)
     return None if found is None else _plain(found)
 
 
-def _believed(trials: list[Trial], unnamed: Trial, held: HeldOut, rules: FormulaRules) -> Trial | None:
-    """The formula of most evidence that says as much as the unnamed force."""
+def _believed(problem: Problem, base: Fit, trials: list[Trial], unnamed: Trial, held: HeldOut) -> Trial | None:
+    """The formula of most evidence that says as much as the unnamed force, and nearly everything that is to be said."""
+    rules = problem.rules.formula
     for trial in trials:
+        if not problem.process_noise and _left(problem, trial.fit) > rules.leaves * _left(problem, base):
+            continue
         says = trial.evidence >= unnamed.evidence - rules.slack and trial.gain >= rules.says * unnamed.gain
         if trial.finished and says and not trial.fit.bounded and not held.compare(unnamed.fit, trial.fit).refuted:
             return trial
     return None
+
+
+def _left(problem: Problem, fit: Fit) -> float:
+    """Chi-square per degree of freedom beyond what chance leaves of noise."""
+    return max(fit.reduced - 1 - problem.rules.selection.chance * float(np.sqrt(2 / fit.count)), 0.0)
 
 
 def _worth(hit: Candidate) -> float:

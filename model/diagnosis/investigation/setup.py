@@ -28,7 +28,7 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.screening.elements import element_candidates
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.screening.structures import structure_candidates
-from sprung.model.diagnosis.selection.compete import compete, start_of
+from sprung.model.diagnosis.selection.compete import compete, from_nominal, start_of
 from sprung.model.laws import ElementLaw, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -55,7 +55,7 @@ def without_setup_faults(
     rules = problem.rules.setup
     while len(found) < rules.most and float(np.max(present)) > rules.strange:
         best = _best(system, signals, declared, split, problem, fit, present)
-        if best is None or _left_beside_a_part(problem, fit) < rules.outdone * best[0].after:
+        if best is None or _left_beside_a_part(problem, fit, best[0].after) < rules.outdone * best[0].after:
             break
         fault, system, mended, problem, fit = best
         split, signals = fitted_samples(signals, mended, split), mended
@@ -66,21 +66,34 @@ def without_setup_faults(
     return system, signals, tuple(found)
 
 
-def _left_beside_a_part(problem: Problem, fit: Fit) -> float:
+def _left_beside_a_part(problem: Problem, fit: Fit, rival: float) -> float:
     """Misfit of all sensors beside the best of the parts that a file may lack: then nothing of it is set up wrongly.
 
     Parts of the structure, and springs and dampers in series: linear as a wrong set-up is, and as gross.
+    rival: what the accepted set-up leaves; a part that leaves less is fitted on.
     """
     rules, projector = problem.rules.setup, Projector(problem, fit)
     structures = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
     hits = [hit for hit, _ in structure_candidates(projector, structures)]
     best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
-    fits = [try_optimise(problem, start_of(fit, hit), rules.part_steps) for hit in best]
+    starts = [start for hit in best for start in (start_of(fit, hit), *from_nominal(problem, fit, hit))]
+    fits = [try_optimise(problem, start, rules.part_steps) for start in starts]
     series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.memory_decay)
     hits = [hit for hit, _ in element_candidates(projector, series) if hit.term.law in series]
     best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
     fits += [trial.fit for trial in compete(problem, fit, best)]
-    return min((float(np.sum(misfit(one))) for one in fits if one is not None), default=np.inf)
+    good = [one for one in fits if one is not None]
+    if not good:
+        return np.inf
+    leading = min(good, key=_left)
+    if _left(leading) < rival and not leading.converged:
+        leading = try_optimise(problem, leading.point, rules.part_steps) or leading
+    return _left(leading)
+
+
+def _left(fit: Fit) -> float:
+    """Misfit of all sensors together."""
+    return float(np.sum(misfit(fit)))
 
 
 def fitted_samples(whole: Signals, cut: Signals, split: int) -> int:
@@ -118,7 +131,7 @@ def _best(
                 other, again = baseline(changed, mended, declared, fitted, problem.rules, problem.memory)
             except (ValueError, FloatingPointError):
                 continue
-            left = float(np.sum(misfit(again)))
+            left = _left(again)
             if left < rules.explains * total:
                 if hypothesis.by_mass:  # told apart from all stiffnesses, which others only bend to their needs
                     fault = _fault(hypothesis, total, left), changed, mended, other, again
@@ -200,4 +213,4 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
         split, signals = fitted_samples(signals, mended, split), mended
         problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory)
     std *= value if effect.relative else 1.0
-    return replace(fault, value=value, std=std, after=float(np.sum(misfit(fit)))), system, signals, problem, fit
+    return replace(fault, value=value, std=std, after=_left(fit)), system, signals, problem, fit

@@ -234,9 +234,18 @@ def start_of(base: Fit, hit: Candidate) -> Point:
     return Point(point.theta, (*point.terms, hit.term), state, near)
 
 
+def from_nominal(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+    """The start at nominal parameters, where the present ones are far off: what a gross part drove them to."""
+    start = start_of(base, hit)
+    far = np.max(np.abs(start.theta), initial=0.0) > problem.rules.selection.astray
+    return [replace(start, theta=np.zeros_like(start.theta))] if far else []
+
+
 def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
     """Starts at other values of the element than those that were read without the law."""
     law, names = hit.term.law, [p.name for p in problem.system.parameters]
+    if isinstance(law, StructureLaw):
+        return from_nominal(problem, base, hit)
     at = {quantity: f"{hit.location}.{quantity}" for quantity in ("stiffness", "damping")}
     if not isinstance(law, ElementLaw) or at["damping"] not in names:
         return []
