@@ -212,7 +212,18 @@ def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
         std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f} %"
         what = spoken(alarm.parameter or "") or "windows no longer fit the model"
         lines.append(f"{alarm.severity}: {what}{change}{std} since {to_iso(alarm.onset)}")
-    return "\n".join(lines)
+    return "\n".join([*lines, *measurement_lines(view.measurements())])
+
+
+def measurement_lines(found: dict[str, Any]) -> list[str]:
+    """What was found wrong with measurements, and the loads."""
+    lines = []
+    for fault in found.get("sensors", []):
+        value = "" if fault.get("value") is None else f" {fault['value']:.4g}"
+        std = "" if fault.get("std") is None else f" ± {fault['std']:.2g}"
+        lines.append(f"sensor: {fault['channel']} {fault['kind']}{value}{std}")
+    loads = found.get("load") or {}
+    return lines + [f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal" for body, (mass, std) in loads.items()]
 
 
 def incomplete_line(path: Path, fed: Fed) -> str | None:

@@ -1,0 +1,19 @@
+"""What a replay says last of measurements and loads."""
+
+from sprung.service.cli.replay import measurement_lines
+
+
+def test_wrong_sensors_and_loads_are_told_below_the_table():
+    found = {
+        "sensors": [
+            {"channel": "bogie1_1l", "kind": "gain", "value": 1.0507, "std": 0.0034},
+            {"channel": "car_1l", "kind": "stuck", "value": None, "std": None},
+        ],
+        "load": {"car": [-4038.3, 360.9]},
+    }
+    assert measurement_lines(found) == [
+        "sensor: bogie1_1l gain 1.051 ± 0.0034",
+        "sensor: car_1l stuck",
+        "load: car -4038 ± 361 kg against nominal",
+    ]
+    assert measurement_lines({"sensors": [], "load": {}}) == []
