@@ -23,6 +23,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sprung.benchmarks.concealed import engine_digest
+from sprung.benchmarks.keeping import keep, kept
 from sprung.benchmarks.sensitivity_cases import recordings
 from sprung.benchmarks.setups import Falsified
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
@@ -128,7 +129,7 @@ def run(
         if number % parts != own - 1:
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
-        told = _told(name, system, record, keys, _Kept(file, settings))
+        told = _told(name, system, record, keys, file, settings)
         done.append(told)
         changed = {key: one["changed"] for key, one in told["varied"].items() if one and one["changed"]}
         yield {key: told[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
@@ -145,33 +146,16 @@ def run(
     }
 
 
-@dataclass(frozen=True)
-class _Kept:
-    """What is known of a recording under some settings, in a file if there is one."""
-
-    file: Path | None
-    settings: list[Any]
-
-    def read(self) -> dict[str, Any]:
-        if self.file is None or not self.file.exists():
-            return {}
-        found = json.loads(self.file.read_text())
-        told: dict[str, Any] = found["told"] if found["settings"] == self.settings else {}
-        return told
-
-    def write(self, told: dict[str, Any]) -> None:
-        if self.file is not None:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            beside = self.file.with_suffix(".part")
-            beside.write_text(json.dumps({"settings": self.settings, "told": told}))
-            beside.replace(self.file)
-
-
 def _told(
-    name: str, system: System, record: Falsified, keys: list[tuple[str, Field[Any]]], kept: _Kept
+    name: str,
+    system: System,
+    record: Falsified,
+    keys: list[tuple[str, Field[Any]]],
+    file: Path | None,
+    settings: list[Any],
 ) -> dict[str, Any]:
     """What a recording says of all numbers; None of those that it does not read.  Varied are those not yet known."""
-    told = kept.read()
+    told = kept(file, settings) or {}
     known = told.get("varied", {})
     wanted = {f"{stage}.{one.name}": (stage, one) for stage, one in keys}
     open_keys = [key for key, (_, one) in wanted.items() if known.get(key, {}).get("varied") != _numbers(one)]
@@ -181,7 +165,7 @@ def _told(
         for key in open_keys:
             stage, one = wanted[key]
             known[key] = {"varied": _numbers(one), "found": vary(subject, stage, one)}
-            kept.write(told | {"varied": known})
+            keep(file, settings, told | {"varied": known})
     return told | {"varied": {key: known[key]["found"] for key in wanted}}
 
 

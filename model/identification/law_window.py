@@ -204,8 +204,7 @@ class LawWindows:
         carried = transfer.drive * self.model.drive_noise[:, None]
         whiten = self.model.whitening(carried)
         shown = self.shown(point, steps, motion, data, smooth, along, flow)
-        spectra = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
-        white = as_rows(whiten @ spectra)
+        white = as_rows(whiten @ self._by_bin(shown))
         N = point.x0.shape[1]
         free, J = white[:, :N], white[:, N:]
         free_scale = free.square().sum(dim=2).sqrt().clamp_min(1e-300)
@@ -260,9 +259,7 @@ class LawWindows:
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
         memory[:, :, N + self.told :] = torch.eye(memories, dtype=torch.float64)
         path = flow.run(push, self._force_sources(along, point, steps, N), first, memory=memory)  # (B, N + L, T, X)
-        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
-        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
-        found = (rows @ path.flatten(2)).view(B, len(Q), T, -1)
+        found = self._shown_by(path, steps, Q)
         changed = found[..., N:]
         direct = Q @ (steps.shown[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
         changed[..., linear] += direct.unsqueeze(2) * load.unsqueeze(1)
@@ -295,14 +292,23 @@ class LawWindows:
             push += gain[:, :, 2 * of].unsqueeze(2) * value[:, None, at]
             push += gain[:, :, 2 * of + 1].unsqueeze(2) * rate[:, None, at]
         path = flow.run(push, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), remembered)
-        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T
-        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
-        shown = (rows @ path.flatten(2)).view(B, len(Q), T, X)
+        shown = self._shown_by(path, steps, Q)
         D = Q @ steps.discrete.D
         for gain, given in ((D[:, :, 2 * of], value), (D[:, :, 2 * of + 1], rate)):
             shown += gain.unsqueeze(2) * given.unsqueeze(1)
-        spectra = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
-        return list((columns.whiten @ spectra).to(torch.complex64).split(half, dim=3))
+        return list((columns.whiten @ self._by_bin(shown)).to(torch.complex64).split(half, dim=3))
+
+    def _shown_by(self, path: Tensor, steps: Steps, Q: Tensor) -> Tensor:
+        """What the compressed signals show of changes of states and of the laws' forces (B, N + L, T, X):
+        (B, R, T, X)."""
+        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
+        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
+        return (rows @ path.flatten(2)).view(len(path), len(Q), *path.shape[2:])
+
+    def _by_bin(self, shown: Tensor) -> Tensor:
+        """Spectra within the band of signals (B, R, T, X), (B, F, R, X)."""
+        found: Tensor = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
+        return found
 
     def _element_loads(
         self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray

@@ -94,13 +94,9 @@ def recall(
 
 
 class MemoryStep:
-    """Coefficients of ETDRK4 for z' = -decay z + source(z, motion) with step h.
+    """Coefficients of ETDRK4 for z' = -decay z + source(z, motion) with step h; z is (memory, ...), ... as in p."""
 
-    runs: z is (memory, W); else (memory,) and what the values have.
-    """
-
-    def __init__(self, law: ElementLaw, p: Values, element: SpringDamper, h: float, runs: bool = False) -> None:
-        p = tuple(np.atleast_1d(value) for value in p) if runs and law.memory > 1 else p
+    def __init__(self, law: ElementLaw, p: Values, element: SpringDamper, h: float) -> None:
         self.law, self.p, self.element = law, p, element
         self.decay: Any = law.memory_decay(p, element) if law.memory_decay else 0.0
         self.full, one, two, three = phi(-np.asarray(self.decay) * h)

@@ -95,9 +95,7 @@ def march(
     Q, W = (len(known) - 1) // (2 * parts), x0.shape[1]
     states, motion, forces = np.empty((Q + 1, N, W)), np.empty((Q * parts, 2 * L, W)), np.empty((Q * parts, L, W))
     memories = [np.empty((Q * parts + 1, site.law.memory, W)) for site in sites]
-    memory_steps = [
-        MemoryStep(site.law, site.p, site.element, h, runs=True) if site.law.memory else None for site in sites
-    ]
+    memory_steps = [_memory_step(site, h) if site.law.memory else None for site in sites]
     x, z = x0, [np.array(value) for value in z0]
     timed = start
     stage = np.empty((4, L, W))
@@ -127,6 +125,11 @@ def march(
     for store, value in zip(memories, z, strict=True):
         store[-1] = value
     return March(states, motion, forces, memories)
+
+
+def _memory_step(site: Site, h: float) -> MemoryStep:
+    """The same values for all runs."""
+    return MemoryStep(site.law, tuple(np.atleast_1d(value) for value in site.p), site.element, h)
 
 
 class _Memory:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
-from sprung.model.diagnosis.component.motion import white_noise
+from sprung.model.diagnosis.component.motion import white_noise, without_gaps
 from sprung.model.signals import FloatArray
 
 _STANDS_OUT = 300.0  # power over that of the noise from which a frequency belongs to the test
@@ -36,7 +36,7 @@ def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | Non
     """Motion from an acceleration (T,); None: it shows nothing but noise."""
     good = np.isfinite(acceleration)
     at = np.arange(len(acceleration))
-    series = np.interp(at, at[good], acceleration[good])
+    series = without_gaps(acceleration)
     series = series - series.mean()
     whole, frequency = _mirrored(series, sample_rate)
     spectrum = np.fft.rfft(whole)
@@ -60,11 +60,9 @@ def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | Non
 
 def without_slow(series: FloatArray, sample_rate: float, lowest: float) -> FloatArray:
     """A force (T,) without what is below the lowest frequency of its motion; gaps stay gaps."""
-    good = np.isfinite(series)
-    at = np.arange(len(series))
-    whole, frequency = _mirrored(np.interp(at, at[good], series[good]), sample_rate)
+    whole, frequency = _mirrored(without_gaps(series), sample_rate)
     fast = np.fft.irfft(np.fft.rfft(whole) * _passed(frequency, lowest), len(whole))
-    return np.where(good, fast[len(series) - 1 : 2 * len(series) - 1], np.nan)
+    return np.where(np.isfinite(series), fast[len(series) - 1 : 2 * len(series) - 1], np.nan)
 
 
 def _mirrored(series: FloatArray, sample_rate: float) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,13 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentModel, ComponentTask, NominalValues
 from sprung.model.diagnosis.component.given import given_model
 from sprung.model.diagnosis.component.integrated import integrated, without_slow
-from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
+from sprung.model.diagnosis.component.motion import (
+    element_motion,
+    noise_at_rest,
+    still_stretches,
+    white_noise,
+    without_gaps,
+)
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.laws.following import Covariate
@@ -132,8 +138,8 @@ def _record(
     if last - first < len(values):
         notes.append(f"used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording")
     part = slice(first, last)
-    d, f = _closed(displacement[part]), _closed(force[part])
-    v = None if velocity is None else _closed(velocity[part])
+    d, f = without_gaps(displacement[part]), without_gaps(force[part])
+    v = None if velocity is None else without_gaps(velocity[part])
     if np.std(d) <= rules.component.moves * white_noise(d) or np.ptp(d) == 0:
         raise TooLittleError(f"too still to decide anything: {element} is not moved")
     if np.ptp(f) == 0:
@@ -248,7 +254,7 @@ def _column(values: FloatArray, names: list[str], name: str) -> FloatArray:
 def _integral(rate: FloatArray, sample_rate: float) -> FloatArray:
     """A position from its rate, about its mean; gaps stay gaps."""
     good = np.isfinite(rate)
-    filled = np.interp(np.arange(len(rate)), np.flatnonzero(good), rate[good])
+    filled = without_gaps(rate)
     position = np.concatenate([[0.0], np.cumsum(0.5 * (filled[1:] + filled[:-1]))]) / sample_rate
     return np.where(good, position - position.mean(), np.nan)
 
@@ -262,12 +268,3 @@ def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:
     starts, ends = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(at) - 1]])
     best = int(np.argmax(at[ends] - at[starts]))
     return int(at[starts[best]]), int(at[ends[best]]) + 1
-
-
-def _closed(series: FloatArray) -> FloatArray:
-    """Short gaps closed by linear interpolation."""
-    good = np.isfinite(series)
-    if good.all():
-        return series
-    at = np.arange(len(series))
-    return np.interp(at, at[good], series[good])

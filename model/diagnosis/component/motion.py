@@ -68,6 +68,15 @@ class ElementMotion:
         )
 
 
+def without_gaps(series: FloatArray) -> FloatArray:
+    """A series (T,) with its gaps closed by linear interpolation."""
+    good = np.isfinite(series)
+    if good.all():
+        return series
+    at = np.arange(len(series))
+    return np.interp(at, at[good], series[good])
+
+
 def white_noise(series: FloatArray) -> float:
     """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
 

@@ -20,7 +20,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.elements import TrialElement
 from sprung.model.diagnosis.screening.families import ELEMENT
 from sprung.model.diagnosis.screening.score import Candidate, Projector
-from sprung.model.diagnosis.selection.compete import Trial, compete
+from sprung.model.diagnosis.selection.compete import Trial, compete, noise_bound
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.laws.grammar import Shape, forms, formula_cost, law_of
 
@@ -70,8 +70,8 @@ def _believed(problem: Problem, base: Fit, trials: list[Trial], unnamed: Trial, 
 
 
 def _left(problem: Problem, fit: Fit) -> float:
-    """Chi-square per degree of freedom beyond what chance leaves of noise."""
-    return max(fit.reduced - 1 - problem.rules.selection.chance * float(np.sqrt(2 / fit.count)), 0.0)
+    """Chi-square per degree of freedom beyond what noise may leave."""
+    return max(fit.reduced - noise_bound(problem, fit), 0.0)
 
 
 def _worth(hit: Candidate) -> float:

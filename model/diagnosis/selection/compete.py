@@ -181,7 +181,12 @@ def _leaves_much(problem: Problem, trial: Trial) -> bool:
     """Whether a fit is no end: more than noise is left, or, where noise is what is fitted, it still falls."""
     if problem.process_noise:
         return not trial.fit.converged
-    return trial.fit.reduced > 1 + problem.rules.selection.chance * float(np.sqrt(2 / trial.fit.count))
+    return trial.fit.reduced > noise_bound(problem, trial.fit)
+
+
+def noise_bound(problem: Problem, fit: Fit) -> float:
+    """Chi-square per degree of freedom that noise alone may leave."""
+    return 1 + problem.rules.selection.chance * float(np.sqrt(2 / fit.count))
 
 
 def _alike_starts(base: Fit, hit: Candidate) -> list[Point]:
@@ -199,8 +204,8 @@ def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     if problem.process_noise or len(named) < 2:
         return True
     best = max(named, key=lambda trial: trial.worth)
-    noise = 1 + problem.rules.selection.chance * np.sqrt(2 / best.fit.count)
-    return unnamed.score > best.worth or not problem.rules.evidence.quiet <= best.fit.reduced <= noise
+    quiet = problem.rules.evidence.quiet <= best.fit.reduced <= noise_bound(problem, best.fit)
+    return unnamed.score > best.worth or not quiet
 
 
 def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
