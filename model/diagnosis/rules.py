@@ -268,6 +268,15 @@ class ComponentRules:
     turned: float = rule(3.0, "times what speaks for its sign, that speaks against it; chosen", 2.0, 5.0)
     preload: float = rule(5.0, "deviations of a preload that is told; derived: one in a million", 3.0, 8.0)
     beside: int = rule(4, "trials that are refined beside the close laws; chosen", 2, 8)
+    stands_clear: float = rule(
+        300.0, "times the noise's power, of an acceleration that is integrated; chosen", 100.0, 1000.0
+    )
+    periods: float = rule(4.0, "of the slowest motion that an integral holds; derived: a level needs some", 3.0, 8.0)
+    integral_settled: float = rule(1.5, "of those periods lost at either end; chosen", 1.0, 2.5)
+    formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)
+    formula_partners: int = rule(3, "shapes of a formula that others are tried beside; chosen", 2, 5)
+    formula_told: float = rule(5.0, "deviations of an amplitude; derived: one in a million", 3.0, 8.0)
+    formula_pair: float = rule(0.5, "of the held-out power of one shape, that two may leave; chosen", 0.3, 0.7)
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, covariance, refined, spread
 from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, Piece, Seen, Shape
 from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
+from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.laws import ElementLaw, Motion, Observed, SpringDamper
 from sprung.model.laws.formula import EFFECT
@@ -21,10 +22,6 @@ from sprung.model.laws.grammar import Shape as Form
 from sprung.model.laws.grammar import forms, formula_cost, law_of
 from sprung.model.signals import FloatArray
 
-_WIDE = 20.0  # times the usual size of a length or rate, either way
-_PARTNERS = 3  # shapes that others are tried beside
-_CLEARLY = 5.0  # deviations of an amplitude; less is no part of a formula
-_SERVES = 0.5  # of the held-out power that one shape leaves, which a second one may leave
 _UNIT = SpringDamper(1.0, 1.0)
 _OFF = 2.0  # factor by which an amplitude is tried for being one
 
@@ -53,7 +50,7 @@ def formula_piece(law: ElementLaw, grid: FloatArray | None = None, parts: int = 
     def limits(seen: Seen) -> list[tuple[float, float]]:
         sizes = {"m": seen.travel, "m/s": seen.rate_rms}
         return [
-            (sizes[unit] / _WIDE, sizes[unit] * _WIDE) if unit in sizes else (seen.step, seen.seconds)
+            (sizes[unit] / seen.reach, sizes[unit] * seen.reach) if unit in sizes else (seen.step, seen.seconds)
             for unit in (law.parameters[i].unit for i in others)
         ]
 
@@ -95,18 +92,18 @@ def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
     quick, fine = task.every(max(1, len(task.force) // rules.search)), task.every(max(1, len(task.force) // rules.fit))
     base, seen = refined(quick, given), _observed(task)
     single = {piece.key: (form, piece) for form in forms() for piece in [_single(form, seen)]}
-    alone = [one for one in next_laws(base, tuple(piece for _, piece in single.values()), rules) if _told(one)]
+    alone = [one for one in next_laws(base, tuple(piece for _, piece in single.values()), rules) if _told(one, rules)]
     alone.sort(key=_worth, reverse=True)
     pairs = [
         _pair(single[one.last.key][0], one.fit.model.shapes[-1], form, piece, task.seen)
-        for one in alone[:_PARTNERS]
+        for one in alone[: rules.formula_partners]
         for key, (form, piece) in single.items()
         if key != one.last.key and not (form.memory and single[one.last.key][0].memory)
     ]
     if not alone or _worth(alone[0]) <= 0:
         return None
-    enough = _SERVES * alone[0].fit.held_out
-    together = [one for one in next_laws(base, tuple(pairs), rules) if _told(one) and one.fit.held_out < enough]
+    enough = rules.formula_pair * alone[0].fit.held_out
+    together = [one for one in next_laws(base, tuple(pairs), rules) if _told(one, rules) and one.fit.held_out < enough]
     chosen, before = max([alone[0], *together], key=_worth), Ranked(base, 0.0, 0.0, 0.0)
     freedom = chosen.fit.model.count - base.model.count
     p_value = chance(chosen.gain, freedom, len(single))
@@ -134,12 +131,12 @@ def _pair(one: Form, shape: Shape, other: Form, piece: FormulaPiece, seen: Seen)
     return formula_piece(law_of((one, other)), rows, one.parts + other.parts)
 
 
-def _told(one: Ranked) -> bool:
+def _told(one: Ranked, rules: ComponentRules) -> bool:
     """Whether the record tells every amplitude."""
     index = len(one.fit.model.pieces) - 1
     sigma, _ = spread(one.fit, index, *covariance(one.fit))
     named = zip(one.fit.values(index).items(), sigma, strict=True)
-    return all(abs(value) > _CLEARLY * s for (name, (value, _)), s in named if name in "abc")
+    return all(abs(value) > rules.formula_told * s for (name, (value, _)), s in named if name in "abc")
 
 
 def _observed(task: ComponentTask) -> Observed:

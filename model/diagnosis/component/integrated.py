@@ -13,12 +13,10 @@ import numpy as np
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.component.motion import white_noise, without_gaps
+from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.signals import FloatArray
 
-_STANDS_OUT = 300.0  # power over that of the noise from which a frequency belongs to the test
 _RAMP = 0.6  # of the lowest frequency, from where the filter opens
-_SETTLED = 1.5  # periods of the lowest frequency that are lost at either end
-_LEAST_PERIODS = 4.0  # of the lowest frequency within a recording
 
 
 @dataclass(frozen=True)
@@ -32,7 +30,7 @@ class Integrated:
     lowest: float  # Hz, below which the motion is not known
 
 
-def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | None:
+def integrated(acceleration: FloatArray, sample_rate: float, rules: ComponentRules) -> Integrated | None:
     """Motion from an acceleration (T,); None: it shows nothing but noise."""
     good = np.isfinite(acceleration)
     at = np.arange(len(acceleration))
@@ -41,7 +39,12 @@ def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | Non
     whole, frequency = _mirrored(series, sample_rate)
     spectrum = np.fft.rfft(whole)
     noise = white_noise(series)
-    lowest = _lowest(spectrum, frequency, noise, len(whole), _LEAST_PERIODS * sample_rate / len(series))
+    lowest = _lowest(
+        np.abs(spectrum) ** 2 / len(whole),
+        frequency,
+        rules.stands_clear * max(noise**2, 1e-300),
+        rules.periods * sample_rate / len(series),
+    )
     if lowest is None:
         return None
     passed = _passed(frequency, lowest)
@@ -51,7 +54,7 @@ def integrated(acceleration: FloatArray, sample_rate: float) -> Integrated | Non
         np.fft.irfft(spectrum * passed / (1j * omega) ** power, len(whole))[here] for power in (1, 2)
     )
     deviations = [noise * float(np.sqrt(2 * np.sum((passed / omega**p) ** 2) / len(whole))) for p in (1, 2)]
-    lost = int(_SETTLED * sample_rate / lowest)
+    lost = int(rules.integral_settled * sample_rate / lowest)
     known = good & (at >= lost) & (at < len(series) - lost)
     return Integrated(
         np.where(known, displacement, np.nan), np.where(known, velocity, np.nan), deviations[1], deviations[0], lowest
@@ -76,9 +79,8 @@ def _passed(frequency: FloatArray, lowest: float) -> FloatArray:
     return np.asarray(0.5 - 0.5 * np.cos(np.pi * ramp))
 
 
-def _lowest(spectrum: np.ndarray, frequency: FloatArray, noise: float, count: int, least: float) -> float | None:
-    """The lowest frequency, Hz, of the band that stands out of the noise."""
-    power = np.abs(spectrum) ** 2 / count
-    smooth = uniform_filter1d(median_filter(power, size=5), size=max(5, count // 1000) | 1)
-    out = np.flatnonzero((smooth > _STANDS_OUT * max(noise**2, 1e-300)) & (frequency >= least))
+def _lowest(power: FloatArray, frequency: FloatArray, clear: float, least: float) -> float | None:
+    """The lowest frequency, Hz, of the band whose power per bin stands clear of the noise."""
+    smooth = uniform_filter1d(median_filter(power, size=5), size=max(5, 2 * len(power) // 1000) | 1)
+    out = np.flatnonzero((smooth > clear) & (frequency >= least))
     return float(frequency[out[0]]) if len(out) else None

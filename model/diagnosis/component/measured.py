@@ -21,7 +21,7 @@ from sprung.model.diagnosis.component.motion import (
     without_gaps,
 )
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
-from sprung.model.diagnosis.rules import RULES, Rules
+from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
 from sprung.model.laws.following import Covariate
 from sprung.model.schema import ElementSensor, SupportInput
 from sprung.model.signals import FloatArray
@@ -124,7 +124,7 @@ def _record(
     rules: Rules,
 ) -> ComponentRecord:
     notes: list[str] = []
-    displacement, velocity, left = _deflection(system, element, values, names, sample_rate, notes)
+    displacement, velocity, left = _deflection(system, element, values, names, sample_rate, rules.component, notes)
     force = _column(values, names, sensor)
     if left.lowest > 0:
         force = without_slow(force, sample_rate, left.lowest)
@@ -169,7 +169,13 @@ def _record(
 
 
 def _deflection(
-    system: System, element: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
+    system: System,
+    element: str,
+    values: FloatArray,
+    names: list[str],
+    sample_rate: float,
+    rules: ComponentRules,
+    notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
     """Motion of an element's upper end less that of its lower, (T,); its rate where both ends' are known."""
     ends, count = system.file.elements[element], len(values)
@@ -179,7 +185,7 @@ def _deflection(
             if end != "ground":
                 notes.append(f"{end} hardly moves under the measured force: taken for ground")
             continue
-        moved, rate, more = _motion_of(system, end, values, names, sample_rate, notes)
+        moved, rate, more = _motion_of(system, end, values, names, sample_rate, rules, notes)
         left = left.beside(more)
         displacement += sign * moved
         has_velocity &= rate is not None
@@ -195,7 +201,13 @@ def _between(rests: list[slice], count: int, least: int) -> slice:
 
 
 def _motion_of(
-    system: System, end: str, values: FloatArray, names: list[str], sample_rate: float, notes: list[str]
+    system: System,
+    end: str,
+    values: FloatArray,
+    names: list[str],
+    sample_rate: float,
+    rules: ComponentRules,
+    notes: list[str],
 ) -> tuple[FloatArray, FloatArray | None, _Wandering]:
     """Displacement of a support (T,), its rate where known, and what integrations left in both."""
     source, nothing = system.file.inputs[end], _Wandering()
@@ -207,7 +219,7 @@ def _motion_of(
     if rate is not None:
         notes.append(f"{end}.displacement was integrated from its velocity")
         return _integral(rate, sample_rate), rate, nothing
-    moved = integrated(_column(values, names, f"{end}.acceleration"), sample_rate)
+    moved = integrated(_column(values, names, f"{end}.acceleration"), sample_rate, rules)
     if moved is None:
         raise TooLittleError(f"too still to decide anything: {end}.acceleration shows nothing but noise")
     notes.append(

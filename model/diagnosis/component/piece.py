@@ -38,13 +38,15 @@ class Seen:
     seconds: float
     step: float  # s
     lowest_knee: float  # m/s: a valve that opens far below usual rates acts as friction, and is called so
+    reach: float  # times the usual size of a length or rate, either way, within which a formula's are searched
 
     @classmethod
     def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> Seen:
         quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
         travel = 0.5 * float(np.ptp(motion.deflection))
         rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
-        return cls(max(travel, 1e-12), rate, seconds, motion.step, rules.lowest_knee * float(rate[50]))
+        knee = rules.lowest_knee * float(rate[50])
+        return cls(max(travel, 1e-12), rate, seconds, motion.step, knee, rules.formula_reach)
 
     @property
     def rate_rms(self) -> float:
