@@ -23,6 +23,7 @@ from mcap_ros2.decoder import DecoderFactory as Ros2Factory
 
 from sprung.model.signals import FloatArray, IntArray
 from sprung.replay.account import Account
+from sprung.replay.jsonkeys import KeyTwice, load, may_name_twice
 from sprung.replay.mcapfile import Messages
 from sprung.replay.plausible import LATEST
 
@@ -56,7 +57,7 @@ class Topic:
         self.fields = list(fields)
         self.account = account
         self.is_json = channel.message_encoding == "json"
-        self.decode: Callable[[bytes], Any] | None = json.loads if self.is_json else None
+        self.decode: Callable[[bytes], Any] | None = load if self.is_json else None
         self._checked = False
         self._stamp: tuple[tuple[str, ...], tuple[str, str]] | None = None  # where the messages carry their time
         for factory in () if self.is_json else (Ros2Factory(), ProtobufFactory()):
@@ -93,11 +94,12 @@ class Topic:
             return [], np.zeros(len(data), dtype=bool)
         if self.is_json:  # one call for the whole batch is twice as fast as one a message
             try:
-                documents = json.loads(b"[" + b",".join(data) + b"]")
-                if len(documents) == len(data):
+                content = b"[" + b",".join(data) + b"]"
+                documents = json.loads(content)
+                if len(documents) == len(data) and not may_name_twice(content, documents):
                     return documents, np.ones(len(data), dtype=bool)
             except (ValueError, RecursionError):
-                pass  # some message is damaged, or nested beyond all reason: find it below
+                pass  # some message is damaged, or nested beyond all reason, or names a key twice: find it below
         documents = []
         good = np.zeros(len(data), dtype=bool)
         reasons: Counter[str] = Counter()
@@ -106,7 +108,7 @@ class Topic:
                 documents.append(self.decode(item))
                 good[index] = True
             except Exception as error:  # decoders raise what their generated code happens to raise
-                reasons[type(error).__name__] += 1
+                reasons["a key is there twice" if isinstance(error, KeyTwice) else type(error).__name__] += 1
         self.account.corrupt(len(data) - len(documents), f"message of {self.name} cannot be decoded")
         for reason, count in reasons.items():
             self.account.problem(f"{count} messages of {self.name} cannot be decoded ({reason})")

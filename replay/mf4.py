@@ -17,6 +17,8 @@ from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
 from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME
 
+SIGNATURES = (b"MDF", b"UnFinMF")  # the second of a logger that was not stopped
+
 
 def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
     """Blocks in time order.  The groups of an MDF file follow each other, so they are read whole and merged."""
@@ -24,6 +26,10 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         from asammdf import MDF
     except ImportError:
         raise UnreadableRecording(f"{path}: reading MF4 needs asammdf; install sprung[mf4]") from None
+    with path.open("rb") as file:
+        head = file.read(16)
+    if head[:8].strip() not in SIGNATURES:
+        raise UnreadableRecording(f"{path}: not an MDF file: {'it does not begin as one' if head else 'it is empty'}")
     with _quietly():
         wrong = ""
         try:
@@ -31,12 +37,16 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
                 start = round(mdf.header.start_time.timestamp() * 1e6) * 1_000
                 groups = list(_groups(mdf, account))
                 mdf_version = mdf.version
-        except Exception as error:  # asammdf raises what its parser happens to raise
-            wrong = " ".join(str(error).split())[:200] or type(error).__name__
+        except Exception as error:  # asammdf raises what its parser happens to raise, and says it to its authors
+            wrong = type(error).__name__
         if wrong:
             gc.collect()  # what was left half made complains at its end: here, where nobody listens
     if wrong:
-        raise UnreadableRecording(f"{path}: not an MDF file that can be read: {wrong}")
+        version = head[8:].decode("ascii", "replace").strip(" \0") or "?"
+        raise UnreadableRecording(
+            f"{path}: an MDF file of version {version} that cannot be read: damaged, cut short, or of a kind that "
+            f"asammdf does not know ({wrong})"
+        )
     if not groups:
         raise UnreadableRecording(f"{path}: MDF {mdf_version} without a CAN_DataFrame group (no bus log)")
     width = 64 if max(group[2].max(initial=0) for group in groups) > 8 else 8

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import logging
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,6 +13,7 @@ from numpy.typing import NDArray
 
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.extras import needed
+from sprung.replay.jsonkeys import load
 from sprung.replay.stamps import SECOND
 from sprung.replay.tables import Column, EvenTimes, whole
 
@@ -54,22 +53,13 @@ def _mat(path: Path) -> Iterator[list[Column]]:
 def _json(path: Path) -> Iterator[list[Column]]:
     """JSON: an object of arrays, an array of objects, or matrices as arrays of arrays."""
     try:
-        content = json.loads(path.read_bytes(), object_pairs_hook=_each_once)
+        content = load(path.read_bytes())
     except (ValueError, RecursionError) as error:
         raise UnreadableRecording(f"{path}: not JSON that can be read: {error}") from error
     if isinstance(content, list) and content and isinstance(content[0], Mapping):
         keys = list(dict.fromkeys(key for row in content if isinstance(row, Mapping) for key in row))
         content = {key: [row.get(key) if isinstance(row, Mapping) else None for row in content] for key in keys}
     yield list(_flat(content if isinstance(content, Mapping) else {"data": content}))
-
-
-def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object; ValueError where it names a key twice: of two series nobody knows which is meant."""
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        named = Counter(name for name, _ in pairs)
-        raise ValueError(f"{max(named, key=named.__getitem__)!r:.80} is there twice")
-    return content
 
 
 def _as_float(value: Any) -> float:

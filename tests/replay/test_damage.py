@@ -1,10 +1,13 @@
 """Cut and damaged files: nothing raises but the one clear error, nothing wrong is read, every loss is counted."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from mcap.writer import CompressionType
 
-from sprung.replay import UnreadableRecording
+from sprung.replay import UnreadableRecording, mf4
+from sprung.replay.account import Account
 from tests.replay_files import ROWS, START, STEP, TIMES, VALUES, database, read, write_can, write_csv, write_json
 
 TOLERANCE = 2_000  # ns; python-can writes float seconds
@@ -140,3 +143,21 @@ def test_damaged_text_is_counted_and_the_rest_is_read(name, tmp_path, dbc):
         path.write_bytes(damaged)
         recording, _ = read(path, dbc)
         assert recording.tally.used >= ROWS - 2
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (b"", "it is empty"),
+        (b"hello, I am no recording\n", "it does not begin as one"),
+        (b"MDF     4.10    " + bytes(range(256)) * 8, "an MDF file of version 4.10 that cannot be read: damaged"),
+        (b"MDF     4.1", "an MDF file of version 4.1 that cannot be read: damaged"),
+    ],
+)
+def test_a_file_that_is_no_mdf_is_told_in_plain_words(content: bytes, told: str, tmp_path: Path) -> None:
+    pytest.importorskip("asammdf")
+    path = tmp_path / "a.mf4"
+    path.write_bytes(content)
+    with pytest.raises(UnreadableRecording) as refused:
+        list(mf4.frames(path, Account()))
+    assert told in str(refused.value) and "mmap" not in str(refused.value) and "magic" not in str(refused.value)
