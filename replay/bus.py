@@ -60,11 +60,11 @@ def parse_bus(text: str) -> BusAddress:
     return BusAddress(interface, channel, options)
 
 
-def opening_options(address: BusAddress, ids: Iterable[int]) -> dict[str, Any]:
+def opening_options(address: BusAddress, ids: Iterable[int] | None) -> dict[str, Any]:
     """What python-can is told beside interface and channel: listen only and filter, where the interface can; what
-    the user named goes before.  ids: wanted frames, with EXTENDED."""
+    the user named goes before.  ids: wanted frames, with EXTENDED; None: all."""
     options = dict(LISTEN_ONLY.get(address.interface, {}))
-    if address.interface in FILTERS_IN_KERNEL:
+    if ids is not None and address.interface in FILTERS_IN_KERNEL:
         options["can_filters"] = [
             {
                 "can_id": frame_id & ~EXTENDED,

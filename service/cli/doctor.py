@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from sprung import __version__
 from sprung.model.identification.identify import load_identifier
 from sprung.model.system import load_system
+from sprung.replay.bus import opening_options, parse_bus
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
 from sprung.service.store.status import Wanted, health_counts
@@ -139,11 +140,10 @@ def _clock(_settings: Settings) -> Iterator[Check]:
 
 def _bus(name: str) -> Check:
     """Open a bus as the service would, and listen for a moment."""
-    interface, separator, channel = name.split(",", maxsplit=1)[0].partition(":")
-    if not separator:
-        return Check("failed", f"bus {name}", "give INTERFACE:CHANNEL, as in socketcan:can0")
     try:
-        with can.Bus(channel, interface) as bus:
+        address = parse_bus(name)
+        options = opening_options(address, ids=None)
+        with can.Bus(interface=address.interface, channel=address.channel, **options) as bus:
             end = time.monotonic() + BUS_SECONDS
             count = 0
             while time.monotonic() < end:

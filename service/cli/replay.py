@@ -73,6 +73,7 @@ def run(
                 own_limits(settings, path),
                 began,
                 json_lines,
+                settings.store is not None,
             )
             status = max(status, _report(pipeline, path, fed, json_lines))
             told = slower_line(fed, speed, engine.system.sample_rate)
@@ -97,6 +98,7 @@ def _replay(
     limits: ProcessLimits | None,
     start: int | None,
     json_lines: bool,
+    keeps: bool,
 ) -> Fed:
     system = pipeline.engine.system
     row = file_row(path)
@@ -104,7 +106,7 @@ def _replay(
         work.add_recording(connection, row)
     kept = Counter[str]()
     with (
-        told_when_interrupted(kept, store),
+        told_when_interrupted(kept, store.engine.url if keeps else None),
         progress(path.name, system.hop / system.sample_rate, quiet=json_lines) as show,
     ):
 
@@ -131,15 +133,15 @@ def _replay(
 
 
 @contextmanager
-def told_when_interrupted(kept: Counter[str], store: Store) -> Iterator[None]:
-    """After Ctrl-C: what is stored, and how to go on."""
+def told_when_interrupted(kept: Counter[str], url: object | None) -> Iterator[None]:
+    """After Ctrl-C: what is stored, and how to go on.  url: of the store; None where it goes with this run."""
     try:
         yield
     except KeyboardInterrupt:
-        if "/sprung-" in str(store.engine.url):  # the folder that goes with this run
+        if url is None:
             line = f"{kept['windows']} windows were followed and nothing is kept; with --store they would be"
         else:
-            line = f"{kept['windows']} windows are kept in {store.engine.url}; call it again to go on"
+            line = f"{kept['windows']} windows are kept in {url}; call it again to go on"
         print(f"sprung: {line}", file=sys.stderr)
         raise
 

@@ -9,14 +9,18 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
+from can import BusState
 from mcap.reader import make_reader
 
 from sprung.service.cli import describe, main
 from sprung.service.cli.console import parameter_table
-from sprung.service.cli.replay import slower_line
+from sprung.service.cli.doctor import _bus
+from sprung.service.cli.replay import slower_line, told_when_interrupted
 from sprung.service.engine import Engine
 from sprung.service.feed import Fed
 from sprung.service.views import vehicle_view
@@ -111,6 +115,31 @@ def test_an_interrupt_tells_what_is_kept(tmp_path: Path) -> None:
         _, errors = process.communicate(timeout=30)
     assert process.returncode == 130
     assert b"windows are kept in" in errors and b"call it again" in errors
+
+
+def test_what_an_interrupt_left_does_not_depend_on_the_name_of_its_folder(capsys: pytest.CaptureFixture[str]) -> None:
+    for url, told in (("sqlite:////srv/sprung-depot/s.db", "7 windows are kept in sqlite:"), (None, "nothing is kept")):
+        with pytest.raises(KeyboardInterrupt), told_when_interrupted(Counter(windows=7), url):
+            raise KeyboardInterrupt
+        assert told in capsys.readouterr().err
+
+
+def test_the_doctor_opens_a_bus_as_the_service_does(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[dict[str, Any]] = []
+
+    def opened(**options: Any) -> Any:
+        asked.append(options)
+        raise OSError("no such device")
+
+    monkeypatch.setattr("can.Bus", opened)
+    assert _bus("pcan:PCAN_USBBUS1,bitrate=250000,fd=true").state == "failed"
+    assert asked == [
+        {"interface": "pcan", "channel": "PCAN_USBBUS1", "bitrate": 250000, "fd": True, "state": BusState.PASSIVE}
+    ]
+    assert "name=value" in _bus("socketcan:can0,fast").text and "INTERFACE:CHANNEL" in _bus("can0").text
+    assert len(asked) == 1
 
 
 def test_a_free_body_is_a_legal_system(capsys: pytest.CaptureFixture[str]) -> None:
