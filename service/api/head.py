@@ -4,23 +4,24 @@ from __future__ import annotations
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-STREAMS = ("/events",)  # they never end: their headers cannot be waited for
-
 
 class HeadAsGet:
-    """ASGI middleware."""
+    """ASGI middleware.  Whoever asks is told to be gone, so that a stream which never ends does."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "HEAD" or scope["path"] in STREAMS:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
             await self.app(scope, receive, send)
             return
 
-        async def without_body(message: Message) -> None:
-            if message["type"] == "http.response.body":
-                message = {**message, "body": b""}
-            await send(message)
+        async def headers_only(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
 
-        await self.app(dict(scope) | {"method": "GET"}, receive, without_body)
+        async def gone() -> Message:
+            return {"type": "http.disconnect"}
+
+        await self.app(dict(scope) | {"method": "GET"}, gone, headers_only)

@@ -16,6 +16,7 @@ FEED_LOST, FEED_FOUND = "sprung.feed.lost", "sprung.feed.found"
 BLOCKS = {"SD": "state detection", "HA": "health assessment", "DA": "data acquisition"}  # of ISO 13374-1
 ADVICE = {
     "change": "Inspect {element}; when it is repaired, mark the maintenance so that its baseline is learned anew.",
+    "common": "All of them at once: weather, load, speed or a scale more often than wear. Compare with other vehicles.",
     "misfit": "A sensor, or physics that the model lacks: read the mismatch report that follows.",
     "sensor": "Check mounting, cable and scale of the sensor.",
     "load": "Check the load and its sensor.",
@@ -26,6 +27,7 @@ def alarm_event(base: str, vehicle: str, change: AlarmChange, now: int) -> dict[
     """An alarm was opened, has another severity, or is closed."""
     alarm = change.alarm
     element, _, quantity = (alarm.parameter or "").rpartition(".")
+    advice = ADVICE["common" if alarm.kind == "change" and "*" in element else alarm.kind]
     data = {
         "vehicle": vehicle,
         "alarm": {
@@ -42,7 +44,7 @@ def alarm_event(base: str, vehicle: str, change: AlarmChange, now: int) -> dict[
             "recovered": optional_iso(alarm.closed),
         },
         "iso13374": {"block": "SD", "function": BLOCKS["SD"]},
-        "advisory": ADVICE[alarm.kind].format(element=element or vehicle) if change.what != "closed" else None,
+        "advisory": advice.format(element=element or vehicle) if change.what != "closed" else None,
         "page": vehicle_page(base, vehicle),
     }
     return _event(ALARM_TYPES[change.what], vehicle, data, now)

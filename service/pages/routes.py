@@ -14,6 +14,7 @@ from sqlalchemy import Connection
 
 from sprung.service.api.access import ActorOf, CoreOf, read
 from sprung.service.api.fleet import silent_before
+from sprung.service.api.queries import one_of
 from sprung.service.fleet.telling import knowledge_dict
 from sprung.service.pages.drawing import columns, small_view
 from sprung.service.pages.render import render
@@ -55,7 +56,7 @@ async def fleet_page(
     before = silent_before(core)
     wanted = Wanted(
         q.strip(),
-        health if health in HEALTH else None,
+        one_of("health", health or None, tuple(HEALTH)),
         before if silent else None,
         False if open else None,
         retired,

@@ -6,6 +6,7 @@ import io
 import json
 from typing import Any
 
+import jsonschema
 import numpy as np
 import pytest
 from fastapi.testclient import TestClient
@@ -118,6 +119,8 @@ def test_the_bundle_is_read_by_mcap_itself(client: TestClient, broken: str, syst
         body, wanted = json.loads(message.data), json.loads(schema.data)
         assert set(wanted["required"]) <= set(body) <= set(wanted["properties"])
         topics[channel.topic] = topics.get(channel.topic, 0) + 1
+        if schema.name == "foxglove.Log":
+            jsonschema.validate(body, FOXGLOVE_LOG)
     assert topics["/signals/car_1l"] >= 6000
     assert topics["/compared/car_1l"] >= 5900
     assert topics["/estimate/secondary_2l/damping"] > 50
@@ -167,6 +170,26 @@ def test_data_in_pages_cannot_break_out(client: TestClient, broken: str) -> None
     for path in ("/pages/vehicles/a", "/"):
         text = client.get(path).text
         assert "<script>alert" not in text and "<b>x</b>" not in text
+
+
+FOXGLOVE_LOG = {  # what Foxglove publishes of its schema foxglove.Log, without descriptions
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {
+                "sec": {"type": "integer", "minimum": 0},
+                "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+            },
+        },
+        "level": {"enum": [0, 1, 2, 3, 4, 5]},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+        "file": {"type": "string"},
+        "line": {"type": "integer", "minimum": 0},
+    },
+    "additionalProperties": False,
+}
 
 
 RIG = """

@@ -105,6 +105,8 @@ def test_search_and_filter(client: TestClient, core: Core) -> None:
         connection.execute(fleet_status.update().where(fleet_status.c.vehicle_id == "car-0007").values(received_ns=old))
     assert [v["vehicle"] for v in client.get("/vehicles?silent=true").json()["vehicles"]] == ["car-0007"]
     assert "silent since" in client.get("/?silent=true").text
+    assert "out of specification 1" in client.get("/?health=").text  # as the form sends it
+    assert client.get("/?health=alarm").json()["errors"][0]["field"] == "health"
 
 
 def test_two_thousand_vehicles_are_paged_quickly(client: TestClient, core: Core) -> None:
