@@ -21,6 +21,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "one process and many: identity, scaling, load, kills, edge, a plan on paper",
     ),
     "serve": ("sprung.benchmarks.serve", "latency of POST /identify, against a bare echo"),
+    "pages": ("sprung.benchmarks.pages", "what a person waits for: a large fleet, a vehicle's page, a month"),
     "trust": ("sprung.benchmarks.trust", "windows acknowledged, lost and doubled while the service is killed"),
     "drift": ("sprung.benchmarks.drift", "delay of alarms and false alarms of the tracker"),
     "sensing": ("sprung.benchmarks.sensing", "every set of sensors: error over the Cramer-Rao bound, coverage"),

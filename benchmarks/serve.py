@@ -36,10 +36,10 @@ def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iter
     body = window_body(system)
     context = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory(prefix="sprung-bench-") as folder:
-        ports = [_free_port(), _free_port()]
+        ports = [free_port(), free_port()]
         servers = [
             context.Process(target=_serve_echo, args=(ports[0],), daemon=True),
-            context.Process(target=_serve_sprung, args=(ports[1], folder), daemon=True),
+            context.Process(target=serve_sprung, args=(ports[1], folder), daemon=True),
         ]
         for server in servers:
             server.start()
@@ -177,7 +177,8 @@ def _ask_together(
     return len(found) / seconds, found
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """One that nobody listens on just now."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
@@ -197,7 +198,8 @@ def _serve_echo(port: int) -> None:
     uvicorn.run(app, port=port, log_level="error", access_log=False)
 
 
-def _serve_sprung(port: int, folder: str) -> None:
+def serve_sprung(port: int, folder: str) -> None:
+    """The service on the store of a folder, until the process is ended."""
     import uvicorn
 
     from sprung.service.api.app import create_app
