@@ -13,6 +13,7 @@ from prometheus_client.registry import Collector
 from sprung.service.live import FeedStatus
 
 STATES = ("receiving", "silent", "behind", "down", "failing", "hung", "ended")
+UNCONNECTED = ("down", "hung", "ended")  # whether windows can be stored at the moment is another matter
 
 
 def request_histogram(registry: CollectorRegistry) -> Histogram:
@@ -58,15 +59,17 @@ class Vitals(Collector):
 
 def _feed_families(feeds: list[FeedStatus]) -> Iterator[Metric]:
     state = GaugeMetricFamily("sprung_feed_state", "1 for the state that a live feed is in", labels=["source", "state"])
+    connected = GaugeMetricFamily("sprung_bus_connected", "Whether the bus of a live feed is open", labels=["source"])
     lag = GaugeMetricFamily("sprung_feed_lag_seconds", "Time that the last frame had waited", labels=["source"])
     lost = CounterMetricFamily("sprung_feed_lost", "What a live feed has lost, by cause", labels=["source", "cause"])
     restarts = CounterMetricFamily("sprung_feed_restarts", "Begun again: bus, reader or writer", labels=["source"])
     for feed in feeds:
         for known in STATES:
             state.add_metric([feed.name, known], float(feed.state == known))
+        connected.add_metric([feed.name], float(feed.state not in UNCONNECTED))
         lag.add_metric([feed.name], feed.lag_seconds)
         lost.add_metric([feed.name, "windows given up"], feed.dropped_windows)
         lost.add_metric([feed.name, "windows not identified"], feed.failed_windows)
         lost.add_metric([feed.name, "frames dropped by the kernel"], feed.lost_frames)
         restarts.add_metric([feed.name], feed.restarts)
-    yield from (state, lag, lost, restarts)
+    yield from (state, connected, lag, lost, restarts)

@@ -30,7 +30,7 @@ from tests.service_fakes import make_window
 ROOT = Path(__file__).parent.parent
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 # not in this registry; test_deploy asks for them
-OF_THE_SERVICE = ("sprung_feed_", "sprung_queue_", "sprung_build_", "sprung_fleet_")
+OF_THE_SERVICE = ("sprung_bus_", "sprung_feed_", "sprung_queue_", "sprung_build_", "sprung_fleet_")
 SUFFIXES = ("_bucket", "_sum", "_count", "_total")
 
 

@@ -289,6 +289,13 @@ def service() -> dict[str, Any]:
             [("sum by (source, cause) (rate(sprung_feed_lost_total[5m]))", "{{source}} {{cause}}")],
             (12, 20, 12, 8),
         ),
+        panel("timeseries", "Buses: connected", [("sprung_bus_connected", "{{source}}")], (0, 28, 12, 8)),
+        panel(
+            "timeseries",
+            "Live feeds: begun again, per hour",
+            [("increase(sprung_feed_restarts_total[1h])", "{{source}}")],
+            (12, 28, 12, 8),
+        ),
     ]
     return dashboard(SERVICE, "service", panels, [])
 

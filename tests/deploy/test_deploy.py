@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
-import json
 import re
 import shutil
-import socket
 import subprocess
 import sys
 import threading
 import time
-import urllib.error
-import urllib.parse
-import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import pytest
 import uvicorn
@@ -30,21 +22,11 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.live import FeedStatus
 from sprung.service.settings import Settings
+from tests.monitoring import DEPLOY, RULES, ask, made, prometheus, queries
 from tests.service_fakes import make_window
 
-DEPLOY = Path(__file__).parents[2] / "deploy"
-RULES = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.yml").read_text())["groups"][0]["rules"]
 MKDOCS = shutil.which("mkdocs", path=str(Path(sys.executable).parent))  # CI does not activate its environment
 MAY_BE_EMPTY = {"Alarms"}  # an annotation: alarms that opened within the last minute
-
-
-def made() -> ModuleType:
-    """The module that makes the dashboards."""
-    spec = importlib.util.spec_from_file_location("make", DEPLOY / "grafana" / "make.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def test_committed_dashboards_are_what_the_code_makes() -> None:
@@ -83,7 +65,6 @@ def test_compose_tells_somebody_and_has_no_usual_password() -> None:
     assert all("mem_limit" in service for service in services.values())
 
 
-@pytest.mark.skipif(shutil.which("amtool") is None, reason="needs amtool, of the package prometheus-alertmanager")
 def test_images_of_others_are_pinned_by_digest() -> None:
     compose = yaml.safe_load((DEPLOY / "docker-compose.yaml").read_text())
     names = [part["image"] for part in compose["services"].values() if "build" not in part]
@@ -94,6 +75,7 @@ def test_images_of_others_are_pinned_by_digest() -> None:
     assert [name for name in names if not re.search(r":[\w.-]+@sha256:[0-9a-f]{64}$", name)] == []
 
 
+@pytest.mark.skipif(shutil.which("amtool") is None, reason="needs amtool, of the package prometheus-alertmanager")
 def test_the_configuration_of_alertmanager_is_one() -> None:
     command = ["amtool", "check-config", str(DEPLOY / "prometheus" / "alertmanager.yml")]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -115,29 +97,16 @@ def core(engine: Engine, data_dir: Path) -> Core:
 
 
 @pytest.fixture
-def prometheus(core: Core, system: System, tmp_path: Path) -> Iterator[str]:
+def judge(core: Core, system: System, tmp_path: Path) -> Iterator[str]:
     """The address of a Prometheus that has scraped an alarmed vehicle for a while."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
     server = uvicorn.Server(uvicorn.Config(create_app(core), port=0, log_level="warning", lifespan="on"))
     thread = threading.Thread(target=server.run, daemon=True)
     thread.start()
     while not server.started:
         thread.join(0.05)
-    target = f"127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}"
-    jobs = [{"job_name": "sprung", "static_configs": [{"targets": [target]}]}]
-    config = {"global": {"scrape_interval": "1s", "evaluation_interval": "1s"}, "scrape_configs": jobs}
-    config["rule_files"] = [str(DEPLOY / "prometheus" / "sprung.rules.yml")]  # type: ignore[assignment]
-    (tmp_path / "prometheus.yml").write_text(yaml.safe_dump(config))
-    command = ["prometheus", f"--config.file={tmp_path}/prometheus.yml", f"--storage.tsdb.path={tmp_path}/tsdb"]
-    with subprocess.Popen(
-        [*command, f"--web.listen-address=127.0.0.1:{port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
-        try:
-            replay(core, system)
-            yield f"http://127.0.0.1:{port}"
-        finally:
-            process.terminate()
+    with prometheus(f"127.0.0.1:{server.servers[0].sockets[0].getsockname()[1]}", tmp_path) as address:
+        replay(core, system)
+        yield address
     server.should_exit = True
     thread.join(20)
 
@@ -154,48 +123,27 @@ def replay(core: Core, system: System) -> None:
         time.sleep(1.0)
 
 
-def ask(address: str, query: str) -> list[Any]:
-    """What Prometheus answers to a query; fails where it refuses it."""
-    url = f"{address}/api/v1/query?{urllib.parse.urlencode({'query': query})}"
-    try:
-        with urllib.request.urlopen(url, timeout=10) as answer:
-            found = json.load(answer)
-    except urllib.error.HTTPError as error:
-        raise AssertionError(f"{query}: {error.read().decode()}") from error
-    result: list[Any] = found["data"]["result"]
-    return result
-
-
 @pytest.mark.skipif(shutil.which("prometheus") is None, reason="needs prometheus, of the package of that name")
-def test_every_query_of_panels_variables_and_rules_is_answered(prometheus: str) -> None:
-    empty = []
-    for name, build in made().DASHBOARDS.items():
-        board = build()
-        queries = [(p["title"], t["expr"]) for p in board["panels"] for t in p["targets"]]
-        queries += [(a["name"], a["expr"]) for a in board["annotations"]["list"]]
-        for variable in board["templating"]["list"]:
-            series = re.match(r"label_values\((.*), \w+\)", variable["query"])
-            queries += [(variable["name"], series[1])] if series else []
-        for title, expr in queries:
-            query = expr.replace("$vehicle", "a").replace('="$element"', '=~".*"').replace("$element", ".*")
-            if not ask(prometheus, query) and title not in MAY_BE_EMPTY:
-                empty.append((name, title, query))
-    assert empty == []
+def test_every_query_of_panels_variables_and_rules_is_answered(judge: str) -> None:
+    asked = [query for query in queries("a") if query.title not in MAY_BE_EMPTY]
+    assert [query for query in asked if not ask(judge, query.expression)] == []
     for rule in RULES:
-        ask(prometheus, rule["expr"])
+        ask(judge, rule["expr"])
         for metric in re.findall(r"sprung_\w+", rule["expr"]):
-            assert ask(prometheus, metric), (rule["alert"], metric)
-    assert {alert["metric"]["alertname"] for alert in ask(prometheus, "ALERTS")} >= {"SprungSuspensionChanged"}
+            assert ask(judge, metric), (rule["alert"], metric)
+    assert {alert["metric"]["alertname"] for alert in ask(judge, "ALERTS")} >= {"SprungSuspensionChanged"}
 
 
 @pytest.mark.skipif(MKDOCS is None, reason="needs mkdocs, as `make docs` installs it")
 def test_the_site_of_the_documents_asks_no_other_host(tmp_path: Path) -> None:
     root = DEPLOY.parent
     assert MKDOCS is not None
-    command = [MKDOCS, "build", "--quiet", "--site-dir", str(tmp_path / "site")]
+    command = [MKDOCS, "build", "--quiet", "--strict", "--site-dir", str(tmp_path / "site")]
     done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     pages = list((tmp_path / "site").rglob("*.html"))
+    first = (tmp_path / "site" / "index.html").read_text()
+    assert [path.stem for path in (root / "docs").rglob("*.md") if f"{path.stem}.html" not in first] == ["README"]
     assert {page.stem for page in pages} >= {path.stem for path in (root / "docs").glob("*.md")}
     for page in pages:
         loaded = re.findall(r"<(?:script|img|iframe)[^>]* src=\"([^\"]+)\"", page.read_text())

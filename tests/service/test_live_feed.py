@@ -87,6 +87,7 @@ def test_a_source_is_followed_and_what_came_is_stored_at_the_end(core: Core, fee
     assert feed.status().state == "receiving"
     assert b'sprung_frames_total{outcome="used",source="test:0"}' in core.metrics.render()
     assert b'sprung_feed_state{source="test:0",state="receiving"} 1.0' in core.metrics.render()
+    assert b'sprung_bus_connected{source="test:0"} 1.0' in core.metrics.render()
 
 
 def test_a_locked_store_loses_no_window_and_shows_meanwhile(
