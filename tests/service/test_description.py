@@ -124,24 +124,30 @@ def test_the_typed_client_uploads(address: str, tmp_path: Path) -> None:
     assert client.wait(job.id, 60).state in ("done", "failed")
 
 
+OVERRIDES = "content_type_overrides: {application/vnd.sprung.estimates: application/octet-stream}"  # of an edge
+
+
 def test_a_generated_client_reads_a_vehicle(address: str, tmp_path: Path) -> None:
     tool = shutil.which("openapi-python-client", path=str(Path(sys.executable).parent))  # CI does not activate it
     if tool is None:
         pytest.skip("needs openapi-python-client")
     with urllib.request.urlopen(f"{address}/openapi.json") as answer:
         (tmp_path / "openapi.json").write_bytes(answer.read())
+    (tmp_path / "config.yaml").write_text(OVERRIDES)
     command = [tool, "generate", "--path", "openapi.json", "--meta", "none", "--output-path", "made"]
+    command += ["--config", "config.yaml"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "WARNING" not in done.stdout + done.stderr, done.stdout + done.stderr
     script = (
-        "from made import Client; from made.models import Vehicle; import importlib, pkgutil, made.api.vehicles as v\n"
-        "name = next(m.name for m in pkgutil.iter_modules(v.__path__) if m.name.startswith('vehicle_vehicles_id'))\n"
-        f"got = importlib.import_module(f'made.api.vehicles.{{name}}').sync('a', client=Client('{address}'))\n"
-        "assert isinstance(got, Vehicle), got\n"
-        "print(got.health, len(got.parameters))"
+        "from made import Client; from made.models import ProblemAnswer, VehicleAnswer\n"
+        "from made.api.vehicles import vehicle_vehicles_id_get as route\n"
+        f"client = Client('{address}')\n"
+        "got, none = route.sync('a', client=client), route.sync('nobody', client=client)\n"
+        "assert isinstance(got, VehicleAnswer) and isinstance(none, ProblemAnswer), (got, none)\n"
+        "print(got.health, len(got.parameters), none.status)"
     )
     read = subprocess.run([sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert read.stdout.split() == ["out_of_specification", "24"], read.stdout + read.stderr
+    assert read.stdout.split() == ["out_of_specification", "24", "404"], read.stdout + read.stderr
 
 
 def test_files_of_others_are_those_that_were_published() -> None:
