@@ -92,6 +92,7 @@ class LiveBus:
         """Samples as they come, at most `latency` s after their frames; ends when `stop` is set."""
         retry = FIRST_RETRY
         while not self.stop.is_set():
+            self.beat = time.monotonic()  # a bus that is absent is looked for: the reader does not hang
             try:
                 with self._open() as bus:  # type: ignore[no-untyped-call]
                     widen(bus)

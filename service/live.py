@@ -106,12 +106,15 @@ class LiveFeed:
         self._trouble = ""  # why the reader failed
         self._refused = ""  # why nothing can be kept at the moment
         self._hung = False
+        self._begun = 0.0  # monotonic s, when the reader in place of one that hung was started
         self._ended = False
         self._last_block = self._dropped_at = -1e9  # monotonic s
         self._dropped = self._failed = self._restarts = 0
 
     def start(self) -> None:
         """Begin."""
+        if hasattr(self.source, "beat"):  # it may have been made long ago
+            self.source.beat = time.monotonic()
         for thread in (self._reading, self._keeping, self._watching):
             thread.start()
 
@@ -246,15 +249,17 @@ class LiveFeed:
                 self._restarts += 1
                 self._keeping = self._thread(self._keep)
                 self._keeping.start()
-            silent = time.monotonic() - getattr(self.source, "beat", time.monotonic())
-            if self._ended or (self._reading.is_alive() and silent < HUNG_SECONDS):
+            beat = getattr(self.source, "beat", time.monotonic())
+            if self._ended or (self._reading.is_alive() and time.monotonic() - beat < HUNG_SECONDS):
+                self._hung = self._hung and beat <= self._begun  # until the one that was started gives a sign
                 continue
             log.error("the reader of %s gives no sign; another one is started", self.source.name)
             self._restarts += 1
             self._hung = True
             self._turn += 1
+            self._begun = time.monotonic()
             if hasattr(self.source, "beat"):
-                self.source.beat = time.monotonic()
+                self.source.beat = self._begun
             self._reading = self._thread(self._read)
             self._reading.start()
 

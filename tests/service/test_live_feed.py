@@ -20,6 +20,7 @@ from sprung.model.signals import SampleBlock, Tally
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.bus import opening_options, parse_bus, socket_drops
 from sprung.replay.frames import EXTENDED
+from sprung.replay.live import LiveBus
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
@@ -172,6 +173,32 @@ def test_a_reader_that_hangs_is_replaced(
     eventually(lambda: len(stored(core)) > 3)
     assert feed.status().restarts >= 1
     release.set()
+
+
+def test_an_absent_bus_is_down_and_its_reader_does_not_hang(core: Core, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sprung.service.live.HUNG_SECONDS", 0.4)
+    monkeypatch.setattr("sprung.service.live.WATCH_SECONDS", 0.05)
+    monkeypatch.setattr("sprung.replay.live.LAST_RETRY", 0.1)
+    monkeypatch.setattr("sprung.replay.live.FIRST_RETRY", 0.05)
+
+    def absent(**_: Any) -> Any:
+        raise OSError("no such device")
+
+    assert core.engine.dbc is not None
+    bus = LiveBus(
+        "socketcan", "can9", core.engine.system.channels, core.engine.dbc, stop=core.stopping, open_bus=absent
+    )
+    bus.beat -= 100.0  # the model took long to load
+    feed = LiveFeed(core.pipeline, bus, "live", core.stopping, core.tally_counter(bus.name))
+    core.feeds.append(feed)
+    feed.start()
+    time.sleep(1.0)
+    assert feed.status().state == "down" and "no such device" in feed.status().detail
+    assert b'sprung_bus_connected{source="socketcan:can9"} 0.0' in core.metrics.render()
+    feed._hung, feed._begun = True, time.monotonic()  # as after a moment in which nothing ran
+    eventually(lambda: feed.status().state == "down")
+    core.stopping.set()
+    assert feed.join(10)
 
 
 def test_overload_gives_up_whole_windows_and_counts_them(
