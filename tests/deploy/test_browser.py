@@ -16,15 +16,17 @@ from typing import Any
 import pytest
 import uvicorn
 
-from sprung.model.system import MANCHESTER, System
+from sprung.model.system import MANCHESTER, System, load_system
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.engine import Engine
+from sprung.service.report import write_report
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.worker import Emit
 from tests.oidc_provider import provider_settings, running_provider
+from tests.report_made import friction_report
 from tests.service_fakes import REPORT, START, make_window
 
 CHROMIUM = shutil.which("chromium")
@@ -198,16 +200,19 @@ def test_the_first_load_of_a_vehicle_is_light(address: str, browser: Any) -> Non
 @pytest.mark.parametrize("width", [1400, 380])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_nothing_serious(address: str, browser: Any, name: str, width: int, scheme: str) -> None:
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
     context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
     page = context.new_page()
     page.goto(address + PAGES[name])
     page.wait_for_timeout(700)
-    found = axe.Axe().run(page).response["violations"]
-    assert [
-        (one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")
-    ] == []
+    assert serious(page) == []
     context.close()
+
+
+def serious(page: Any) -> list[tuple[str, str]]:
+    """What axe-core calls serious or worse: the rule, and where."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright")
+    found = axe.Axe().run(page).response["violations"]
+    return [(one["id"], one["nodes"][0]["html"][:200]) for one in found if one["impact"] in ("serious", "critical")]
 
 
 def test_every_control_of_the_vehicle_page_is_reached_by_keys_and_seen(address: str, browser: Any) -> None:
@@ -246,6 +251,26 @@ def test_an_alarm_is_acknowledged_by_keys(address: str, browser: Any) -> None:
     page.goto(address + PAGES["vehicle"])
     assert "acknowledged" in page.inner_text("main")
     page.close()
+
+
+@pytest.fixture(scope="module")
+def report_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("report")
+    return write_report(friction_report(), load_system(), folder).page
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [1400, 380])
+def test_a_report_is_read_on_a_phone_and_in_the_dark(report_page: Path, browser: Any, width: int, scheme: str) -> None:
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page = context.new_page()
+    page.goto(report_page.as_uri())
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    red = page.evaluate("Number(getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0])")
+    assert (red < 100) == (scheme == "dark")
+    assert serious(page) == []
+    kept(page, f"report-{width}-{scheme}")
+    context.close()
 
 
 LAW = "laws: [{coulomb_friction: {force: {value: 300, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"
