@@ -18,7 +18,8 @@ router = APIRouter(tags=["identify"])
 BODY = {
     "requestBody": {
         "required": True,
-        "content": {MEDIA_TYPE: {"schema": {"type": "string", "format": "binary"}}},
+        "description": f"As {MEDIA_TYPE}, which an edge says, or as any octets.",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
     }
 }
 _ID: TypeAdapter[str] = TypeAdapter(VehicleId)

@@ -32,7 +32,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/docs"): Need("read", by_fleet=True),
     ("GET", "/openapi.json"): Need("read", by_fleet=True),
     ("POST", "/identify"): Need("ingest", by_fleet=True),
-    ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(MEDIA_TYPE,)),
+    ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(MEDIA_TYPE, "application/octet-stream")),
     ("POST", "/ingest/windows"): Need("ingest", by_fleet=True),
     ("POST", "/recordings"): Need("ingest", by_fleet=True, body=FORM),
     ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", *FORM)),

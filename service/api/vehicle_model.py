@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import PlainTextResponse, Response
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from sqlalchemy import Connection
 
 from sprung.service.api import models
@@ -29,8 +29,18 @@ router = APIRouter(tags=["operation"])
 MOST_CHARACTERS = 500_000  # of a system file
 
 
+GIVEN = {"report": "string", "version": "integer", "system": "string"}  # of which one says what to use
+
+
 class ModelBody(StrictBody):
     """One of the three."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "oneOf": [{"required": [name], "properties": {name: {"type": kind}}} for name, kind in GIVEN.items()],
+            "maxProperties": 1,
+        }
+    )
 
     report: str | None = Field(default=None, max_length=36, description="a mismatch report: its system file is used")
     version: int | None = Field(default=None, ge=0, le=2**31 - 1, description="an earlier one; 0: the service's own")
