@@ -111,7 +111,7 @@ schemathesis: install-dev
 
 audit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "pip-audit>=2.7,<3"
-	$(BIN)/pip-audit --requirement requirements.lock --no-deps
+	$(BIN)/pip-audit --strict --requirement requirements.lock --no-deps
 
 bandit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"
@@ -119,7 +119,7 @@ bandit: install-dev
 
 docs: install-dev
 	$(BIN)/python docs/reference.py
-	$(BIN)/mkdocs build --quiet --site-dir site
+	$(BIN)/mkdocs build --quiet --strict --site-dir site
 
 bench: install
 	$(BIN)/sprung bench $(NAME)
