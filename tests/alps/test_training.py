@@ -261,6 +261,7 @@ def test_torchdiffeq_and_our_solutions_agree(task: Task) -> None:
         assert float(error.abs().max()) < tolerance
 
 
+@pytest.mark.slow
 def test_what_physics_costs_is_measured_for_the_train_too() -> None:
     rows = list(physics_overhead.run("quick", system="train", batch=2))
     assert [row["method"] for row in rows] == [

@@ -45,6 +45,7 @@ def test_a_decay_whose_spring_is_far_from_nominal_is_consistent(stiffer: float, 
         assert abs(value.value - truth) < max(4 * value.std, 1e-3 * truth)
 
 
+@pytest.mark.slow
 def test_friction_that_brings_the_mass_to_rest_is_named_with_its_force() -> None:
     report = diagnosed(let_go(5000.0, 4.0, 6.0, 0.05, 10.0), 4500.0, 6.0)
     assert report.verdict == "missing_physics", report.summary

@@ -122,7 +122,6 @@ def test_no_name_of_a_client_reaches_the_file_system(
     if response.status_code == 202:
         assert [path.parent for path in stored] == [core.settings.uploads]
         assert "evil" not in stored[0].name
-        finished(client, response.json())
     else:
         assert response.status_code in (400, 422) and stored == []
 

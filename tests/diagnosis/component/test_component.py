@@ -268,6 +268,7 @@ def test_noise_of_a_differentiated_motion_is_no_law(seed: int) -> None:
     assert (found.verdict, laws(found)) == ("consistent", [])
 
 
+@pytest.mark.slow
 def test_what_a_law_leaves_large_is_not_that_law() -> None:
     """A slider driven through a play that stays where it was pushed: no law of the catalogue is near."""
     random, t = np.random.default_rng(4), np.arange(4000) / RATE

@@ -86,8 +86,8 @@ def wrong(values: FloatArray, kind: str) -> FloatArray:
     [
         ("late node", "node_delay", "a1|a2|a3", 0.08),
         ("late force", "node_delay", "shaker", 0.08),
-        ("reversed sensor", "sign_reversed", "a2", None),
-        ("exchanged", "channels_swapped", "a1|a3", None),
+        pytest.param("reversed sensor", "sign_reversed", "a2", None, marks=pytest.mark.slow),
+        pytest.param("exchanged", "channels_swapped", "a1|a3", None, marks=pytest.mark.slow),
         ("kN", "wrong_scale", "shaker", 1e-3),
         ("g", "wrong_scale", "a1|a2|a3", 1 / 9.80665),
     ],
