@@ -48,6 +48,10 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.structure",
         "parts that the file does not state: connections, hanging masses, lever arms; named, and none invented",
     ),
+    "several-laws": (
+        "sprung.benchmarks.several_laws",
+        "three to five laws at once, two at one element",
+    ),
     "silverbox": ("sprung.benchmarks.silverbox", "missing physics in the Silverbox record (--data DIR)"),
     "real": ("sprung.benchmarks.real", "measured dampers, an axis and a beam, beside references (--data DIR)"),
     "video": ("sprung.benchmarks.real_video", "real videos: the length of their pendulums (--data DIR)"),

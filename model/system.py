@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import numpy as np
 
 from sprung.model.address import Address
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
+from sprung.model.laws.in_place import Follower, Whole, all_in_place
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
@@ -64,16 +65,19 @@ def _signal_channel(name: str, at: FollowedSignal) -> Channel:
 class System:
     """A checked system.  Parameters are ordered element by element: all stiffnesses, all dampings, then masses.
 
+    Those of linear laws come between dampings and masses, ratios of masses at the end.
+
     A body's mass parameter scales its mass and its inertias together (a load that is spread like the body).
     """
 
     file: SystemFile
     catalogue: tuple[Law, ...] = CATALOGUE
+    whole: bool = False  # whether laws of bodies and of the structure are part of the mechanics; see `whole_system`
 
     def __reduce__(self) -> tuple[type[System], tuple[object, ...]]:
         """To another process goes the file: the bundled laws are there already, and functions do not travel."""
         own = () if self.catalogue is CATALOGUE else (self.catalogue,)
-        return System, (self.file, *own)
+        return (_whole_again if self.whole else System), (self.file, *own)
 
     @cached_property
     def laws(self) -> tuple[PlacedLaw, ...]:
@@ -103,7 +107,31 @@ class System:
 
     @cached_property
     def mechanics(self) -> Mechanics:
-        return assemble(self.file)
+        return self._in_place.mechanics
+
+    @property
+    def followers(self) -> tuple[Follower, ...]:
+        """What follows the values of linear laws, which are parameters of the whole system."""
+        return self._in_place.followers
+
+    @property
+    def all_elements(self) -> tuple[str, ...]:
+        """Names of the elements of the mechanics."""
+        return (*self.elements, *self._in_place.added)
+
+    @cached_property
+    def _in_place(self) -> Whole:
+        nominal = assemble(self.file)
+        return all_in_place(self.file, nominal, self.laws) if self.whole else Whole(nominal)
+
+    @cached_property
+    def whole_system(self) -> System:
+        """With the laws of bodies and of the structure in its mechanics, their values among its parameters.
+
+        Their elements come after those of the file, their degrees of freedom after those of the bodies.  Errors:
+        `model.laws.in_place.LawError`.
+        """
+        return self if self.whole else replace(self, whole=True)
 
     @cached_property
     def elements(self) -> tuple[str, ...]:
@@ -201,16 +229,22 @@ class System:
                     value = getattr(element, quantity)
                     if not value.fixed:
                         found.append(Parameter(f"{name}.{quantity}", name, quantity, SI[quantity], value.value))
+        found += [follower.parameter for follower in self.followers if follower.element >= 0]
         if "mass" in self.file.estimate:
             for name, body in self.file.bodies.items():
                 if not body.mass.fixed:
                     found.append(Parameter(f"{name}.mass", name, "mass", "kg", body.mass.value))
+        found += [follower.parameter for follower in self.followers if follower.body >= 0]
         return tuple(found)
 
     @cached_property
     def tracked(self) -> tuple[Parameter, ...]:
-        """What windows are asked for: the parameters, then positive values of element laws that are not fixed."""
-        found = list(self.parameters)
+        """What windows are asked for: the parameters, then positive values of element laws that are not fixed.
+
+        Among the parameters are those values of laws of bodies and of the structure that something grows with a power
+        of; where a mode acts, or a mass hangs, is held.
+        """
+        found = list(self.whole_system.parameters)
         for placed in self.laws:
             if isinstance(placed.law, ElementLaw):
                 values = zip(placed.law.parameters, placed.names, placed.values, placed.fixed, strict=True)
@@ -311,6 +345,10 @@ class System:
             source["kind"] = "displacement" if source["kind"] == "support" else source["kind"]
         _without_empty_laws(keep)
         return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _whole_again(file: SystemFile, catalogue: tuple[Law, ...] = CATALOGUE) -> System:
+    return System(file, catalogue, whole=True)
 
 
 def _with_parts(signals: list[dict[str, Any]]) -> list[dict[str, Any]]:

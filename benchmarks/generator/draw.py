@@ -89,7 +89,8 @@ def _values(rng: np.random.Generator, vehicle: Vehicle) -> tuple[dict[str, float
     return stiffness, damping
 
 
-def _add_law(case: Case, rng: np.random.Generator, element: str, law: str, weak: float) -> None:
+def add_law(case: Case, rng: np.random.Generator, element: str, law: str, weak: float) -> None:
+    """Puts a law at an element; weak: as in `draw_cases`."""
     low, high = LAWS[law].strength
     strength = _log_uniform(rng, low**weak * high ** (1 - weak), high if weak <= 1 else low)
     deflection, rate = USUAL["secondary" if element.startswith("secondary") else "primary"]
@@ -122,12 +123,12 @@ def _conceal(case: Case, rng: np.random.Generator, vehicle: Vehicle, weak: float
     small = 0.05 ** max(weak - 1, 0)  # of faults and bodies; laws have ranges of their own
     element = str(rng.choice(elements if rng.random() < 0.6 else elements[8:]))
     if kind in LAWS:
-        _add_law(case, rng, element, kind, weak)
+        add_law(case, rng, element, kind, weak)
     elif kind == "two":
         names = [name for name, law in LAWS.items() if law.named]
         places = rng.choice(elements, 2, replace=False)
         for place, law in zip(places, rng.choice(names, 2, replace=False), strict=True):
-            _add_law(case, rng, str(place), str(law), weak * 0.5)
+            add_law(case, rng, str(place), str(law), weak * 0.5)
     elif kind == "flexible_mode":
         case.flex = [rng.uniform(6, 16), rng.uniform(0.01, 0.03), small * _log_uniform(rng, 0.03, 0.5), 8000.0]
     elif kind == "external_force":

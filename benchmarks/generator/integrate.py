@@ -109,7 +109,7 @@ class BatchMotion:
         self.linear += self.plant.damping * rate
         memory_rate = self._laws(deflection, rate, memory, time)
         force = self.linear.copy()
-        force[self.row, self.column] += self.extra  # at most one law per element and recording
+        np.add.at(force, (self.row, self.column), self.extra)  # of an element with two laws, both
         out = np.empty_like(state)
         out[: n + 1] = state[n + 1 :]
         push = self.pull @ force

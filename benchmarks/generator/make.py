@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from sprung.benchmarks.generator.draw import Case
 from sprung.benchmarks.generator.exact import exact_response, is_linear
 from sprung.benchmarks.generator.files import WRITERS
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE, WARM_UP, PlantBatch, Slot, simulate
-from sprung.benchmarks.generator.oracle import SETTLE, oracle_snr
+from sprung.benchmarks.generator.oracle import SETTLE, oracle_snr, snr_of_each
 from sprung.benchmarks.generator.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -140,6 +140,14 @@ def _integrated(
     for column in range(len(group)):
         own = [float(s) for s, slot in zip(strength, plant.slots, strict=True) if slot.column == column]
         yield clean[:, :, column], own
+
+
+def make_with_each_missing(vehicle: Vehicle, case: Case, seconds: float = 60.0) -> tuple[Array, list[float]]:
+    """What is measured of a case (T, C), and the signal-to-noise ratio of each of its laws beside the others."""
+    samples, effects = round(seconds * SAMPLE_RATE), case.effects
+    less = [replace(case, effects=effects[:i] + effects[i + 1 :]) for i in range(len(effects))]
+    whole, *without = (clean[:samples] for clean, _ in _integrated(vehicle, [case, *less], seconds, None))
+    return _noisy(vehicle, case, whole), snr_of_each(vehicle, case, whole, without)
 
 
 def label(made: MadeRecording, seconds: float) -> dict[str, Any]:

@@ -13,6 +13,8 @@ frequency domain with an own transfer matrix.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -63,6 +65,55 @@ def _windowed_spectrum(series: Array, keep: slice) -> Complex:
     return spectrum
 
 
+class OracleTest:
+    """What the best test makes of deviations in one recording; clean: its true filtered signals, (T, channels)."""
+
+    def __init__(self, vehicle: Vehicle, case: Case, clean: Array) -> None:
+        self.wheels = wheels = len(vehicle.inputs)
+        periodic = _periodic(clean[:, :wheels])
+        omega_full = np.asarray(2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE), dtype=np.float64)
+        values = (np.array([found[e] for e in vehicle.elements]) for found in (case.stiffness, case.damping))
+        stiffness, damping = values
+        full = VehicleTransfer(vehicle, stiffness, damping, omega_full)
+        spectrum = np.fft.rfft(periodic, axis=0)
+
+        def back(values: Complex) -> Array:
+            result: Array = np.fft.irfft(values, len(periodic), axis=0)[: len(clean)]
+            return result
+
+        self.linear = back(np.einsum("fsw,fw->fs", full.to_sensors, spectrum))
+        self.keep = slice(int(SETTLE * SAMPLE_RATE), len(clean))
+        n = len(clean[self.keep])
+        frequency = np.fft.rfftfreq(n, 1 / SAMPLE_RATE)
+        self.band = (frequency > 0) & (frequency < TOP)
+        self.omega = np.asarray(2 * np.pi * frequency[self.band], dtype=np.float64)
+        self.there = VehicleTransfer(vehicle, stiffness, damping, self.omega)
+        self.s_d, self.s_v = vehicle.input_noise
+        # of the fused displacement, (F, wheels)
+        self.variance = 1 / (1 / self.s_d**2 + (self.omega[:, None] / self.s_v) ** 2)
+        seen = self.there.to_sensors
+        noise = np.einsum("fsw,fw,ftw->fst", seen, self.variance, seen.conj()) + np.diag(vehicle.sensor_noise**2)
+        self.whiten = np.linalg.inv(np.linalg.cholesky(noise))
+        self.columns = self.spectrum(back(_sensitivities(full, spectrum, omega_full)))
+        self.share = len(clean) / n  # the settling part would have told as much per second
+
+    def spectrum(self, series: Array) -> Complex:
+        """Of series (T, ...) within the band, (F, ...)."""
+        found: Complex = _windowed_spectrum(series, self.keep)[self.band]
+        return found
+
+    def square(self, delta: Complex, beside: Sequence[Complex] = ()) -> float:
+        """snr^2 of a deviation of the sensors (F, S) that neither parameters nor the deviations `beside` imitate."""
+        flat = (self.whiten @ delta[:, :, None]).ravel()
+        columns = np.concatenate([self.columns, *[other[:, :, None] for other in beside]], axis=2)
+        matrix = (self.whiten @ columns).reshape(flat.size, -1)
+        left = np.concatenate([flat.real, flat.imag])
+        stacked = np.vstack([matrix.real, matrix.imag]) / (np.linalg.norm(matrix, axis=0) + 1e-300)
+        basis, _ = np.linalg.qr(stacked)
+        left = left - basis @ (basis.T @ left)
+        return float(2 * self.share * (left @ left))
+
+
 def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> float | None:
     """The signal-to-noise ratio of the case's concealed effects together; None where no oracle is defined.
 
@@ -71,43 +122,22 @@ def oracle_snr(vehicle: Vehicle, case: Case, clean: Array, faulty: Array) -> flo
     """
     if case.fault and case.fault[1] in {"sensor_noise", "sensor_stuck"}:
         return None
-    wheels = len(vehicle.inputs)
-    periodic = _periodic(clean[:, :wheels])
-    omega_full = np.asarray(2 * np.pi * np.fft.rfftfreq(len(periodic), 1 / SAMPLE_RATE), dtype=np.float64)
-    stiffness, damping = (np.array([values[e] for e in vehicle.elements]) for values in (case.stiffness, case.damping))
-    full = VehicleTransfer(vehicle, stiffness, damping, omega_full)
-    spectrum = np.fft.rfft(periodic, axis=0)
-
-    def back(values: Complex) -> Array:
-        result: Array = np.fft.irfft(values, len(periodic), axis=0)[: len(clean)]
-        return result
-
-    linear = back(np.einsum("fsw,fw->fs", full.to_sensors, spectrum))
-    keep = slice(int(SETTLE * SAMPLE_RATE), len(clean))
-    delta = _windowed_spectrum(faulty[:, 2 * wheels :] - linear, keep)
-    columns = _windowed_spectrum(back(_sensitivities(full, spectrum, omega_full)), keep)
-    n = len(clean[keep])
-    frequency = np.fft.rfftfreq(n, 1 / SAMPLE_RATE)
-    band = (frequency > 0) & (frequency < TOP)
-    omega = np.asarray(2 * np.pi * frequency[band], dtype=np.float64)
-    there = VehicleTransfer(vehicle, stiffness, damping, omega)
-    s_d, s_v = vehicle.input_noise
-    variance = 1 / (1 / s_d**2 + (omega[:, None] / s_v) ** 2)  # of the fused displacement, (F, wheels)
-    delta = delta[band]
+    test = OracleTest(vehicle, case, clean)
+    wheels, omega = test.wheels, test.omega
+    delta = test.spectrum(faulty[:, 2 * wheels :] - test.linear)
     extra = 0.0
     if case.fault and (faulty[:, : 2 * wheels] != clean[:, : 2 * wheels]).any():
-        wrong = _windowed_spectrum(faulty[:, : 2 * wheels] - clean[:, : 2 * wheels], keep)[band]
-        shifted = wrong[:, :wheels] / s_d**2 + wrong[:, wheels:] * omega[:, None] / s_v**2 / 1j
-        delta = delta - np.einsum("fsw,fw->fs", there.to_sensors, shifted * variance)
+        wrong = test.spectrum(faulty[:, : 2 * wheels] - clean[:, : 2 * wheels])
+        shifted = wrong[:, :wheels] / test.s_d**2 + wrong[:, wheels:] * omega[:, None] / test.s_v**2 / 1j
+        delta = delta - np.einsum("fsw,fw->fs", test.there.to_sensors, shifted * test.variance)
         contradiction = wrong[:, wheels:] / (1j * omega[:, None]) - wrong[:, :wheels]
-        extra = 2 * float(np.sum(np.abs(contradiction) ** 2 / (s_d**2 + (s_v / omega[:, None]) ** 2)))
-    noise = np.einsum("fsw,fw,ftw->fst", there.to_sensors, variance, there.to_sensors.conj())
-    noise += np.diag(vehicle.sensor_noise**2)
-    whiten = np.linalg.inv(np.linalg.cholesky(noise))
-    flat = (whiten @ delta[:, :, None]).ravel()
-    matrix = (whiten @ columns[band]).reshape(flat.size, -1)
-    left = np.concatenate([flat.real, flat.imag])
-    basis, _ = np.linalg.qr(np.vstack([matrix.real, matrix.imag]) / (np.linalg.norm(matrix, axis=0) + 1e-300))
-    left = left - basis @ (basis.T @ left)
-    share = len(clean) / n  # the settling part would have told as much per second
-    return float(np.sqrt(2 * share * (left @ left) + extra * share))
+        extra = 2 * float(np.sum(np.abs(contradiction) ** 2 / (test.s_d**2 + (test.s_v / omega[:, None]) ** 2)))
+    return float(np.sqrt(test.square(delta) + extra * test.share))
+
+
+def snr_of_each(vehicle: Vehicle, case: Case, clean: Array, without: Sequence[Array]) -> list[float]:
+    """The ratio of every law beside the others; without: the true signals where one of them is missing."""
+    test = OracleTest(vehicle, case, clean)
+    sensors = slice(2 * test.wheels, None)
+    deltas = [test.spectrum(clean[:, sensors] - one[:, sensors]) for one in without]
+    return [float(np.sqrt(test.square(own, deltas[:i] + deltas[i + 1 :]))) for i, own in enumerate(deltas)]

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.exchange.statespace import ExchangeError
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.expression import MOTION, Expression, parse
+from sprung.model.laws.in_place import is_linear
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY
 from sprung.model.signals import FloatArray
@@ -32,23 +33,26 @@ class EquationSite:
 
 
 def sites(system: System) -> list[EquationSite]:
-    """The laws of a system's elements, with formulas.  Errors: `ExchangeError` for laws that no formula describes."""
+    """The laws of a whole system's elements, part by part, with formulas.  Errors: `ExchangeError` for laws that no
+    formula describes, forces and movements that nobody measures among them."""
     found = []
     for placed in system.laws:
         law = placed.law
-        if not isinstance(law, ElementLaw):
-            continue
-        if not law.formula:
+        if isinstance(law, SensorLaw) or is_linear(placed):
+            continue  # of the measurement; part of the mechanics
+        texts = () if not isinstance(law, ElementLaw) else law.parts or ((law.formula, law.memory_formula),)
+        if not isinstance(law, ElementLaw) or not all(force for force, _ in texts):
             raise ExchangeError(f"{placed.location}: {law.name} has no formula and cannot be exported")
         known = {*law.names, *MOTION}
-        memory = parse(law.memory_formula, known) if law.memory_formula else None
         at = [system.elements.index(name) for name in placed.places]
         for group in [at] if law.where == "pair" else [[e] for e in at]:
-            weights = np.zeros(len(system.elements))
+            weights = np.zeros(len(system.all_elements))
             weights[group[0]] = 1.0
             if len(group) == 2:
                 weights[group[1]] = -1.0
-            found.append(EquationSite(placed, law, weights, group[0], parse(law.formula, known), memory))
+            for force, rate in texts:
+                memory = parse(rate, known) if rate else None
+                found.append(EquationSite(placed, law, weights, group[0], parse(force, known), memory))
     return found
 
 

@@ -34,7 +34,7 @@ def write_fmu(path: Path, system: System, *, compiler: str | None = "cc") -> Non
 
     Errors: `ExchangeError` for laws without a formula and where the compiler fails.
     """
-    name = identifier(system.name)
+    name, system = identifier(system.name), system.whole_system
     laws = sites(system)
     equations = _equations(system, laws)
     guid = "{" + hashlib.sha256(equations.encode()).hexdigest()[:32] + "}"
@@ -74,7 +74,7 @@ def _compile(compiler: str, sources: Path, folder: Path, name: str) -> None:
 def parameters(system: System, laws: list[EquationSite]) -> Iterator[tuple[str, float, str]]:
     """Name, value and unit of every parameter, in the order of their value references."""
     for quantity, unit in (("stiffness", "N/m"), ("damping", "N.s/m")):
-        for name, value in zip(system.elements, getattr(system.mechanics, quantity).tolist(), strict=True):
+        for name, value in zip(system.all_elements, getattr(system.mechanics, quantity).tolist(), strict=True):
             yield f"{name}.{quantity}", value, unit
     for placed in dict.fromkeys(site.placed for site in laws):
         for full, spec, value in zip(placed.names, placed.law.parameters, placed.values, strict=True):
@@ -83,7 +83,7 @@ def parameters(system: System, laws: list[EquationSite]) -> Iterator[tuple[str, 
 
 def _equations(system: System, laws: list[EquationSite]) -> str:
     """The generated header but for its GUID."""
-    m, E, n = system.mechanics, len(system.elements), system.mechanics.n
+    m, E, n = system.mechanics, len(system.all_elements), system.mechanics.n
     names = [name for name, _, _ in parameters(system, laws)]
     memories = [i for i, site in enumerate(laws) if site.memory is not None]
     lines = [
@@ -138,7 +138,7 @@ def _law(site: EquationSite, index: int, names: list[str], state: int | None, me
 
 
 def _entry_points(system: System, memories: int) -> list[str]:
-    E, n = len(system.elements), system.mechanics.n
+    E, n = len(system.all_elements), system.mechanics.n
     local = f"  double d[{E}], v[{E}], f[{E}], a[{max(n, 1)}], dz[{max(memories, 1)}];"
     call = "  motion(time, x, u, p, d, v, f, a, dz);"
     shown = [
@@ -170,7 +170,9 @@ def _description(system: System, laws: list[EquationSite], name: str, guid: str)
     """modelDescription.xml."""
     space = state_space(system)
     given = list(parameters(system, laws))
-    states = [*space.states, *(f"{site.placed.location}.{site.law.name}.z" for site in laws if site.memory is not None)]
+    memories = [f"{site.placed.location}.{site.law.name}.z" for site in laws if site.memory is not None]
+    several = [name if memories.count(name) == 1 else f"{name}{i + 1}" for i, name in enumerate(memories)]
+    states = [*space.states, *several]
     root = ElementTree.Element(
         "fmiModelDescription",
         fmiVersion="2.0",

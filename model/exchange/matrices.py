@@ -1,4 +1,4 @@
-"""A baseline system from matrices in a .mat file: M, C, K with sensor rows, or A, B, C, D.
+"""A baseline system from matrices: M, C, K with sensor rows or A, B, C, D of a .mat file, or a linearised FMU.
 
 Every coordinate becomes a body that heaves, every coupling a spring and damper between two bodies or to a moving
 support, so that its values can be identified and laws sought in it.  That is possible where the matrices are those of
@@ -8,7 +8,8 @@ was read is assembled again and must give the same matrices.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,12 +19,14 @@ import scipy.io
 import scipy.sparse
 import yaml
 
+from sprung.model.exchange.from_fmu import read_fmu
 from sprung.model.exchange.statespace import ExchangeError
 from sprung.model.signals import FloatArray
 from sprung.model.system import USUAL_NOISE, System, parse_system
 
 _KEYS = ("M", "C", "K", "Kb", "Cb", "S", "A", "B", "mass", "sample_rate")
 _SAME = 1e-8  # relative to the largest entry of a matrix
+_DIFFERENCES = 1e-6  # the same of derivatives that an FMU may take by differences
 _UNITS = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "deflection": "m"}
 
 
@@ -54,6 +57,8 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     rate: Hz, of the recordings; else `sample_rate` of the file.
     Errors: `ExchangeError`, OSError.
     """
+    if path.suffix.lower() == ".fmu":
+        return _from_fmu(path, name, rate)
     try:
         data = scipy.io.loadmat(path)
     except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
@@ -68,13 +73,27 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     return text
 
 
+def _from_fmu(path: Path, name: str | None, rate: float | None) -> str:
+    """The text of a system file from an FMU's A, B, C."""
+    if rate is None or not rate > 0:
+        raise ExchangeError(f"{path}: say at how many Hz the recordings are by --rate")
+    linear = read_fmu(path)
+    network = _from_state_space(path, {"A": linear.A, "B": linear.B, "C": linear.C}, _DIFFERENCES)
+    names = _Names(linear.states, linear.supports, linear.outputs)
+    text = _text(network, name or path.stem, rate, names)
+    _same_again(path, network, parse_system(text, str(path)), _DIFFERENCES)
+    return text
+
+
 def _matrix(path: Path, name: str, value: Any) -> FloatArray:
+    if np.iscomplexobj(value.data if scipy.sparse.issparse(value) else value):
+        raise ExchangeError(f"{path}: {name}: its numbers are complex; real ones are needed")
     try:
         found = np.atleast_2d(np.asarray(value.toarray() if scipy.sparse.issparse(value) else value, dtype=np.float64))
     except (TypeError, ValueError) as error:
         raise ExchangeError(f"{path}: {name}: is no matrix of numbers") from error
-    if found.ndim != 2:
-        raise ExchangeError(f"{path}: {name}: is no matrix")
+    if found.ndim != 2 or not found.size:
+        raise ExchangeError(f"{path}: {name}: is no matrix, or an empty one")
     if not np.isfinite(found).all():
         raise ExchangeError(f"{path}: {name}: numbers that are not finite")
     return found
@@ -105,6 +124,8 @@ def _from_mck(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
     if Kb.shape != Cb.shape or len(Kb) != n:
         raise ExchangeError(f"{path}: Kb {Kb.shape} and Cb {Cb.shape}: a row for each of {n} coordinates is needed")
     rows = given.get("S", np.eye(n))
+    if rows.shape[1] != n:
+        raise ExchangeError(f"{path}: S {rows.shape}: a column for each of {n} coordinates is needed")
     sensors = tuple(_sensor_of_row(path, i, row) for i, row in enumerate(rows))
     return _checked(path, SpringNetwork(mass, K, C, Kb, Cb, sensors))
 
@@ -118,7 +139,8 @@ def _sensor_of_row(path: Path, number: int, row: FloatArray) -> tuple[str, int, 
     raise ExchangeError(f"{path}: S: row {number + 1} is neither one coordinate (1) nor a difference of two (1, -1)")
 
 
-def _from_state_space(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
+def _from_state_space(path: Path, given: Mapping[str, FloatArray], same: float = _SAME) -> SpringNetwork:
+    """same: how far entries that should be equal may be apart, relative to the largest of their matrix."""
     missing = [name for name in ("B", "C") if name not in given]
     if missing:
         raise ExchangeError(f"{path}: A without {missing[0]}")
@@ -130,11 +152,17 @@ def _from_state_space(path: Path, given: Mapping[str, FloatArray]) -> SpringNetw
         )
     if np.abs(A[:n] - np.eye(n, 2 * n, n)).max() > _SAME or np.abs(B[:n]).max() > _SAME * np.abs(B).max():
         raise ExchangeError(f"{path}: A: states are not displacements, then their velocities")
-    X, Y = -A[n:, :n], -A[n:, n:]
+    X, Y = (_without_dust(part, same) for part in (-A[n:, :n], -A[n:, n:]))
+    Kb, Cb = (_without_dust(B[n:, i::2], same) for i in (0, 1))
     mass = _masses(path, X, given.get("mass"))
     scale = mass[:, None]
-    sensors = tuple(_sensor_of_output(path, i, row, A) for i, row in enumerate(rows))
-    return _checked(path, SpringNetwork(mass, scale * X, scale * Y, scale * B[n:, 0::2], scale * B[n:, 1::2], sensors))
+    sensors = tuple(_sensor_of_output(path, i, row, A, same) for i, row in enumerate(rows))
+    return _checked(path, SpringNetwork(mass, scale * X, scale * Y, scale * Kb, scale * Cb, sensors), same)
+
+
+def _without_dust(matrix: FloatArray, same: float) -> FloatArray:
+    """Entries that are nothing but rounding are none."""
+    return np.where(np.abs(matrix) > same * np.abs(matrix).max(initial=0.0), matrix, 0.0)
 
 
 def _masses(path: Path, X: FloatArray, given: FloatArray | None) -> FloatArray:
@@ -142,6 +170,8 @@ def _masses(path: Path, X: FloatArray, given: FloatArray | None) -> FloatArray:
     n = len(X)
     if given is not None and given.size == n:
         return given.ravel()
+    if given is not None and given.size > 1:
+        raise ExchangeError(f"{path}: mass: {given.size} numbers for {n} coordinates; one or all of them are needed")
     mass = np.full(n, np.nan)
     mass[0] = 1.0 if given is None or not given.size else given.ravel()[0]
     waiting = [0]
@@ -152,15 +182,21 @@ def _masses(path: Path, X: FloatArray, given: FloatArray | None) -> FloatArray:
                 mass[j] = mass[i] * X[i, j] / X[j, i]
                 waiting.append(int(j))
     if np.isnan(mass).any():
-        raise ExchangeError(f"{path}: A: its coordinates do not hang together; give the masses as `mass`")
+        apart, fmu = int(np.isnan(mass).argmax()) + 1, path.suffix.lower() == ".fmu"
+        advice = "" if fmu else "; give the masses as `mass`"
+        raise ExchangeError(
+            f"{path}: A: coordinate {apart} hangs together with no other (rotations do not): its mass is open{advice}"
+        )
     return mass
 
 
-def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray) -> tuple[str, int, int]:
+def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray, same: float) -> tuple[str, int, int]:
     n = len(A) // 2
     for i in range(n):
-        if np.allclose(row, A[n + i], rtol=1e-9, atol=_SAME * np.abs(A[n + i]).max()):
+        if np.allclose(row, A[n + i], rtol=1e-9, atol=same * np.abs(A[n + i]).max()):
             return "acceleration", i, -1
+    row = _without_dust(row, same)
+    row = np.where(np.abs(np.abs(row) - 1) < same, np.sign(row), row)
     at = np.flatnonzero(row)
     if len(at) == 1 and row[at[0]] == 1:
         return ("displacement", int(at[0]), -1) if at[0] < n else ("velocity", int(at[0] - n), -1)
@@ -169,22 +205,22 @@ def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray) -
     raise ExchangeError(f"{path}: C: row {number + 1} is no displacement, velocity, acceleration or deflection")
 
 
-def _checked(path: Path, found: SpringNetwork) -> SpringNetwork:
+def _checked(path: Path, found: SpringNetwork, same: float = _SAME) -> SpringNetwork:
     if not (found.mass > 0).all():
         raise ExchangeError(f"{path}: a mass is not greater than 0")
     for name, matrix in (("K", found.K), ("C", found.C)):
         size = np.abs(matrix).max() or 1.0
-        if np.abs(matrix - matrix.T).max() > _SAME * size:
+        if np.abs(matrix - matrix.T).max() > same * size:
             raise ExchangeError(f"{path}: {name} is not symmetric: no network of springs and dampers has it")
-        if (matrix - np.diag(np.diag(matrix))).max(initial=0.0) > _SAME * size:
-            i, j = np.argwhere(np.triu(matrix, 1) > _SAME * size)[0]
+        if (matrix - np.diag(np.diag(matrix))).max(initial=0.0) > same * size:
+            i, j = np.argwhere(matrix - np.diag(np.diag(matrix)) > same * size)[0]
             raise ExchangeError(f"{path}: {name}({i + 1}, {j + 1}) is positive: no spring between two bodies pushes so")
     for name, matrix in (("Kb", found.Kb), ("Cb", found.Cb)):
-        if matrix.min(initial=0.0) < -_SAME * (np.abs(matrix).max() or 1.0):
+        if matrix.min(initial=0.0) < -same * (np.abs(matrix).max(initial=0.0) or 1.0):
             raise ExchangeError(f"{path}: {name}: a support is coupled by a negative value")
     for name, inner, outer in (("K", found.K, found.Kb), ("C", found.C, found.Cb)):
         over = inner.sum(axis=1) - outer.sum(axis=1)
-        if np.abs(over).max() > _SAME * (np.abs(inner).max() or 1.0):
+        if np.abs(over).max() > same * (np.abs(inner).max() or 1.0):
             i = int(np.abs(over).argmax())
             raise ExchangeError(
                 f"{path}: {name}: row {i + 1} leaves {over[i]:.4g} that no support takes: springs to a fixed ground "
@@ -193,10 +229,30 @@ def _checked(path: Path, found: SpringNetwork) -> SpringNetwork:
     return found
 
 
-def _text(found: SpringNetwork, name: str, rate: float) -> str:
+@dataclass(frozen=True, slots=True)
+class _Names:
+    """What a model calls its displacements, supports and outputs."""
+
+    states: tuple[str, ...]
+    supports: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def _plain(names: Sequence[str], tails: tuple[str, ...] = ()) -> list[str]:
+    """Names as a system file may have them, all different."""
+    found: list[str] = []
+    for name in names:
+        short = next((name.removesuffix(tail) for tail in tails if name.endswith(tail)), name)
+        plain = re.sub(r"[^A-Za-z0-9_]+", "_", short).strip("_")
+        plain = plain if plain[:1].isalpha() else f"n{plain}"
+        found.append(plain if plain not in found else f"{plain}_{len(found) + 1}")
+    return found
+
+
+def _text(found: SpringNetwork, name: str, rate: float, names: _Names | None = None) -> str:
     n, supports = len(found.mass), found.Kb.shape[1]
-    body = [f"body{i + 1}" for i in range(n)]
-    support = [f"support{i + 1}" for i in range(supports)]
+    body = [f"body{i + 1}" for i in range(n)] if names is None else _plain(names.states, (".z", "_z", ".s"))
+    support = [f"support{i + 1}" for i in range(supports)] if names is None else _plain(names.supports)
     elements: dict[str, Any] = {}
     for i in range(n):
         for j in range(i + 1, n):
@@ -204,6 +260,9 @@ def _text(found: SpringNetwork, name: str, rate: float) -> str:
         for j in range(supports):
             _add(elements, body[i], support[j], found.Kb[i, j], found.Cb[i, j])
     sensors = dict(_sensor(kind, i, j, body, elements) for kind, i, j in found.sensors)
+    if names is not None:
+        called = zip(_plain(names.outputs), names.outputs, found.sensors, strict=True)
+        sensors = {key: _sensor(*sensor, body, elements)[1] | {"csv": column} for key, column, sensor in called}
     inputs = {
         one: {
             "kind": "displacement",
@@ -245,7 +304,7 @@ def _sensor(kind: str, i: int, j: int, body: list[str], elements: Mapping[str, A
     return name, entry | ({"sign": -1} if i > j else {})
 
 
-def _same_again(path: Path, found: SpringNetwork, system: System) -> None:
+def _same_again(path: Path, found: SpringNetwork, system: System, same: float = _SAME) -> None:
     n, scale = len(found.mass), found.mass[:, None]
     A, B, *_ = system.mechanics.matrices()
     pairs = (
@@ -255,7 +314,7 @@ def _same_again(path: Path, found: SpringNetwork, system: System) -> None:
         (B[n:, 1::2] * scale, found.Cb),
     )
     if any(
-        np.abs(ours - theirs).max(initial=0.0) > _SAME * (np.abs(theirs).max(initial=0.0) or 1.0)
+        np.abs(ours - theirs).max(initial=0.0) > same * (np.abs(theirs).max(initial=0.0) or 1.0)
         for ours, theirs in pairs
     ):
         raise ExchangeError(

@@ -16,6 +16,7 @@ def write_modelica(path: Path, system: System) -> None:
 
 def modelica(system: System, package: str) -> str:
     """The text of a package: blocks of the laws, then `Vehicle` with inputs, outputs and parameters by name."""
+    system = system.whole_system
     laws = sites(system)
     blocks = [line for index, site in enumerate(laws) for line in _block(site, index)]
     lines = [
@@ -56,7 +57,7 @@ def _block(site: EquationSite, index: int) -> list[str]:
 def _vehicle(system: System, laws: list[EquationSite]) -> list[str]:
     m = system.mechanics
     dofs = [identifier(dof) for dof in m.dofs]
-    names = [identifier(element) for element in system.elements]
+    names = [identifier(element) for element in system.all_elements]
     lines = ["  model Vehicle"]
     for e, name in enumerate(names):
         lines.append(f'    parameter Real {name}_stiffness = {float(m.stiffness[e])!r} "N/m";')

@@ -1,6 +1,6 @@
 """The linear system as matrices with names: x' = A x + B u, y = C x + D u, and their derivatives by the parameters.
 
-Laws are left out: no matrix holds them; the FMU and Modelica exports do (docs/exchange.md).
+Laws along the elements are left out: no matrix holds them; the FMU and Modelica exports do (docs/exchange.md).
 """
 
 from __future__ import annotations
@@ -13,7 +13,9 @@ from typing import Any
 import numpy as np
 import scipy.io
 
+from sprung.model.laws.in_place import Follower
 from sprung.model.mechanics import Mechanics
+from sprung.model.parameters import Parameter
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.ride import with_values
 from sprung.model.system import System
@@ -44,10 +46,11 @@ class StateSpace:
 
 
 def state_space(system: System, values: Mapping[str, float] | None = None) -> StateSpace:
-    """The system at its nominal values, or others by name."""
+    """The system at its nominal values, or others by name, laws of bodies and of the structure included."""
+    system = system.whole_system
     mechanics = with_values(system, values or {})
     A, B, C, D = mechanics.matrices()
-    slopes = [_derivative(system, mechanics, p.element, p.quantity) for p in system.parameters]
+    slopes = [_derivative(system, mechanics, p) for p in system.parameters]
     dA, dB, dC, dD = (
         np.array([slope[i] for slope in slopes]).reshape(-1, *matrix.shape) for i, matrix in enumerate((A, B, C, D))
     )
@@ -64,18 +67,24 @@ def state_space(system: System, values: Mapping[str, float] | None = None) -> St
         inputs=_drive_names(system),
         outputs=system.sensors,
         parameters=tuple(p.name for p in system.parameters),
-        values=np.array([_value(system, mechanics, p.element, p.quantity) for p in system.parameters]),
+        values=np.array([_value(system, mechanics, p) for p in system.parameters]),
         sample_rate=system.sample_rate,
     )
 
 
-def _derivative(system: System, mechanics: Mechanics, part: str, quantity: str) -> tuple[FloatArray, ...]:
+def _derivative(system: System, mechanics: Mechanics, parameter: Parameter) -> tuple[FloatArray, ...]:
     """dA, dB, dC, dD by one parameter; the matrices are linear in stiffness and damping, and in 1 / mass."""
-    if quantity == "mass":  # mass and inertias of a body scale together
-        own = mechanics.body_of_dof == system.bodies.index(part)
-        return _scaled_rows(mechanics, np.where(own, -1 / _value(system, mechanics, part, quantity), 0.0))
+    follower, value = _follower(system, parameter), _value(system, mechanics, parameter)
     k, c = (np.zeros_like(mechanics.stiffness) for _ in range(2))
-    (k if quantity == "stiffness" else c)[system.elements.index(part)] = 1.0
+    if follower is not None and follower.element >= 0:
+        at = follower.element
+        k[at] = follower.stiffness * mechanics.stiffness[at] / value
+        c[at] = follower.damping * mechanics.damping[at] / value
+    elif follower is not None or parameter.quantity == "mass":  # mass and inertias of a body scale together
+        body = system.bodies.index(parameter.element) if follower is None else follower.body
+        return _scaled_rows(mechanics, np.where(mechanics.body_of_dof == body, -1 / value, 0.0))
+    else:
+        (k if parameter.quantity == "stiffness" else c)[system.elements.index(parameter.element)] = 1.0
     none = np.zeros_like(k)
     unit, zero = mechanics.matrices(k, c), mechanics.matrices(none, none)
     return tuple(a - b for a, b in zip(unit, zero, strict=True))
@@ -93,12 +102,19 @@ def _scaled_rows(mechanics: Mechanics, rows: FloatArray) -> tuple[FloatArray, ..
     return dA, dB, dC, dD
 
 
-def _value(system: System, mechanics: Mechanics, part: str, quantity: str) -> float:
+def _value(system: System, mechanics: Mechanics, parameter: Parameter) -> float:
+    if _follower(system, parameter) is not None:
+        return parameter.nominal
+    part, quantity = parameter.element, parameter.quantity
     if quantity == "mass":
         at = np.flatnonzero(mechanics.body_of_dof == system.bodies.index(part))[0]
         return float(system.file.bodies[part].mass.value * mechanics.mass[at] / system.mechanics.mass[at])
     values: FloatArray = getattr(mechanics, quantity)
     return float(values[system.elements.index(part)])
+
+
+def _follower(system: System, parameter: Parameter) -> Follower | None:
+    return next((one for one in system.followers if one.parameter.name == parameter.name), None)
 
 
 def _drive_names(system: System) -> tuple[str, ...]:

@@ -129,8 +129,10 @@ class Identifier:
 
     def _refiner(self, samples: int) -> Refines:
         if samples not in self._refiners:
-            kind = LawRefiner if acting_laws(self.system) else Refiner
-            self._refiners[samples] = kind(self.system, samples, self.workers)
+            if acting_laws(self.system):
+                self._refiners[samples] = LawRefiner(self.system, samples, self.workers)
+            else:
+                self._refiners[samples] = Refiner(self.system.whole_system, samples, self.workers)
         return self._refiners[samples]
 
     def _checked(self, windows: FloatArray) -> FloatArray:

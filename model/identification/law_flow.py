@@ -29,8 +29,10 @@ class Flow:
 
         N, (L, n) = steps.discrete.Ad.shape[1], pull.shape
         self.memories, self.N = memories, N
+        self._closed: Tensor | None = None  # for `answer`, which needs it at first
         rows = torch.zeros(2, L, N, dtype=torch.float64)  # deflections and rates by the state
         rows[0, :, :n], rows[1, :, n:] = pull, pull
+        self.rows = rows.flatten(0, 1).expand(len(steps.discrete.Ad), -1, -1)
         self.slopes = stacked("by_deflection"), stacked("by_rate")  # (B, T, L)
         P0, S0, P1, S1 = steps.push
         g0, g1 = -(P0 - (S0 + S1) / dt) @ pull.T, -(P1 + (S0 + S1) / dt) @ pull.T  # (B, N, L)
@@ -53,7 +55,9 @@ class Flow:
             after[:, :, memories] += self.by_memory * self.beyond
         small = torch.linalg.inv(torch.eye(L, dtype=torch.float64) - after @ g1.unsqueeze(1))  # (B, T-1, L, L)
         self.small, self.answers = small, small @ after  # (B, T-1, L, N)
-        self.step, self.g1 = torch.cat([steps.discrete.Ad, g0], dim=2), g1
+        if memories:
+            self.answers_memory = small[:, :, :, memories] * self.by_memory.mT  # (B, T-1, L, Z)
+        self.step, self.g0, self.g1 = torch.cat([steps.discrete.Ad, g0], dim=2), g0, g1
 
     def take(self, at: Tensor) -> Flow:
         """Some of the windows."""
@@ -66,60 +70,102 @@ class Flow:
         return found
 
     def along(self, deflection: Tensor, rate: Tensor) -> tuple[Tensor, Tensor | None]:
-        """Forces (B, L, T, X), and memories (B, Z, T-1, X), that changes of the laws' deflections and rates bring about
+        """Forces (B, T, L, X), and memories (B, T-1, Z, X), that changes of the laws' deflections and rates bring about
         which are not the bodies'; each (B, T, L, X)."""
         by_deflection, by_rate = self.slopes
-        force = (by_deflection.unsqueeze(3) * deflection + by_rate.unsqueeze(3) * rate).transpose(1, 2)
+        force = by_deflection.unsqueeze(3) * deflection + by_rate.unsqueeze(3) * rate
         if not self.memories:
             return force, None
         d, v = deflection[:, :, self.memories], rate[:, :, self.memories]
         ends = (d[:, :-1], d[:, 1:], v[:, :-1], v[:, 1:])
         remembered = sum(gain.unsqueeze(3) * end for gain, end in zip(self.carried, ends, strict=True))
         assert isinstance(remembered, Tensor)
-        return force, remembered.transpose(1, 2)
+        return force, remembered
 
     def run(
         self,
-        push: Tensor | None,
+        push: Tensor,
         given: Tensor,
         first: Tensor,
         remembered: Tensor | None = None,
         memory: Tensor | None = None,
     ) -> Tensor:
-        """Changes of states, then of the laws' forces, (B, N + L, T, X).
+        """Changes of states, then of the laws' forces, (B, T, N + L, X).
 
-        push: of the last X' columns, (B, N, T-1, X'), or none; given: forces (B, L, T, X) apart from what the
-        motion changes; first (B, N, X); remembered: changes of the memories, (B, Z, T-1, X), apart from what the motion
-        changes; memory: of the memories at the first sample, (B, Z, X).
+        push: of the last X' columns, (B, T-1, N, X'); given: forces (B, T, L, X) apart from what the motion changes;
+        first (B, N, X); remembered: changes of the memories, (B, T-1, Z, X), apart from what the motion changes;
+        memory: of the memories at the first sample, (B, Z, X).
         """
-        B, L, T, X = given.shape
-        pushed = slice(X - push.shape[3], X) if push is not None else slice(0)
-        path = given.new_empty(B, self.N + L, T, X)
+        (B, T, L, X), N = given.shape, self.N
+        pushed = slice(X - push.shape[3], X)
+        path = given.new_empty(B, T, N + L, X)
         z = given.new_zeros(B, len(self.memories), X) if memory is None else memory
-        force = self.at_first @ first + given[:, :, 0]
+        path[:, 0, :N] = first
+        path[:, 0, N:] = self.at_first @ first + given[:, 0]
         if self.memories:
-            force[:, self.memories] += self.by_first_memory * z
-        now = torch.cat([first, force], dim=1)
-        path[:, :, 0] = now
+            path[:, 0, N:][:, self.memories] += self.by_first_memory * z
+        known = self.small @ given[:, 1:]
         for k in range(T - 1):
+            now = path[:, k]
             u = self.step @ now
-            if push is not None:
-                u[:, :, pushed] += push[:, :, k]
-            known = given[:, :, k + 1]
+            u[:, :, pushed] += push[:, k]
+            force = torch.baddbmm(known[:, k], self.answers[:, k], u)
             if self.memories:
-                z = torch.baddbmm(self.keep[:, k] * z, self.ahead[:, k], now[:, : self.N])
-                z = z if remembered is None else z + remembered[:, :, k]
-                known = known.clone()
-                known[:, self.memories] += self.by_memory[:, k] * z
-            force = torch.baddbmm(self.small[:, k] @ known, self.answers[:, k], u)
+                z = torch.baddbmm(self.keep[:, k] * z, self.ahead[:, k], now[:, :N])
+                z = z if remembered is None else z + remembered[:, k]
+                force = torch.baddbmm(force, self.answers_memory[:, k], z)
             state = torch.baddbmm(u, self.g1, force)
             if self.memories:
                 z = torch.baddbmm(z, self.beyond[:, k], state)
-            now = torch.cat([state, force], dim=1)
-            path[:, :, k + 1] = now
+            path[:, k + 1, :N], path[:, k + 1, N:] = state, force
         return path
 
     def answer(self, given: Tensor) -> Tensor:
         """Change of the forces (B, T, L) where they are off by `given`, the motion's answer included."""
-        first = given.new_zeros(len(given), self.N, 1)
-        return self.run(None, given.mT.unsqueeze(3), first)[:, self.N :, :, 0].mT
+        if self._closed is None:
+            self._closed = self._answers_by_force()
+        B, T, L = given.shape
+        known = given.clone()
+        known[:, 1:] = (self.small @ given[:, 1:].unsqueeze(3)).squeeze(3)
+        found = torch.linalg.solve_triangular(self._closed, known.reshape(B, T * L, 1), upper=False, unitriangular=True)
+        return found.view(B, T, L)
+
+    def _answers_by_force(self) -> Tensor:
+        """The whole window's forces as one triangular system: what they are, off by given ones, of all, (B, TL, TL)."""
+        B, T, L = self.slopes[0].shape
+        moved = self._moved_by_force()
+        d, v = moved[:, 0], moved[:, 1]  # (B, L, L, T, T)
+        by_d, by_v = (slope.mT[:, :, None, :, None] for slope in self.slopes)
+        force = by_d * d + by_v * v
+        if self.memories:
+            gains = [gain.mT[:, :, None, :, None] for gain in self.carried]  # (B, Z, 1, T-1, 1)
+            d, v = d[:, self.memories], v[:, self.memories]
+            z = d.new_zeros(B, len(self.memories), L, T)
+            for k in range(T - 1):
+                ends = (d[..., k, :], d[..., k + 1, :], v[..., k, :], v[..., k + 1, :])
+                z = self.keep[:, k, :, None] * z
+                for gain, end in zip(gains, ends, strict=True):
+                    z = torch.addcmul(z, gain[..., k, :], end)
+                force[:, self.memories, :, k + 1] += self.by_memory[:, k, :, None] * z
+        whole = force.permute(0, 3, 1, 4, 2).flip(3).reshape(B, T, L, T * L)
+        whole[:, 1:] = self.small @ whole[:, 1:]
+        return -whole.flatten(1, 2)
+
+    def _moved_by_force(self) -> Tensor:
+        """Deflections and rates of the sites at a sample by forces at another one, from rest, the last one first:
+        (B, 2, L, L, T, T), a convolution but for the first force, which nothing leads to."""
+        Ad, (B, T, L) = self.step[:, :, : self.N], self.slopes[0].shape
+        rows = Ad.new_empty(B, T, 2 * L, self.N)  # motions of the sites, samples after a state
+        rows[:, 0], power, done = self.rows, Ad, 1
+        while done < T:
+            more = min(done, T - done)
+            rows[:, done : done + more] = (rows[:, :more].flatten(1, 2) @ power).view(B, more, 2 * L, self.N)
+            done, power = done + more, power @ power
+        held = torch.cat([self.g0 + Ad @ self.g1, self.g0], dim=2)  # by forces on the way, and by the first, (B, N, 2L)
+        after = (rows[:, : T - 1].flatten(1, 2) @ held).view(B, T - 1, 2, L, 2, L).permute(4, 0, 2, 3, 5, 1)
+        lags = Ad.new_zeros(B, 2, L, L, 2 * T - 1)
+        lags[..., T - 1] = (self.rows @ self.g1).view(B, 2, L, L)
+        lags[..., T:] = after[0]
+        found = lags.unfold(4, T, 1).clone()
+        found[..., 0, T - 1], found[..., 1:, T - 1] = 0.0, after[1]
+        return found

@@ -9,9 +9,10 @@ straight line between samples would be; the one state z of a law with memory is 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -19,7 +20,7 @@ from scipy.signal import firwin, upfirdn
 
 from sprung.model.laws import ElementLaw, Motion, SpringDamper
 from sprung.model.laws.placed import PlacedLaw
-from sprung.model.laws.trajectory import recall
+from sprung.model.laws.trajectory import phi, recall
 from sprung.model.signals import FloatArray
 
 FINE = 16  # steps per sample of laws without memory
@@ -27,6 +28,7 @@ _FINE_MEMORY = 2  # of those with, whose steps are of fourth order
 _REACH = 8  # samples of the filter to each side
 _NEAR = 1e-4  # of the rms motion, for slopes
 _STEP = 1e-3  # of a value's logarithm, for derivatives
+_At = tuple[list[FloatArray], SpringDamper]  # values of a law and its element
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,42 +94,75 @@ class Along:
 
         p: (B, values); stiffness, damping and first: (B,).
         """
-        count = len(free) + 2
-        values = np.tile(p.T[:, None, :, None], (1, 2 * count, 1, 1))  # (values, variants, B, 1)
-        k, c = (np.tile(np.asarray(x)[None, :, None], (2 * count, 1, 1)) for x in element)
-        for i, sign in ((i, sign) for i in range(count) for sign in (0, 1)):
-            at, factor = 2 * i + sign, np.exp(_STEP if sign == 0 else -_STEP)
-            target = values[free[i]] if i < len(free) else (k if i == len(free) else c)
-            target[at] *= factor
-        shown = self.force(list(values), SpringDamper(k, c), np.broadcast_to(first, values.shape[1:3]))
-        shown = np.broadcast_to(shown, (2 * count, *shown.shape[-2:]))
-        return np.asarray((shown[0::2] - shown[1::2]) / (2 * _STEP))
+        values, whole = list(p.T[:, :, None]), SpringDamper(*(np.asarray(x)[:, None] for x in element))
+        memory = self.memory(values, whole, first) if self.law.memory else ()
+        motion = Motion(self.d, self.v, 0.0, memory)
+        around = [_moved(values, whole, i) for i in (*free, *range(len(values), len(values) + 2))]
+        found = np.stack([self._difference(self.law.force, motion, *pair) for pair in around])
+        if self.law.memory:
+            rates = np.stack([self._difference(self.law.memory_rate, motion, *pair) for pair in around])
+            if rates.any():
+                near = _small(memory)
+                force, rate = (
+                    self._slope(of, "z", near, motion, values, whole) for of in (self.law.force, self.law.memory_rate)
+                )
+                found += force * self._remembered(rates, rate)
+        return band_limited(found, self.parts)
+
+    def _difference(self, function: Callable[..., Any], motion: Motion, up: _At, down: _At) -> FloatArray:
+        """Half the difference over the step, (B, fine)."""
+        found = np.asarray(function(motion, *up) - function(motion, *down), dtype=np.float64) / (2 * _STEP)
+        return np.broadcast_to(found.reshape(found.shape[-2:]) if found.ndim > 2 else found, self.d.shape)
+
+    def _slope(
+        self,
+        function: Callable[..., Any],
+        of: str,
+        near: FloatArray,
+        motion: Motion,
+        p: Sequence[FloatArray],
+        element: SpringDamper,
+    ) -> FloatArray:
+        """Slope of a function of the motion by its deflection "d", rate "v" or memory "z", (B, fine)."""
+        d, v, time, memory = motion
+        up, down = (
+            np.asarray(
+                function(
+                    Motion(
+                        d + sign * near if of == "d" else d,
+                        v + sign * near if of == "v" else v,
+                        time,
+                        memory + sign * near if of == "z" else memory,
+                    ),
+                    p,
+                    element,
+                )
+            )
+            for sign in (1.0, -1.0)
+        )
+        found = np.asarray((up - down) / (2 * near), dtype=np.float64)
+        return np.broadcast_to(found.reshape(found.shape[-2:]), self.d.shape)
+
+    def _remembered(self, rates: FloatArray, by_z: FloatArray) -> FloatArray:
+        """Change of the memory (X, B, fine) by changes of its rate at an unchanged memory; by_z: (B, fine)."""
+        keep, mean, *_ = phi(np.clip(self.step * 0.5 * (by_z[:, 1:] + by_z[:, :-1]), -700.0, 0.0).T)
+        added = mean[:, None] * np.moveaxis(self.step * 0.5 * (rates[..., 1:] + rates[..., :-1]), -1, 0)
+        found = np.zeros((rates.shape[-1], *rates.shape[:-1]))
+        for i, (kept, more) in enumerate(zip(keep, added, strict=True)):
+            found[i + 1] = kept * found[i] + more
+        return np.moveaxis(found, 0, -1)
 
     def slopes(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> Slopes:
         """Slopes by the motion; values and element (B, 1)."""
         law, memory = self.law, self.memory(p, element, first) if self.law.memory else np.zeros((0, *self.d.shape))
         near = {"d": _NEAR * self.size_d, "v": _NEAR * self.size_v}
         if law.memory:
-            near["z"] = _NEAR * (np.sqrt(np.mean(memory[0] ** 2, axis=1, keepdims=True)) + 1e-12)
+            near["z"] = _small(memory)
 
-        def slope(of: str, function: object) -> FloatArray:
-            up, down = (
-                np.asarray(
-                    function(  # type: ignore[operator]
-                        Motion(
-                            self.d + (sign * near["d"] if of == "d" else 0.0),
-                            self.v + (sign * near["v"] if of == "v" else 0.0),
-                            0.0,
-                            memory + (sign * near["z"] if of == "z" else 0.0),
-                        ),
-                        p,
-                        element,
-                    )
-                )
-                for sign in (1.0, -1.0)
-            )
-            found = np.asarray((up - down) / (2 * near[of]), dtype=np.float64)
-            return np.broadcast_to(found.reshape(found.shape[-2:]), self.d.shape)
+        motion = Motion(self.d, self.v, 0.0, memory)
+
+        def slope(of: str, function: Callable[..., Any]) -> FloatArray:
+            return self._slope(function, of, near[of], motion, p, element)
 
         by_d, by_v = (self._around(slope(of, law.force)) for of in "dv")
         zero = np.zeros((len(self.d), self.samples - 1))
@@ -165,6 +200,21 @@ class Along:
                 found[i] += keep * half * self.step * rate[:, :, j] * share
             keep = keep * half**2
         return keep, *found
+
+
+def _moved(p: Sequence[FloatArray], element: SpringDamper, at: int) -> tuple[_At, _At]:
+    """Values of a law, then stiffness and damping, with the one at `at` a step larger and smaller."""
+    found = []
+    for factor in (np.exp(_STEP), np.exp(-_STEP)):
+        values = [value * factor if i == at else value for i, value in enumerate((*p, *element))]
+        found.append((values[: len(p)], SpringDamper(*values[len(p) :])))
+    return found[0], found[1]
+
+
+def _small(memory: FloatArray) -> FloatArray:
+    """A change of a memory (1, B, fine) for slopes, (B, 1)."""
+    found: FloatArray = _NEAR * (np.sqrt(np.mean(memory[0] ** 2, axis=1, keepdims=True)) + 1e-12)
+    return found
 
 
 @lru_cache(maxsize=8)

@@ -93,7 +93,7 @@ class LawSearch:
         self.error = torch.full((B, len(data.present)), torch.nan, dtype=torch.float64)
         self.states = torch.zeros(B, T, N, dtype=torch.float64)
         self.outputs = torch.full((B, T, len(data.present)), torch.nan, dtype=torch.float64)
-        self.smooth = np.zeros((2, B, T, len(windows.system.elements)))
+        self.smooth = np.zeros((2, B, T, len(windows.system.mechanics.stiffness)))
         self.weighed = torch.zeros(B, dtype=torch.bool)
         self.cross = torch.zeros(B, self.told, H, dtype=torch.float64)
         self.information, self.score = torch.zeros(B, H, H, dtype=torch.float64), torch.zeros(B, H, dtype=torch.float64)
@@ -144,7 +144,7 @@ class LawSearch:
         w, data, smooth = self.windows, self.data.take(rows), self.smooth[:, rows.numpy()]
         point, before = self.point.take(rows), self.cost[rows]
         steps = w.steps(point, data)
-        point, motion = w.settle(point, steps, data, smooth)
+        point, motion, near = w.settle(point, steps, data, smooth)
         columns, flow = w.columns(point, steps, motion, data, smooth)
         residual = w.residual(motion, data, columns.whiten)
         cost, step, alone = columns.solve(residual, point.unknowns)
@@ -153,13 +153,13 @@ class LawSearch:
         dx0 = columns.state_step(alone, step)
         smooth = w.smoothed(columns, residual, step, dx0, steps)
         std = torch.diagonal(columns.covariance, dim1=1, dim2=2).sqrt()
-        second = self._second(columns, flow, point.moved(step, dx0), data, smooth)
+        second = self._second(columns, near, point.moved(step, dx0), data, smooth)
         held = second.cost <= cost * (1 + 1e-6) + _SLACK
         still = (step.abs() / std).amax(dim=1) < _STILL
         going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the old products are good enough for one more
             self._third(
-                going, second, columns.take(going), flow.take(going), data.take(going), smooth[:, going.numpy()]
+                going, second, columns.take(going), near.take(going), data.take(going), smooth[:, going.numpy()]
             )
         done = ((second.small(std) & held) | still) & ~worse
         ripe = ((done | last) & self.wanted[rows]).nonzero().squeeze(1)
@@ -184,7 +184,7 @@ class LawSearch:
     ) -> Second:
         """The step from `there` with products from nearby."""
         w = self.windows
-        there, motion = w.settle(there, w.steps(there, data), data, smooth, flow)
+        there, motion, _ = w.settle(there, w.steps(there, data), data, smooth, flow)
         residual = w.residual(motion, data, columns.whiten)
         return Second(there, motion, residual, *columns.solve(residual, there.unknowns))
 

@@ -140,20 +140,26 @@ class LawWindows:
 
     def settle(
         self, point: WindowPoint, steps: Steps, data: WindowBatch, smooth: FloatArray, flow: Flow | None = None
-    ) -> tuple[WindowPoint, Moved]:
-        """Bring forces and motion together; flow: of a motion nearby."""
-        force = point.force
+    ) -> tuple[WindowPoint, Moved, Flow]:
+        """Bring forces and motion together; flow: of a motion nearby, by default of the one that they begin with."""
+        force, moving = point.force.clone(), torch.arange(len(point.force))
         for _ in range(_SWEEPS):
-            states, _ = self.simulate(steps, force, point.x0, data)
-            along = self.along(states, data, smooth)
-            wanted = self._forces(along, point, steps)
-            flow = self.flow(along, point, steps) if flow is None else flow
-            change = flow.answer(wanted - force)
-            force = force + change
-            if bool((self._shown_at_once(change, steps, data) < _SETTLED).all()):
+            everything = len(moving) == len(force)
+            some = replace(point if everything else point.take(moving), force=force[moving])
+            their_steps, theirs = (steps, data) if everything else (steps.take(moving), data.take(moving))
+            their_smooth = smooth if everything else smooth[:, moving.numpy()]
+            states, _ = self.simulate(their_steps, some.force, some.x0, theirs)
+            along = self.along(states, theirs, their_smooth)
+            flow = self.flow(along, some, their_steps) if flow is None else flow
+            near = flow if everything else flow.take(moving)
+            change = near.answer(self._forces(along, some, their_steps) - some.force)
+            force[moving] += change
+            moving = moving[self._shown_at_once(change, their_steps, theirs) >= _SETTLED]
+            if not len(moving):
                 break
+        assert flow is not None
         states, outputs = self.simulate(steps, force, point.x0, data)
-        return replace(point, force=force), Moved(states, outputs)
+        return replace(point, force=force), Moved(states, outputs), flow
 
     def _shown_at_once(self, change: Tensor, steps: Steps, data: WindowBatch) -> Tensor:
         """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
@@ -232,18 +238,18 @@ class LawWindows:
         along: list[Along],
         flow: Flow,
     ) -> Tensor:
-        """What the compressed signals show of the first state and of the unknowns, (B, R, T, N + U)."""
+        """What the compressed signals show of the first state and of the unknowns, (B, T, R, N + U)."""
         B, T, N = motion.states.shape
         Q = self.model.compression.matrix(data.present)
         columns, memories = self.unknowns, len(self.memories)
         load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
-        P0, S0, P1, S1 = (-(push @ self.model.simulator.H[which].T).unsqueeze(2) for push in steps.push)
+        P0, S0, P1, S1 = (-(push @ self.model.simulator.H[which].T).unsqueeze(1) for push in steps.push)
         linear = slice(len(which))
-        push = load.new_zeros(B, N, T - 1, columns)
-        push[..., linear] = P0 * load[:, None, :-1]
-        push[..., linear] += S0 * slope[:, None, :-1]
-        push[..., linear] += P1 * load[:, None, 1:]
-        push[..., linear] += S1 * slope[:, None, 1:]
+        push = load.new_zeros(B, T - 1, N, columns)
+        push[..., linear] = P0 * load[:, :-1, None]
+        push[..., linear] += S0 * slope[:, :-1, None]
+        push[..., linear] += P1 * load[:, 1:, None]
+        push[..., linear] += S1 * slope[:, 1:, None]
         by_mass = self._mass_loads(point, steps, motion, data)  # (B, n, T, M)
         masses = self.linear[len(which) :]
         springs = self._spring_loads(steps, motion, data, smooth) if self.loads else None  # (B, E, T, X)
@@ -254,20 +260,20 @@ class LawWindows:
             by_slope = self.slope @ by_mass
             series = (by_mass[:, :, :-1], by_slope[:, :, :-1], by_mass[:, :, 1:], by_slope[:, :, 1:])
             for gain, values in zip(steps.push, series, strict=True):
-                push[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1)
+                push[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1).transpose(1, 2)
         first, memory = load.new_zeros(B, N, N + columns), load.new_zeros(B, memories, N + columns)
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
         memory[:, :, N + self.told :] = torch.eye(memories, dtype=torch.float64)
-        path = flow.run(push, self._force_sources(along, point, steps, N), first, memory=memory)  # (B, N + L, T, X)
+        path = flow.run(push, self._force_sources(along, point, steps, N), first, memory=memory)  # (B, T, N + L, X)
         found = self._shown_by(path, steps, Q)
         changed = found[..., N:]
         direct = Q @ (steps.shown[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
-        changed[..., linear] += direct.unsqueeze(2) * load.unsqueeze(1)
+        changed[..., linear] += direct.unsqueeze(1) * load.unsqueeze(2)
         if by_mass.shape[3]:
-            changed[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1)
+            changed[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
         if springs is not None:
             loads = slice(self.first_load, self.told)
-            changed[..., loads] += (Q @ steps.shown @ springs.flatten(2)).view(B, len(Q), T, -1)
+            changed[..., loads] += (Q @ steps.shown @ springs.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
         return found
 
     def by_drive(
@@ -287,40 +293,40 @@ class LawWindows:
         site = site[:, of]  # (L, X)
         force, remembered = flow.along(value.unsqueeze(2) * site, rate.unsqueeze(2) * site)
         G0, G1 = steps.discrete.G0, steps.discrete.G1
-        push = torch.zeros(B, G0.shape[1], T - 1, X, dtype=torch.float64)
+        push = torch.zeros(B, T - 1, G0.shape[1], X, dtype=torch.float64)
         for gain, at in ((G0, slice(0, T - 1)), (G1, slice(1, T))):
-            push += gain[:, :, 2 * of].unsqueeze(2) * value[:, None, at]
-            push += gain[:, :, 2 * of + 1].unsqueeze(2) * rate[:, None, at]
+            push += gain[:, :, 2 * of].unsqueeze(1) * value[:, at, None]
+            push += gain[:, :, 2 * of + 1].unsqueeze(1) * rate[:, at, None]
         path = flow.run(push, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), remembered)
         shown = self._shown_by(path, steps, Q)
         D = Q @ steps.discrete.D
         for gain, given in ((D[:, :, 2 * of], value), (D[:, :, 2 * of + 1], rate)):
-            shown += gain.unsqueeze(2) * given.unsqueeze(1)
+            shown += gain.unsqueeze(1) * given.unsqueeze(2)
         return list((columns.whiten @ self._by_bin(shown)).to(torch.complex64).split(half, dim=3))
 
     def _shown_by(self, path: Tensor, steps: Steps, Q: Tensor) -> Tensor:
-        """What the compressed signals show of changes of states and of the laws' forces (B, N + L, T, X):
-        (B, R, T, X)."""
+        """What the compressed signals show of changes of states and of the laws' forces (B, T, N + L, X):
+        (B, T, R, X)."""
         at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
-        rows = torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2)
-        return (rows @ path.flatten(2)).view(len(path), len(Q), *path.shape[2:])
+        return torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2).unsqueeze(1) @ path
 
     def _by_bin(self, shown: Tensor) -> Tensor:
-        """Spectra within the band of signals (B, R, T, X), (B, F, R, X)."""
-        found: Tensor = torch.fft.rfft(shown, dim=2)[:, :, 1 : self.model.bins + 1].permute(0, 2, 1, 3)
+        """Spectra within the band of signals (B, T, R, X), (B, F, R, X)."""
+        found: Tensor = torch.fft.rfft(shown, dim=1)[:, 1 : self.model.bins + 1]
         return found
 
     def _element_loads(
         self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Forces of elements by the logarithms of stiffnesses, then dampings: values, slopes (B, T, P'), elements."""
+        """Forces of elements by the logarithms of their parameters: values, slopes (B, T, P'), elements."""
         s = self.model.simulator
         d, v = (torch.as_tensor(x) for x in self.element_motion(motion.states, data, smooth))
-        k_at, c_at = s.estimated_elements
-        K, C = steps.values.stiffness[:, None, k_at], steps.values.damping[:, None, c_at]
-        load = torch.cat([d[:, :, k_at] * K, v[:, :, c_at] * C], dim=2)
-        slope = torch.cat([v[:, :, k_at] * K, (self.slope @ v)[:, :, c_at] * C], dim=2)
-        return load, slope, torch.cat([k_at, c_at])
+        at = s.element_of
+        K = (steps.values.stiffness[:, at] * s.by_stiffness).unsqueeze(1)
+        C = (steps.values.damping[:, at] * s.by_damping).unsqueeze(1)
+        load = d[:, :, at] * K + v[:, :, at] * C
+        slope = v[:, :, at] * K + (self.slope @ v)[:, :, at] * C
+        return load, slope, at
 
     def _spring_loads(self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Tensor | None:
         """Forces of air springs by the loads that their stiffness follows, (B, E, T, X); None: none does."""
@@ -348,21 +354,21 @@ class LawWindows:
         return -by_inertia(moved, values.mass, values.coupling, exponents, pattern).permute(0, 2, 1, 3)
 
     def _force_sources(self, along: list[Along], point: WindowPoint, steps: Steps, before: int) -> Tensor:
-        """Laws' forces by the unknowns along the given motion, memories apart, (B, L, T, before + U)."""
+        """Laws' forces by the unknowns along the given motion, memories apart, (B, T, L, before + U)."""
         names = [(p.element, p.quantity) for p in self.system.parameters]
         B, T = point.force.shape[:2]
-        found = torch.zeros((B, len(along), T, before + self.unknowns), dtype=torch.float64)
+        found = torch.zeros((B, T, len(along), before + self.unknowns), dtype=torch.float64)
         at = before + len(names)
         for i, (acting, path) in enumerate(zip(self.acting, along, strict=True)):
             start = self.first_memory(point, i)
             changes = path.changes(self.values(point, i), acting.free, self._element(steps, i), start)
             for change in changes[:-2]:
-                found[:, i, :, at] = torch.as_tensor(change)
+                found[:, :, i, at] = torch.as_tensor(change)
                 at += 1
             element = self.system.elements[acting.element]
             for quantity, change in zip(("stiffness", "damping"), changes[-2:], strict=True):
                 if (element, quantity) in names:
-                    found[:, i, :, before + names.index((element, quantity))] = torch.as_tensor(change)
+                    found[:, :, i, before + names.index((element, quantity))] = torch.as_tensor(change)
         return found
 
     def smoothed(self, columns: Columns, residual: Tensor, step: Tensor, dx0: Tensor, steps: Steps) -> FloatArray:

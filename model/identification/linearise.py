@@ -204,8 +204,7 @@ class WindowModel:
         white = (self.whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
         by_k = (white * values.stiffness.square().unsqueeze(1)).sum(dim=1)
         by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
-        k_at, c_at = s.estimated_elements
-        noise = torch.cat([by_k[:, k_at], by_c[:, c_at]], dim=1)
+        noise = by_k[:, s.element_of] * s.by_stiffness.square() + by_c[:, s.element_of] * s.by_damping.square()
         shown = at.sensitivities.square().sum(dim=2)
         share = torch.zeros_like(shown)
         share[:, : noise.shape[1]] = noise / shown[:, : noise.shape[1]].clamp_min(1e-300)
@@ -298,11 +297,10 @@ class WindowModel:
         moved = (compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support
         deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
         rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
-        k_at, c_at = s.estimated_elements
-        of_k, powers = per_force * deflection[:, :, None], s.loading.stiffness
+        at, powers = s.element_of, s.loading.stiffness
         return (
-            torch.cat([of_k[..., k_at], per_force[..., c_at] * rate[:, :, None, c_at]], dim=3),
-            of_k @ powers.T.to(kind) if bool(powers.any()) else None,
+            per_force[..., at] * (s.by_stiffness * deflection[..., at] + s.by_damping * rate[..., at]).unsqueeze(2),
+            (per_force * deflection.unsqueeze(2)) @ powers.T.to(kind) if bool(powers.any()) else None,
         )
 
     def by_inertia(

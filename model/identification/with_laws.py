@@ -21,11 +21,12 @@ from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refined, in_order
 from sprung.model.identifier import UnusableWindow
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, SensorLaw, StructureLaw
+from sprung.model.laws.in_place import is_linear
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
-_CHUNK = 96  # windows at a time
+_CHUNK = 96  # windows at a time, of one law; forces of more laws fill so much more memory
 _PILOTS = 8  # windows of a batch that are identified first, where there are
 _MANY = 24  # windows, for whom these say where to begin
 _FITS = 1.5  # chi-square of a window that stands where it belongs, generously
@@ -37,8 +38,8 @@ def acting_laws(system: System) -> list[Acting]:
     found = []
     for placed in system.laws:
         law = placed.law
-        if law.name.startswith("sensor_"):
-            continue  # undone in the signals
+        if isinstance(law, SensorLaw) or is_linear(placed):
+            continue  # undone in the signals; part of the mechanics
         if not isinstance(law, ElementLaw) or law.memory > 1 or law.name.startswith("time_varying"):
             raise UnusableWindow(
                 f"{placed.location}: windows cannot be identified with {law.name} in place; "
@@ -46,7 +47,7 @@ def acting_laws(system: System) -> list[Acting]:
             )
         at = [system.elements.index(name) for name in placed.places]
         for group in [at] if law.where == "pair" else [[e] for e in at]:
-            weights = np.zeros(len(system.elements))
+            weights = np.zeros(len(system.whole_system.mechanics.stiffness))
             weights[group[0]] = 1.0
             if len(group) == 2:
                 weights[group[1]] = -1.0
@@ -56,9 +57,13 @@ def acting_laws(system: System) -> list[Acting]:
 
 
 def without_laws(system: System) -> System:
-    """The system without the laws of its elements."""
-    bare = {name: element.model_copy(update={"laws": ()}) for name, element in system.file.elements.items()}
-    return System(system.file.model_copy(update={"elements": bare}), system.catalogue)
+    """The system without the laws along its elements; those of its structure and bodies are part of its mechanics."""
+    of_structure = {law.name for law in system.catalogue if isinstance(law, StructureLaw)}
+    bare = {
+        name: element.model_copy(update={"laws": tuple(law for law in element.laws if set(law) <= of_structure)})
+        for name, element in system.file.elements.items()
+    }
+    return System(system.file.model_copy(update={"elements": bare}), system.catalogue, whole=True)
 
 
 class LawRefiner:
@@ -102,7 +107,7 @@ class LawRefiner:
             pieces = [
                 np.asarray(part)
                 for group in alike(present, of)
-                for part in np.array_split(group, max(1, -(-len(group) // _CHUNK)))
+                for part in np.array_split(group, max(1, -(-len(group) * len(self.laws) // _CHUNK)))
             ]
             return in_order(share(work, pieces, self.workers), np.concatenate(pieces))
 

@@ -211,6 +211,7 @@ class ElementLaw(Parametrised):
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise
+    parts: tuple[tuple[str, str], ...] = ()  # both of every part, where the force is a sum of such
 
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""
@@ -248,6 +249,8 @@ class BodyLaw(Parametrised):
     sentence: str
     load: Callable[[FloatArray, Values], FloatArray] | None = None  # N over the laws' clock: one more force in u
     scales: str = ""  # quantity of the body that the only parameter multiplies: no candidate where that is estimated
+    # Powers of parameters, by their index, with which stiffness and damping of the element that the law adds grow
+    powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
     prior_cost: float = 0.0
 
@@ -278,6 +281,7 @@ class StructureLaw(Parametrised):
     sentence: str
     variants: tuple[str, ...] = ("",)  # discrete choices: an axis
     axes: Mapping[int, str] = field(default_factory=dict)  # parameters that are a place along "x" or "y", m
+    powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # as of a `BodyLaw`
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
     prior_cost: float = 0.0
     fault: bool = False

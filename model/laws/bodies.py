@@ -126,6 +126,7 @@ FLEXIBLE_MODE = BodyLaw(
     shapes=lambda lines: grid(_frequencies(lines), [0.02], [0.3]),
     absent=(1.0, 0.02, 0.0),
     looks_like="a narrow resonance in all sensors of one body, in one pattern; follows the excitation's level",
+    powers={0: (2.0, 1.0), 1: (0.0, 1.0)},
     confused_with=("external_force", "series_stiffness"),
     sentence="the body has an elastic mode at {frequency} with {damping_ratio} of critical damping",
     adds_motion=True,

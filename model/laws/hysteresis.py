@@ -160,9 +160,8 @@ def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     _, beta, n, *further = p
     gamma = further[0] if further else GAMMA
     (z,) = motion.memory
-    v, size = motion.rate, np.abs(z)
-    level = beta * size**n
-    found: FloatArray = (v - level * (np.abs(v) * np.sign(z) + gamma * v))[None]
+    v = motion.rate
+    found: FloatArray = (v - beta * np.abs(z) ** n * (np.copysign(v, z) + gamma * v))[None]
     return found
 
 

@@ -76,6 +76,7 @@ MISSING_CONNECTION = StructureLaw(
     sentence="they are connected by a spring of {stiffness} and a damper of {damping} that the system file does not "
     "have",
     axes={2: "x", 3: "y"},
+    powers={0: (1.0, 0.0), 1: (0.0, 1.0)},
     prior_cost=RARE,
 )
 
@@ -115,6 +116,7 @@ SUSPENDED_MASS = StructureLaw(
     confused_with=("flexible_mode", "mass_change", "external_force"),
     sentence="a mass of {mass} hangs on it that swings at {frequency} with {damping_ratio} of critical damping",
     axes={3: "x", 4: "y"},
+    powers={1: (2.0, 1.0), 2: (0.0, 1.0)},
     adds_motion=True,
     prior_cost=RARE,
 )

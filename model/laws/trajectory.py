@@ -10,6 +10,7 @@ import numpy as np
 from sprung.model.laws.base import CLOCK_LEAD, ElementLaw, Motion, SpringDamper, Values
 from sprung.model.signals import FloatArray
 
+_At = tuple[FloatArray, FloatArray, float]  # deflection, rate, time
 _SERIES = 0.5  # below this the recursion for phi loses digits and the power series takes over
 
 
@@ -72,6 +73,7 @@ def recall(
     p = tuple(_column(value) for value in p)
     element = SpringDamper(_column(element.stiffness), _column(element.damping))
     shape = np.broadcast_shapes(np.shape(deflection)[:-1], *[np.shape(v) for v in (*p, *element)])
+    p, element = tuple(_number(value) for value in p), SpringDamper(*(_number(value) for value in element))
     d = np.moveaxis(np.broadcast_to(deflection, (*shape, len(time))), -1, 0)
     v = np.moveaxis(np.broadcast_to(rate, (*shape, len(time))), -1, 0)
     d_half = 0.5 * (d[1:] + d[:-1]) + h / 8 * (v[:-1] - v[1:])
@@ -80,16 +82,9 @@ def recall(
     path = np.zeros((len(time), law.memory, *shape))
     path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element) if first is None else first
     for i in range(len(time) - 1):
-        z = path[i]
         t = float(time[i])
-        n0 = step.source(d[i], v[i], t, z)
-        a = step.half * z + step.q * n0
-        na = step.source(d_half[i], v_half[i], t + h / 2, a)
-        b = step.half * z + step.q * na
-        nb = step.source(d_half[i], v_half[i], t + h / 2, b)
-        c = step.half * a + step.q * (2 * nb - n0)
-        nc = step.source(d[i + 1], v[i + 1], t + h, c)
-        path[i + 1] = step.full * z + step.f1 * n0 + step.f2 * (na + nb) + step.f3 * nc
+        middle = d_half[i], v_half[i], t + h / 2
+        path[i + 1] = step.advance(path[i], (d[i], v[i], t), middle, (d[i + 1], v[i + 1], t + h))
     return np.moveaxis(path, 0, -1)
 
 
@@ -105,13 +100,32 @@ class MemoryStep:
         self.f1 = h * (one - 3 * two + 4 * three)
         self.f2 = 2 * h * (two - 2 * three)
         self.f3 = h * (4 * three - two)
+        self.h = h
+
+    def advance(self, z: FloatArray, begin: _At, middle: _At, end: _At) -> FloatArray:
+        """The states after a step from z; the motion at its begin, in the middle and at its end."""
+        n0 = self.source(*begin, z)
+        if not self.law.memory_decay:  # what ETDRK4 is without decay: Runge and Kutta's method
+            na = self.source(*middle, z + self.h / 2 * n0)
+            nb = self.source(*middle, z + self.h / 2 * na)
+            return z + self.h / 6 * (n0 + 2 * (na + nb) + self.source(*end, z + self.h * nb))
+        a = self.half * z + self.q * n0
+        na = self.source(*middle, a)
+        nb = self.source(*middle, self.half * z + self.q * na)
+        nc = self.source(*end, self.half * a + self.q * (2 * nb - n0))
+        return self.full * z + self.f1 * n0 + self.f2 * (na + nb) + self.f3 * nc
 
     def source(self, d: FloatArray, v: FloatArray, t: float | FloatArray, z: FloatArray) -> FloatArray:
-        found: FloatArray = self.law.memory_rate(Motion(d, v, t, z), self.p, self.element) + self.decay * z
-        return found
+        found: FloatArray = self.law.memory_rate(Motion(d, v, t, z), self.p, self.element)
+        return found + self.decay * z if self.law.memory_decay else found
 
 
 def _column(value: Any) -> Any:
     """A parameter that broadcasts with (..., T), without the axis of samples."""
     array = np.asarray(value, dtype=float)
     return array[..., 0] if array.ndim else array
+
+
+def _number(value: FloatArray) -> Any:
+    """One number where all are the same: its powers are quick."""
+    return float(value.flat[0]) if value.size and (value == value.flat[0]).all() else value

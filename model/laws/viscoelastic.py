@@ -42,6 +42,16 @@ def _decay(p: Values, element: SpringDamper) -> FloatArray:
     return np.broadcast_to(_POLES.reshape(5, *(1 for _ in shape)), (5, *shape))
 
 
+# the same as text: force and rate of the state of every branch
+_PARTS = tuple(
+    (
+        f"stiffness * sin({np.pi!r} * order) * {float(np.log(_APART) / np.pi)!r} * {float(pole / _UNIT)!r}**order * z",
+        f"v - {float(pole)!r} * z",
+    )
+    for pole in _POLES
+)
+
+
 def _path(motion: Motion, p: Values) -> FloatArray:
     time, d = np.asarray(motion.time), np.asarray(motion.deflection)
     step = float(time[1] - time[0])
@@ -70,6 +80,7 @@ FRACTIONAL_STIFFNESS = ElementLaw(
     looks_like="stiffer at every higher frequency and damped everywhere, without a corner; linear",
     confused_with=("air_spring", "series_stiffness"),
     sentence="a part of {stiffness} at 1 Hz that grows with the frequency to the power {order}",
+    parts=_PARTS,
     memory=5,
     memory_rate=_rate,
     memory_decay=_decay,

@@ -101,20 +101,21 @@ class LinearSimulator:
         self.forces = torch.as_tensor([_knot_of(system, u) for u in mechanics.force_drive], dtype=torch.long)
         self.W = 2 * (len(self.supports) + len(self.forces))
         self._assemble(constant)
-        index = {name: i for i, name in enumerate(system.elements)}
-        quantity = [p.quantity for p in system.parameters]
-        self.k_of = _scatter(system, "stiffness", index, len(index), constant)
-        self.c_of = _scatter(system, "damping", index, len(index), constant)
-        bodies = {name: i for i, name in enumerate(system.bodies)}
-        per_body = _scatter(system, "mass", bodies, len(bodies), constant)
-        self.m_of = per_body[:, torch.as_tensor(mechanics.body_of_dof)]
+        # Powers of the parameters: of stiffnesses (P, E), of dampings (P, E), of masses and inertias (P, n)
+        self.k_of, self.c_of, self.m_of = (constant(powers) for powers in _powers(system))
         self.loading = Loading(system, constant)
-        self.estimates_mass = "mass" in quantity
-        self.estimated_masses = quantity.count("mass")
+        self.estimated_masses = int(self.m_of.any(dim=1).sum())
+        self.estimates_mass = self.estimated_masses > 0
+        index = {name: i for i, name in enumerate(system.elements)}
         self.estimated_elements = tuple(  # indices of elements, in the order of the parameters
             torch.as_tensor([index[p.element] for p in system.parameters if p.quantity == q], dtype=torch.long)
             for q in ("stiffness", "damping")
         )
+        # Of the parameters before those of masses: their element, and the powers of its stiffness and damping
+        of_elements = len(self.m_of) - self.estimated_masses
+        both = torch.stack([self.k_of[:of_elements], self.c_of[:of_elements]])
+        self.element_of = both.abs().sum(dim=0).argmax(dim=1) if of_elements else torch.zeros(0, dtype=torch.long)
+        self.by_stiffness, self.by_damping = both.gather(2, self.element_of.expand(2, -1).unsqueeze(2)).squeeze(2)
         omega = math.sqrt(float(torch.linalg.eigvalsh(self._normalised_stiffness()).max().clamp_min(1e-12)))
         root = self.nominal_m.rsqrt()
         # Mass-normalised states with rates in units of the fastest mode: the norm of A h is then about omega h.
@@ -296,11 +297,19 @@ def _knot_of(system: System, drive: int) -> int:
     raise AssertionError(drive)
 
 
-def _scatter(system: System, quantity: str, index: dict[str, int], size: int, constant) -> Tensor:  # type: ignore[no-untyped-def]
-    """Matrix (P, size) that puts the parameters of one quantity in their places."""
-    matrix = np.zeros((len(system.parameters), size))
+def _powers(system: System) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Powers of the parameters of which stiffnesses (P, E), dampings (P, E), masses and inertias (P, n) are made."""
+    mechanics, P = system.mechanics, len(system.parameters)
+    k, c = np.zeros((2, P, len(mechanics.stiffness)))
+    m = np.zeros((P, mechanics.n))
+    followers = {follower.parameter.name: follower for follower in system.followers}
     for row, parameter in enumerate(system.parameters):
-        if parameter.quantity == quantity:
-            matrix[row, index[parameter.element]] = 1.0
-    found: Tensor = constant(matrix)
-    return found
+        follower = followers.get(parameter.name)
+        if follower is not None and follower.element >= 0:
+            k[row, follower.element], c[row, follower.element] = follower.stiffness, follower.damping
+        elif follower is not None or parameter.quantity == "mass":
+            body = system.bodies.index(parameter.element) if follower is None else follower.body
+            m[row] = mechanics.body_of_dof == body
+        else:
+            (k if parameter.quantity == "stiffness" else c)[row, system.elements.index(parameter.element)] = 1.0
+    return k, c, m

@@ -58,18 +58,19 @@ class Loading:
 
     def __init__(self, system: System, constant: Callable[[FloatArray], Tensor]) -> None:
         self.terms = load_terms(system)
-        dofs = system.mechanics.dofs
+        mechanics = system.mechanics
+        dofs = mechanics.dofs
         exponents = np.zeros((len(self.terms), len(dofs)))
         pattern = np.zeros((len(self.terms), len(dofs), len(dofs)))
         for i, term in enumerate(self.terms):
             if term.kind == "load":
-                exponents[i] = [dof.rpartition(".")[0] == term.body for dof in dofs]
+                exponents[i] = mechanics.body_of_dof == system.bodies.index(term.body)
             elif term.kind == "centre":
                 z, pitch = dofs.index(f"{term.body}.z"), dofs.index(f"{term.body}.pitch")
                 pattern[i, z, pitch] = pattern[i, pitch, z] = 1.0
             else:
                 exponents[i, dofs.index(f"{term.body}.{term.kind.removesuffix('_inertia')}")] = 1.0
-        stiffness = np.zeros((len(self.terms), len(system.elements)))
+        stiffness = np.zeros((len(self.terms), len(mechanics.stiffness)))
         for e, element in enumerate(system.file.elements.values()):
             for i, term in enumerate(self.terms):
                 if term.kind == "load" and term.body == element.upper:

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, StructureLaw, SupportLaw
+from sprung.model.laws.in_place import LawError, is_linear, put_in_place
 from sprung.model.laws.placed import PlacedLaw
-from sprung.model.laws.structure import sites_of
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
@@ -128,22 +128,14 @@ def _with_body_laws(
     system: System, mechanics: Mechanics, laws: tuple[PlacedLaw, ...], drives: FloatArray, time: FloatArray
 ) -> tuple[Mechanics, FloatArray]:
     for placed in laws:
-        if isinstance(placed.law, StructureLaw):
-            sites = sites_of(system.file, placed.location)
-            variant = placed.variant or placed.law.variants[0]
-            mechanics = placed.law.modify(mechanics, sites, placed.values, variant)
-        if isinstance(placed.law, BodyLaw):
-            body = system.bodies.index(placed.location)
-            variants = placed.law.variants(mechanics, body)
-            variant = placed.variant or variants[0]
-            if variant not in variants:
-                raise SimulationError(
-                    f"{placed.location}: {placed.law.name} has no variant {variant!r}; it has {', '.join(variants)}"
-                )
-            mechanics = placed.law.modify(mechanics, body, placed.values, variant)
-            if placed.law.load is not None:
-                load = placed.law.load(time, placed.values)
-                drives = np.column_stack([drives, load, np.gradient(load, 1 / system.sample_rate, edge_order=2)])
+        if isinstance(placed.law, StructureLaw | BodyLaw) and not (system.whole and is_linear(placed)):
+            try:
+                mechanics = put_in_place(system.file, mechanics, placed)
+            except LawError as error:
+                raise SimulationError(str(error)) from None
+        if isinstance(placed.law, BodyLaw) and placed.law.load is not None:
+            load = placed.law.load(time, placed.values)
+            drives = np.column_stack([drives, load, np.gradient(load, 1 / system.sample_rate, edge_order=2)])
     return mechanics, drives
 
 

@@ -114,5 +114,5 @@ def _parameters(
 
 def state_names(engine: Engine) -> list[str]:
     """`car.z`, `car.roll`, ... then their rates `car.z_rate`, ..."""
-    dofs = engine.system.mechanics.dofs
+    dofs = engine.system.whole_system.mechanics.dofs
     return [*dofs, *(f"{dof}_rate" for dof in dofs)]

@@ -306,7 +306,8 @@ def system(
 @app.command("import")
 def import_model(
     file: Annotated[
-        Path, typer.Argument(help=".mat file with M, C, K and sensor rows, or A, B, C, D.", metavar="MODEL")
+        Path,
+        typer.Argument(help=".mat file with M, C, K and sensor rows, or A, B, C, D; or an FMU.", metavar="MODEL"),
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="System file to write.")],
     rate: Annotated[

@@ -16,7 +16,8 @@ from sprung.benchmarks.generator.exact import exact_response
 from sprung.benchmarks.generator.files import WRITERS
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_UP, BatchMotion, PlantBatch, Slot
 from sprung.benchmarks.generator.laws import LAWS
-from sprung.benchmarks.generator.make import _integrated
+from sprung.benchmarks.generator.make import _integrated, make_with_each_missing
+from sprung.benchmarks.several_laws import drawn
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
 from sprung.replay.record import load_record
 
@@ -79,6 +80,40 @@ def test_a_law_acts_on_its_own_element_and_column_alone(name: str) -> None:
     assert np.abs(difference[:, 0]).max() == 0
     assert np.abs(difference[10:19, 1]).max() > 1e-6
     assert difference[16:19, 1] == pytest.approx(0.0, abs=1e-12)  # bogie 2 does not touch secondary_1l
+
+
+def test_two_laws_at_one_element_add_up() -> None:
+    laws = [Slot(0, 8, "coulomb_friction", [320.0, 1e-3]), Slot(0, 8, "cubic_stiffness", [1e9])]
+    state = np.zeros((20, 1))
+    state[0], state[10] = -8e-3, 0.5
+    support = np.zeros((16, 1))
+    plain = BatchMotion(VEHICLE, plant([]))(state, np.zeros(0), support, 0.0)[0]
+    each = [BatchMotion(VEHICLE, plant([law]))(state, np.zeros(1), support, 0.0)[0] - plain for law in laws]
+    both = BatchMotion(VEHICLE, plant(laws))(state, np.zeros(2), support, 0.0)[0] - plain
+    assert min(np.abs(one).max() for one in each) > 1e-3
+    assert both == pytest.approx(each[0] + each[1], rel=1e-9)
+
+
+def test_several_laws_are_three_to_five_the_first_two_at_one_element() -> None:
+    cases = [drawn(VEHICLE, np.random.default_rng([7, number])) for number in range(12)]
+    for case in cases:
+        places = [place for place, _, _ in case.effects]
+        names = [law for _, law, _ in case.effects]
+        assert places[0] == places[1] and names[0] != names[1]
+        assert len(set(places)) == len(places) - 1
+    assert {len(case.effects) for case in cases} == {3, 4, 5}
+
+
+@pytest.mark.slow
+def test_each_law_beside_others_is_seen_as_far_as_they_leave_it() -> None:
+    case = draw_cases(VEHICLE, 1, 22, ["cubic_stiffness"], 0.0)[0]
+    place, law, (k3,) = case.effects[0]
+    elsewhere = next(element for element in VEHICLE.elements if element != place)
+    pair = replace(case, effects=[(place, law, [0.02 * k3]), (elsewhere, law, [0.02 * k3])])
+    _, ratios = make_with_each_missing(VEHICLE, pair, 40.0)
+    alone = next(iter(make_recordings(VEHICLE, [replace(pair, effects=pair.effects[:1])], seconds=40.0))).snr
+    assert alone is not None
+    assert 0.3 * alone < ratios[0] < 1.05 * alone
 
 
 def test_a_constant_force_of_friction_decelerates_the_car_by_force_over_mass() -> None:

@@ -119,6 +119,32 @@ def test_an_fmu_runs_as_our_own_simulation(laws: str, run: Callable[..., np.ndar
         assert error < limit * np.abs(ours[:, column]).max(), name
 
 
+HANGING = "car: {mass: 400, laws: [{suspended_mass: {mass: 60, frequency: 6, damping_ratio: 0.1, x: 0, y: 0}}]}"
+RUBBER = ", laws: [{fractional_stiffness: {stiffness: 6000, order: 0.35}}]"
+
+
+@pytest.mark.parametrize("text", [TEXT % RUBBER, TEXT.replace("car: {mass: 400}", HANGING) % LAWS["friction"]])
+def test_laws_of_several_parts_and_of_bodies_are_in_the_exports(text: str, tmp_path: Path) -> None:
+    vehicle = parse_system(text)
+    write_fmu(tmp_path / "car.fmu", vehicle)
+    assert validate_fmu(str(tmp_path / "car.fmu")) == []
+    _, u = inputs(1.0)
+    ours = simulate_ride(vehicle, u).sensors
+    theirs = cosimulated(tmp_path / "car.fmu", vehicle, u)
+    error = np.abs(theirs - ours[: len(theirs)]).max(axis=0) / np.abs(ours).max(axis=0)
+    assert (error < 1e-3).all()
+    write_modelica(tmp_path / "car.mo", vehicle)
+    assert (tmp_path / "car.mo").read_text().count("der(z)") == (0 if HANGING in text else 5)
+    space = state_space(vehicle)
+    assert len(space.A) == (6 if HANGING in text else 4)
+
+
+def test_what_nobody_measures_is_not_exported(tmp_path: Path) -> None:
+    law = "car: {mass: 400, laws: [{external_force: {amplitude: 10, frequency: 3, phase: 0}}]}"
+    with pytest.raises(ExchangeError, match="car: external_force has no formula"):
+        write_fmu(tmp_path / "car.fmu", parse_system(TEXT.replace("car: {mass: 400}", law) % ""))
+
+
 def test_the_fmu_names_inputs_outputs_and_parameters(tmp_path: Path) -> None:
     write_fmu(tmp_path / "car.fmu", system(LAWS["friction"]))
     description = read_model_description(str(tmp_path / "car.fmu"))
@@ -158,6 +184,19 @@ def test_matrices_are_those_of_the_simulation(tmp_path: Path) -> None:
     answer = control.forced_response(plant, fine, between).outputs[:, ::64].T
     ours = simulate_ride(vehicle, u).sensors
     assert np.all(np.abs(np.asarray(answer) - ours).max(axis=0) < 1e-6 * np.abs(ours).max(axis=0))
+
+
+def test_derivatives_by_values_of_laws_are_those_of_differences() -> None:
+    text = TEXT.replace("car: {mass: 400}", HANGING.replace("}}]", "}}, {mass_change: {ratio: 1.1}}]")) % ""
+    space = state_space(parse_system(text))
+    for name, value in (("frequency", 6), ("damping_ratio", 0.1), ("ratio", 1.1)):
+        at = next(i for i, parameter in enumerate(space.parameters) if parameter.endswith(f".{name}"))
+        ahead, behind = (
+            state_space(parse_system(text.replace(f"{name}: {value}", f"{name}: {value * (1 + step)}")))
+            for step in (1e-5, -1e-5)
+        )
+        for ours, one, other in ((space.dA, ahead.A, behind.A), (space.dC, ahead.C, behind.C)):
+            np.testing.assert_allclose(ours[at], (one - other) / (2e-5 * value), rtol=1e-6, atol=1e-3)
 
 
 def test_derivatives_by_the_parameters_are_those_of_differences() -> None:

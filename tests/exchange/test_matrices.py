@@ -70,6 +70,12 @@ def test_the_command_writes_a_file_that_the_others_take(tmp_path: Path, capsys: 
         ({"S": np.array([[-1.0, 0, 1]])}, "nothing connects"),
         ({"Kb": np.array([[150e3], [0], [0]])}, "row 1 leaves"),
         ({"sample_rate": 0.0}, "sample_rate"),
+        ({"K": K + 0.1j}, "K: its numbers are complex"),
+        ({"K": "stiff"}, "K: is no matrix"),
+        ({"K": np.zeros((0, 0))}, "empty"),
+        ({"K": K[:2]}, "not of the same size"),
+        ({"S": np.eye(4)}, "a column for each of 3"),
+        ({"M": {"car": 400.0}}, "M: is no matrix"),
     ],
 )
 def test_what_is_no_network_is_refused_in_one_line(tmp_path: Path, change: dict[str, object], said: str) -> None:

@@ -57,10 +57,10 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
 
     def shown(point: WindowPoint) -> torch.Tensor:
         for _ in range(2):  # each call takes a few steps of Newton's method
-            point, motion = model.settle(point, model.steps(point, data), data, still)
+            point, motion, _ = model.settle(point, model.steps(point, data), data, still)
         return motion.outputs / torch.as_tensor(bare.sensor_noise)
 
-    point, motion = model.settle(start, model.steps(start, data), data, still)
+    point, motion, _ = model.settle(start, model.steps(start, data), data, still)
     steps = model.steps(point, data)
     along = model.along(motion.states, data, still)
     columns = model.shown(point, steps, motion, data, still, along, model.flow(along, point, steps))
@@ -72,5 +72,5 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
         moved[:, at] = size
         up, down = (shown(WindowPoint(unknowns + sign * moved, start.x0, start.force)) for sign in (1, -1))
         expected = (up - down) / (2 * size)
-        found = (whitened @ columns[..., 4 + at]).mT
+        found = columns[..., 4 + at] @ whitened.mT
         assert (found - expected).square().mean().sqrt() < 0.08 * expected.square().mean().sqrt()

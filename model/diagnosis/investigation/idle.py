@@ -9,9 +9,11 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import is_waveform
+from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.compete import from_nominal, start_of
 from sprung.model.diagnosis.selection.evidence import profile_gain
+from sprung.model.laws import StructureLaw
 
 _STEPS = 8  # of a fit without one finding
 
@@ -42,4 +44,20 @@ def _without(state: Investigation, index: int) -> Fit | None:
     start = tuple(force for i, force in enumerate(near) if i != index and force is not None)
     bare = Point(point.theta, terms, np.zeros(0), start)
     bare = replace(bare, state=np.zeros(state.problem.forward(bare).plant.structure.states))
-    return try_optimise(state.problem, bare, _STEPS, state.fit.whitener)
+    tried = (try_optimise(state.problem, one, _STEPS, state.fit.whitener) for one in (bare, *_afresh(state, terms)))
+    return min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
+
+
+def _afresh(state: Investigation, terms: tuple[Term, ...]) -> list[Point]:
+    """Starts as if the last finding, a part of the structure, had been the first.
+
+    Beside another one its values may be far from its own: two springs between the same bodies are as well one of them
+    moved and a third.
+    """
+    if len(terms) != state.given + 1 or not isinstance(terms[-1].law, StructureLaw):
+        return []
+    hits = [hit for hit in state.first.candidates if hit.term.key == terms[-1].key]
+    starts = (
+        start for hit in hits for start in (start_of(state.base, hit), *from_nominal(state.problem, state.base, hit))
+    )
+    return list(starts)

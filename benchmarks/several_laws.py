@@ -1,0 +1,72 @@
+"""`sprung bench several-laws [--count 12] [--seed 1]`: three to five laws at once, two of them at one element.
+
+The independent generator conceals laws of the catalogue in the bundled vehicle.  A law counts where its signal-to-noise
+ratio, for a test that knows places and names of all of them and leaves to the others what they imitate, is at least
+twice its limit.  A finding is right where a law of its name is at its place, whatever else is there.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from sprung.benchmarks.generator.draw import Case, add_law, draw_cases
+from sprung.benchmarks.generator.laws import LAWS
+from sprung.benchmarks.generator.make import make_with_each_missing
+from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
+from sprung.benchmarks.structure import LIMIT, VISIBLE, MadeSamples, in_order
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.system import MANCHESTER, load_system
+
+WEAK = 0.5  # laws from the middle of their range on
+NAMED = tuple(name for name, law in LAWS.items() if law.named)
+
+
+def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[str, Any]]:
+    """Yields one line per recording, then precision and recall."""
+    vehicle, system = read_vehicle(MANCHESTER), load_system(MANCHESTER)
+    said = right = visible = found = everything = 0
+    for number in range(count):
+        case = drawn(vehicle, np.random.default_rng([seed, number]))
+        values, ratios = make_with_each_missing(vehicle, case, seconds)
+        began = time.process_time()
+        report = diagnose(system, MadeSamples(in_order(vehicle, system, values)), Options(file=f"several-{number}"))
+        truth = {(place, law): ratio / LIMIT for (place, law, _), ratio in zip(case.effects, ratios, strict=True)}
+        told = [(f.location, f.effect) for f in report.findings]
+        due = [one for one, limits in truth.items() if limits >= VISIBLE]
+        said, right = said + len(told), right + sum(one in truth for one in told)
+        visible, found = visible + len(due), found + sum(one in told for one in due)
+        everything += set(told) == set(truth)
+        yield {
+            "number": number,
+            "truth": [[*one, round(limits, 1)] for one, limits in truth.items()],
+            "verdict": report.verdict,
+            "said": told,
+            "false": [one for one in told if one not in truth],
+            "missed": [one for one in due if one not in told],
+            "cpu_seconds": round(time.process_time() - began, 1),
+        }
+    yield {
+        "recordings": count,
+        "findings": said,
+        "precision": round(right / said, 3) if said else None,
+        "visible": visible,
+        "recall": round(found / visible, 3) if visible else None,
+        "recordings_wholly_right": everything,
+    }
+
+
+def drawn(vehicle: Vehicle, random: np.random.Generator) -> Case:
+    """A vehicle with three to five laws, the first two at one element."""
+    case = draw_cases(vehicle, 1, int(random.integers(2**31)), ["clean"])[0]
+    case.kind = "several"
+    laws = int(random.integers(3, 6))
+    places = [str(place) for place in random.choice(vehicle.elements, laws - 1, replace=False)]
+    names = [str(name) for name in random.choice(NAMED, 2, replace=False)]
+    names += [str(name) for name in random.choice(NAMED, laws - 2)]
+    for place, name in zip([places[0], *places], names, strict=True):
+        add_law(case, random, place, name, WEAK)
+    return case
