@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -74,7 +75,7 @@ class System:
     catalogue: tuple[Law, ...] = CATALOGUE
     whole: bool = False  # whether laws of bodies and of the structure are part of the mechanics; see `whole_system`
 
-    def __reduce__(self) -> tuple[type[System], tuple[object, ...]]:
+    def __reduce__(self) -> tuple[Callable[..., System], tuple[object, ...]]:
         """To another process goes the file: the bundled laws are there already, and functions do not travel."""
         own = () if self.catalogue is CATALOGUE else (self.catalogue,)
         return (_whole_again if self.whole else System), (self.file, *own)

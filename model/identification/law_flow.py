@@ -127,7 +127,9 @@ class Flow:
         B, T, L = given.shape
         known = given.clone()
         known[:, 1:] = (self.small @ given[:, 1:].unsqueeze(3)).squeeze(3)
-        found = torch.linalg.solve_triangular(self._closed, known.reshape(B, T * L, 1), upper=False, unitriangular=True)
+        found: Tensor = torch.linalg.solve_triangular(
+            self._closed, known.reshape(B, T * L, 1), upper=False, unitriangular=True
+        )
         return found.view(B, T, L)
 
     def _answers_by_force(self) -> Tensor:
