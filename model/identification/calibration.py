@@ -28,9 +28,10 @@ from torch import Tensor
 
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.gauss_newton import WindowBatch
-from sprung.model.identification.linearise import WindowModel, as_rows
+from sprung.model.identification.linearise import WindowModel, as_rows, as_spectra
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.linear import ElementValues
 
 _ROUNDING = 1e-6  # of sums in single precision, relative
 
@@ -114,6 +115,27 @@ class DeviationSensitivity:
         """Values and rates (B, T, W/2) of the drives as gains change them, and as delays do."""
         value, slope = data.w[:, :, 0::2], data.w[:, :, 1::2]
         return (value, slope), (slope, self.slope @ slope)
+
+    def smoothed(
+        self,
+        at: Products,
+        after: Seconded,
+        data: WindowBatch,
+        carried: Tensor,
+        compliance: Tensor,
+        values: ElementValues,
+    ) -> tuple[WindowBatch, Tensor]:
+        """Windows and outputs (B, T, S') less what the residual says of the noise of the drives.
+
+        The noise of a measured motion below is not in what the sensors show, but in what the model makes of it: along
+        the motion as measured, all sensors would seem to show too little (errors in variables).
+        carried: what that noise brings to the signals, (B, F, R, W/2); compliance: (B, F, n, n).
+        """
+        alone = torch.cholesky_solve(at.free @ after.residual, at.factor)  # (B, N, 1)
+        step = after.step.unsqueeze(2)
+        left = after.residual - at.free.mT @ (alone - at.across @ step) - at.sensitivities.mT @ step
+        noise = self.model.noise_told(at.whiten, carried, as_spectra(left, at.whiten))
+        return self.model.smoothed(values, compliance, noise, data, after.outputs)
 
     def evidence(self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]) -> Evidence:
         """At the log-ratios that the chord step `after` of `at` leads to.

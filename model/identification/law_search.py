@@ -203,7 +203,10 @@ class LawSearch:
         self, rows: Tensor, columns: Columns, steps: Steps, flow: Flow, after: Second, data: WindowBatch
     ) -> None:
         """Evidence on gains and delays of the windows `rows`."""
-        shown = self.windows.by_drive(columns, steps, flow, self.calibration.motions(data), data)
+        given = columns.carried, columns.compliance, steps.values
+        clean, outputs = self.calibration.smoothed(columns, after, data, *given)
+        after = replace(after, motion=replace(after.motion, outputs=outputs))
+        shown = self.windows.by_drive(columns, steps, flow, self.calibration.motions(clean), data)
         found = self.calibration.evidence(columns, after, data, shown)
         self.cross[rows] = found.cross[:, : self.told]
         self.information[rows], self.score[rows], self.weighed[rows] = found.information, found.score, True

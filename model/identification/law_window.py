@@ -25,7 +25,7 @@ from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
 from sprung.model.identification.law_forces import Acting, Along, slopes_of
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
-from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra
 from sprung.model.laws import SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE
 from sprung.model.signals import FloatArray
@@ -376,18 +376,8 @@ class LawWindows:
         model, s = self.model, self.model.simulator
         left = residual - columns.free.mT @ (columns.free_scale * dx0).unsqueeze(2)  # (B, K, 1)
         left = left - columns.sensitivities.mT @ step.unsqueeze(2)
-        B, F, R, _ = columns.whiten.shape
-        spectra = torch.view_as_complex(left.reshape(B, F, R, 2).contiguous()).unsqueeze(3)
-        noise = ((columns.whiten @ columns.carried).mH @ spectra).squeeze(3) / model.weight[:, None] ** 2
-        noise = noise * model.drive_noise  # (B, F, W/2)
-        kind = noise.dtype
-        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)
-        load = -(model.frequency.dynamic(steps.values) * support) @ s.H.to(kind)
-        if len(s.forces):
-            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
-        moved = (columns.compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support  # (B, F, E)
-        whole = moved.new_zeros(2, B, model.samples // 2 + 1, moved.shape[2])
-        whole[0, :, 1 : model.bins + 1] = moved
-        whole[1, :, 1 : model.bins + 1] = model.frequency.jw[:, None] * moved
-        found: FloatArray = torch.fft.irfft(whole, n=model.samples, dim=2).numpy()
-        return found
+        noise = model.noise_told(columns.whiten, columns.carried, as_spectra(left, columns.whiten))
+        motion, support = model.moved_by(steps.values, columns.compliance, noise)
+        moved = motion @ s.H.T.to(motion.dtype) + support  # (B, F, E)
+        found = torch.stack([model.signals(moved), model.signals(model.frequency.jw[:, None] * moved)])
+        return np.asarray(found.numpy())

@@ -89,7 +89,7 @@ class WindowModel:
 
         left = white_residual - white_free @ x0[:, None, :, None].to(white_free.dtype)
         x0 = x0[:, : discrete.Ad.shape[1]]
-        noise = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2 * self.drive_noise
+        noise = self.noise_told(whiten, carried, left)
         states = forced + s.free_states(discrete, x0, self.samples)
         J, by_load = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
         masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
@@ -134,6 +134,36 @@ class WindowModel:
         """Simulated states, (B, T, N)."""
         s = self.simulator
         return s.states(s.discretise(s.element_values(x)), data.w, x0)
+
+    def noise_told(self, whiten: Tensor, carried: Tensor, left: Tensor) -> Tensor:
+        """What a whitened residual (B, F, R, 1), free responses apart, says of the noise of the drives, (B, F, W/2)."""
+        found: Tensor = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2
+        return found * self.drive_noise
+
+    def moved_by(self, values: ElementValues, compliance: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """What noise of the drives (B, F, W/2) moves: coordinates (B, F, n), deflections by its supports (B, F, E)."""
+        s, kind = self.simulator, compliance.dtype
+        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)
+        load = -(self.frequency.dynamic(values) * support) @ s.H.to(kind)
+        if len(s.forces):
+            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
+        return (compliance @ load.unsqueeze(3)).squeeze(3), support
+
+    def smoothed(
+        self, values: ElementValues, compliance: Tensor, noise: Tensor, data: WindowBatch, outputs: Tensor
+    ) -> tuple[WindowBatch, Tensor]:
+        """Windows and simulated outputs (B, T, S') with drives that are less their noise (B, F, W/2)."""
+        s = self.simulator
+        motion, _ = self.moved_by(values, compliance, noise)
+        shown = (self.frequency.sensing(values) @ motion.unsqueeze(3)).squeeze(3)
+        if self.frequency.element_sensors and len(s.supports):
+            direct = self.frequency.element_response(values, s.G)
+            shown = shown + (direct @ noise[:, :, s.supports // 2].unsqueeze(3)).squeeze(3)
+        w = data.w.clone()
+        w[:, :, 0::2] += self.signals(noise)
+        w[:, :, 1::2] += self.signals(self.frequency.jw[:, None] * noise)
+        present = torch.as_tensor(np.flatnonzero(data.present))
+        return replace(data, w=w), outputs + self.signals(shown[:, :, present])
 
     def excitation(self, windows: FloatArray) -> FloatArray:
         """Mean power over bins of the strongest input of windows (B, T, C), over that of its noise, (B,).
@@ -227,6 +257,13 @@ class WindowModel:
         found: Tensor = torch.fft.rfft(signals, dim=1)[:, 1 : self.bins + 1]
         return found
 
+    def signals(self, spectra: Tensor) -> Tensor:
+        """Signals (B, T, X) of bins within the band (B, F, X)."""
+        whole = spectra.new_zeros(len(spectra), self.samples // 2 + 1, spectra.shape[2])
+        whole[:, 1 : self.bins + 1] = spectra
+        found: Tensor = torch.fft.irfft(whole, n=self.samples, dim=1)
+        return found
+
     def _signals(self, data: WindowBatch) -> Tensor:
         return data.measured @ self.compression.matrix(data.present).mT
 
@@ -289,12 +326,8 @@ class WindowModel:
         E = s.H.shape[0]
         # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
         kind = compliance.dtype
-        dynamic = self.frequency.dynamic(values)
-        support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)  # deflections, (B, F, E)
-        load = -(dynamic * support) @ s.H.to(kind)
-        if len(s.forces):
-            load = load + noise[:, :, s.forces // 2] @ s.F.T.to(kind)
-        moved = (compliance @ load.unsqueeze(3)).squeeze(3) @ s.H.T.to(kind) + support
+        motion, support = self.moved_by(values, compliance, noise)
+        moved = motion @ s.H.T.to(kind) + support
         deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
         rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
         at, powers = s.element_of, s.loading.stiffness
@@ -348,3 +381,9 @@ def as_rows(spectra: Tensor) -> Tensor:
     """(B, F, R, X) complex to (B, X, 2 F R) real."""
     B, F, R, X = spectra.shape
     return torch.view_as_real(spectra).permute(0, 3, 1, 2, 4).reshape(B, X, F * R * 2)
+
+
+def as_spectra(rows: Tensor, like: Tensor) -> Tensor:
+    """(B, 2 F R, 1) real, as `as_rows` makes them, back to (B, F, R, 1) complex; `like`: (B, F, R, ...)."""
+    B, F, R = like.shape[:3]
+    return torch.view_as_complex(rows.reshape(B, F, R, 2).contiguous()).unsqueeze(3)

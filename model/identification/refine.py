@@ -18,7 +18,7 @@ the old products give a second correction, at a tenth of the price.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -35,8 +35,6 @@ from sprung.model.system import System
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
-UNSURE_STD = 0.06  # beyond this a window that is weighed for gains is held against its noise, too
-HEARD_SHARE = 0.01  # mean share of noise beyond which it is not: what the model makes of noisy inputs looks like a gain
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _SLACK = (
     0.5  # rise of the weighted squares that is no failure: the solution with smoothed inputs is not quite its minimum
@@ -198,9 +196,12 @@ class Refiner:
     ) -> None:
         """Evidence on deviations of the windows `which` of a chunk."""
         if len(which):
-            at, data = at.take(which), data.take(which)
-            shown = self.model.by_drive(at, self.calibration.motions(data), data)
-            found = self.calibration.evidence(at, second.take(which), data, shown)
+            at, second, data = at.take(which), second.take(which), data.take(which)
+            carried = at.transfer.drive * self.model.drive_noise[:, None]
+            given = carried, at.transfer.compliance, self.model.simulator.element_values(at.x)
+            clean, outputs = self.calibration.smoothed(at, second, data, *given)
+            shown = self.model.by_drive(at, self.calibration.motions(clean), data)
+            found = self.calibration.evidence(at, replace(second, outputs=outputs), data, shown)
             at_rows = rows[which]
             progress.cross[at_rows], progress.information[at_rows] = found.cross, found.information
             progress.score[at_rows], progress.weighed[at_rows] = found.score, True
@@ -223,13 +224,11 @@ class Refiner:
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
-        weighed, weak, P = progress.weighed[rows], (std > WEAK_STD).any(dim=1), len(self.system.parameters)
-        asked = (weak | weighed & (std[:, :P] > UNSURE_STD).any(dim=1)).nonzero().squeeze(1)
-        if len(asked):
-            chosen = data.take(asked)
-            share = self.model.noise_share(self.model.linearise(x[asked], chosen), chosen)
-            identifiable[asked] &= (share < NOISE_SHARE) | ~weak[asked, None]
-            weighed[asked] &= share[:, :P].mean(dim=1) < HEARD_SHARE
+        weak = (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        if len(weak):
+            chosen = data.take(weak)
+            share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
+            identifiable[weak] &= share < NOISE_SHARE
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
@@ -253,7 +252,7 @@ class Refiner:
             states=path.numpy(),
             outputs=np.zeros((len(x), 0, len(data.present))),
             excitation=excitation,
-            weighed=weighed.numpy(),
+            weighed=progress.weighed[rows].numpy(),
             cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),
             information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(progress.score[rows] / chi_square.clamp_min(1)[:, None]).numpy(),

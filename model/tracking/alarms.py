@@ -17,8 +17,8 @@ from itertools import takewhile
 
 import numpy as np
 
-from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import FaultKind, FloatArray, IntArray
+from sprung.model.identification.deviations import Deviation, named
+from sprung.model.signals import FaultKind, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.deviations import DeviationModel, Jump
@@ -33,6 +33,7 @@ ALIKE = 0.35  # of the common change: elements within this of it move together
 MOST_OF = 0.75  # of the elements of a kind
 FEWEST = 4  # elements that can be said to move together
 RECOVERED = 0.6  # of the change that opens an alarm of a kind: below it is over
+MENDED = 0.2  # of a sensor's largest deviation: surely below it is over
 LOAD_KNOWN = 0.02  # standard deviation of a load that can be said to be beyond a limit
 WINDOWS = 6  # windows that a frozen or reversed channel needs to be told
 HARD = ("frozen", "saturated", "inverted", "swapped")
@@ -85,11 +86,13 @@ class Attribution:
         overloaded = self._overloads(state)
         quiet = not (state.active or state.changes.active.any() or common or overloaded)
         quiet = quiet and state.misfit_since is None
-        if quiet and jump is None and not state.stuck:
+        crept = self._crept(state)
+        if quiet and jump is None and not state.stuck and not crept:
             return state.alarms
         alarms = [self._kept_open(alarm, state, drift, now) for alarm in state.alarms]
         if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMPED[jump.kind]:
             alarms = self._with_sensor(alarms, state, jump, now)
+        alarms = self._with_crept(alarms, crept, state, now)
         alarms = self._with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, now)
         alarms = self._with_changes(alarms, state, drift, now)
@@ -267,6 +270,30 @@ class Attribution:
         alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, None, jump.size)
         return [*alarms, alarm]
 
+    def _crept(self, state: TrackerState) -> list[MeasurementFault]:
+        """Gains and delays that are no longer those of the baseline by more than electronics do."""
+        if not self.deviations:
+            return []
+        off, far = dev.crept(state.calibration, self.model, state.belief)
+        return list(named(self.deviations, off, np.zeros(len(off)), far)) if far.any() else []
+
+    def _with_crept(
+        self, alarms: list[Alarm], crept: list[MeasurementFault], state: TrackerState, now: int
+    ) -> list[Alarm]:
+        """Opens alarms of gains and delays that crept away, those apart that jumped, or are told with others."""
+        told = {
+            (channel, kind)
+            for a in alarms
+            if a.closed is None and a.kind == "sensor"
+            for names, _, kind in [(a.parameter or "").rpartition(".")]
+            for channel in names.split("|")
+        }
+        fresh = [f for f in crept if not all((channel, f.kind) in told for channel in f.channel.split("|"))]
+        return alarms + [
+            self._sensor_followed(Alarm("sensor", f"{f.channel}.{f.kind}", now, now, "warning"), state, now)
+            for f in fresh
+        ]
+
     def sensor_name(self, direction: FloatArray, kind: str) -> str:
         channels = [d.name for d, part in zip(self.deviations, direction, strict=True) if part]
         return f"{'|'.join(channels)}.{kind}"
@@ -283,8 +310,13 @@ class Attribution:
         apart = state.belief.mean[-H:] - state.calibration.reference
         others = ~np.isin(np.arange(H), members)
         off = float(np.mean((apart - self.model.common(apart, others))[members]))
-        std = float(np.sqrt(np.mean(self.model.relative_std(state.belief.covariance[-H:, -H:])[members] ** 2)))
-        if abs(off) + 2 * std < dev.JUMPED[kind]:
+        own = self.model.relative_std(state.belief.covariance[-H:, -H:])[members]
+        # That of the baseline is known as well as this one, or wrong by what is no straying yet.
+        strays = dev.STRAYED / 3 * self.model.crept[members]
+        of_baseline = np.where(state.calibration.moved[members] > 0, own, strays)
+        known = float(np.sqrt(np.mean(own**2)))
+        std = float(np.hypot(np.sqrt(np.mean(own**2 + of_baseline**2)), dev.bending(kind, off)))
+        if abs(off) + 2 * known < max(dev.JUMPED[kind], MENDED * abs(alarm.peak or 0.0)):
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak
         return replace(alarm, change=off, std=std, peak=peak)

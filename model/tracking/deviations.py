@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,15 +32,19 @@ GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
 CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
 CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4}  # per sqrt(s), of a running
 # vehicle: 1 % of the mass, 0.3 % of how it is spread in two minutes; one walks 10 m along the car for 1e-3
-GAIN_BIAS = 3e-3  # of a gain, by noise of the inputs that the model answers to and sensors do not show
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
 JUMPED = {"gain": 0.005, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
+CREPT = {"gain": 0.03, "delay": 2e-3}  # one that came slowly is an alarm from here on: electronics age by 2 % a month
+KNOWN_SHARE = 0.2  # of that is the standard deviation of one that is known
+STRAYED = 0.5  # of that: so far from where it was first known, a deviation is not what the baseline was learned with
+BENDING = 2.0  # of the square of a gain: what a window in which it was not taken back errs by, being linearised without
+TAKEN_BACK = 0.06  # gain from which windows are
 LOST_LOAD = 6.0  # deviations of one window from the believed load beyond which it is taken for another
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class DeviationModel:
     """Constants: how deviations are distributed at first, how they wander, and in which directions they jump."""
 
@@ -76,6 +81,11 @@ class DeviationModel:
             at = np.array([k == kind for k in self.kinds], dtype=float)
             apart -= np.outer(at, at) / max(at.sum(), 1.0)
         return np.asarray(np.sqrt(((apart @ covariance) * apart).sum(axis=1).clip(0.0)))
+
+    @cached_property
+    def crept(self) -> FloatArray:
+        """How far each deviation may creep without being told, (H,); infinite for loads."""
+        return np.array([CREPT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
 
 
 def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
@@ -115,7 +125,8 @@ class DeviationRecord:
     cross: FloatArray  # mean sensitivity of the log-ratios to the deviations, shape (P, H)
     base_cross: FloatArray  # the same over the windows of the baseline, shape (P, H)
     reference: FloatArray  # deviations while the baseline was learned, shape (H,)
-    moved: FloatArray  # 1 where a deviation has jumped since, shape (H,)
+    moved: FloatArray  # 1 where a deviation has jumped, or crept away, since, shape (H,)
+    origin: FloatArray  # gains and delays when they were first known, shape (H,); NaN: not yet
     slope: FloatArray  # recent evidence for a jump along each direction, shape (V,)
     curvature: FloatArray  # its information, shape (V,)
     since: IntArray  # ns, when the evidence began to rise, shape (V,)
@@ -132,7 +143,7 @@ def start(parameters: int, model: DeviationModel) -> DeviationRecord:
     H, V = model.size, len(model.directions)
     zeros = np.zeros
     return DeviationRecord(
-        zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), zeros(V), zeros(V),
+        zeros((parameters, H)), zeros((parameters, H)), zeros(H), zeros(H), np.full(H, np.nan), zeros(V), zeros(V),
         zeros(V, dtype=np.int64), zeros(1), zeros(3, dtype=np.int64),
     )  # fmt: skip
 
@@ -150,7 +161,7 @@ def grown(record: DeviationRecord, belief: Belief, model: DeviationModel) -> tup
     covariance[:first, :first] = belief.covariance
     covariance[first:, first:] = model.prior[old:, old:]
     wider = {name: np.pad(getattr(record, name), ((0, 0), (0, more))) for name in ("cross", "base_cross")}
-    longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved")}
+    longer = {name: np.pad(getattr(record, name), (0, more)) for name in ("reference", "moved", "origin")}
     return (
         replace(record, **wider, **longer),
         Belief(np.pad(belief.mean, (0, more)), covariance, H),
@@ -212,6 +223,48 @@ def weigh(
         jump,
         agrees,
     )
+
+
+def followed(record: DeviationRecord, model: DeviationModel, belief: Belief, here: BoolArray) -> DeviationRecord:
+    """With the deviations that the baseline was learned with, as far as they can be told by now.
+
+    What is known better than then is taken over, but for what has strayed meanwhile: it keeps what was known first.
+    here: deviations (H,) that may be said to be known first now.
+    """
+    value, moved = belief.mean[-model.size :], record.moved > 0
+    known, origin = np.isfinite(record.origin), record.origin
+    if not (known | moved | ~here).all():
+        std = model.relative_std(belief.covariance[-model.size :, -model.size :])
+        origin = np.where(here & ~known & ~moved & (std < KNOWN_SHARE * model.crept), value, origin)
+        known = np.isfinite(origin)
+    off = np.where(known, value - origin, 0.0)
+    strayed = known & ~moved & (np.abs(off - model.common(off, known & ~moved)) > STRAYED * model.crept)
+    # What all channels share cannot be known: where it wanders, the reference of one that moved goes along.
+    kept = np.where(strayed, origin, record.reference)
+    kept = kept + model.common(value - record.reference, ~(moved | strayed))
+    return replace(
+        record,
+        origin=origin,
+        moved=np.maximum(record.moved, strayed),
+        reference=np.where(moved | strayed, kept, value),
+    )
+
+
+def crept(record: DeviationRecord, model: DeviationModel, belief: Belief) -> tuple[FloatArray, BoolArray]:
+    """How far deviations (H,) are from those of the baseline, whatever they share, and which have left them slowly or
+    at once by more than electronics do."""
+    off = belief.mean[-model.size :] - record.reference
+    off = off - model.common(off, record.moved == 0)
+    far = np.abs(off) > model.crept
+    if far.any():
+        std = model.relative_std(belief.covariance[-model.size :, -model.size :])
+        far &= std < KNOWN_SHARE * model.crept
+    return off, far
+
+
+def bending(kind: str, value: float) -> float:
+    """Standard deviation that a deviation of this size has because windows are linearised without it."""
+    return BENDING * min(abs(value), TAKEN_BACK) ** 2 if kind == "gain" else 0.0
 
 
 def explained(belief: Belief, found: Deviating) -> float:

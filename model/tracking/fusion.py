@@ -293,9 +293,14 @@ class Fusion:
             return np.zeros(len(cross))
         stays = ~self.model.cargo
         learned = state.changes.learned >= self.settings.learning
-        here = np.where(stays, belief.mean[-self.model.size :], 0.0)
         reference = np.where(stays, calibration.reference, 0.0)
+        # One that is learned anew is counted from the deviations that are known for the others by now.
+        here = np.where(stays, belief.mean[-self.model.size :], 0.0) if self._refining(state) else reference
         return np.where(learned, calibration.base_cross @ reference, cross @ here)
+
+    def _refining(self, state: TrackerState) -> bool:
+        """Whether the deviations that the baseline was learned with are still being made out."""
+        return (state.used + 1) * self.settings.hop < dev.SETTLED
 
     def _learned(
         self,
@@ -312,12 +317,9 @@ class Fusion:
         more = (tested.weight - state.changes.weight) / np.maximum(tested.weight, 1e-300)
         gained = np.where(first & (tested.weight > 0), more, 0.0)
         base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
-        reference = calibration.reference
-        if (state.used + 1) * self.settings.hop < dev.SETTLED:
-            here, moved = belief.mean[-self.model.size :], calibration.moved > 0
-            # What all channels share cannot be known: where it wanders, the reference of one that jumped goes along.
-            reference = np.where(moved, reference + self.model.common(here - reference, ~moved), here)
-        return replace(calibration, base_cross=base, reference=reference)
+        calibration = replace(calibration, base_cross=base)
+        learned = ~self.model.cargo & self.armed(state)
+        return dev.followed(calibration, self.model, belief, learned) if self._refining(state) else calibration
 
     def baseline(self, state: TrackerState) -> FloatArray:
         """Log-ratio to nominal of the vehicle's own healthy state, shape (P,); NaN before any window."""

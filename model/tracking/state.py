@@ -190,6 +190,7 @@ def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     if "calibration" not in data:
         return deviations.start(len(data["names"]), deviations.model_of(()))
     arrays = _unpack_all(data["calibration"])
+    arrays.setdefault("origin", np.full(len(arrays["reference"]), np.nan))
     shape = len(data["names"]), len(arrays["reference"])
     return DeviationRecord(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 

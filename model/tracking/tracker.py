@@ -242,9 +242,9 @@ class Tracker:
         if H == 0 or state.calibration.recent[-1] == 0:
             return tuple(stuck)
         value, std = state.belief.mean[-H:], self.model.relative_std(state.belief.covariance[-H:, -H:])
-        std = np.where([kind == "gain" for kind in self.model.kinds], np.hypot(std, dev.GAIN_BIAS), std)
         least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
         off = value - self.model.common(value)
+        std = np.hypot(std, [dev.bending(kind, v) for kind, v in zip(self.model.kinds, off, strict=True)])
         chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 

@@ -115,3 +115,55 @@ def test_evidence_of_a_state_that_knew_fewer_directions_begins_anew():
     after = new.update(state, told(rng, 4, np.zeros(4)), EPOCH + 40 * SECOND)
     assert after.used == state.used + 1
     assert len(after.calibration.slope) == len(new.model.directions) != len(state.calibration.slope)
+
+
+GAINS = [Deviation(f"c{i}", "gain", 0.015, i) for i in range(6)]
+
+
+def gained(rng, gains, information=0.01**-2):
+    """A weighed window: gains (6,), relative to their mean only; the first moves the first parameter."""
+    apart = np.eye(6) - np.ones((6, 6)) / 6
+    M = information * apart
+    score = M @ gains + np.sqrt(information) * apart @ rng.normal(size=6)
+    cross = np.zeros((6, 6))
+    cross[0, 0] = 1.0
+    covariance = correlated(rng, STD)
+    value = np.linalg.cholesky(covariance) @ rng.normal(size=6) - cross @ gains
+    return estimate(value, covariance, deviating=Deviating(np.zeros(6), covariance, cross, M, score, 300.0, True))
+
+
+@pytest.mark.parametrize("begins", [60, 900])  # while the gains of the baseline are being refined, and after
+@pytest.mark.parametrize("to", [0.02, 0.06])
+def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begins, to):
+    rng, tracker = np.random.default_rng(6), make(GAINS)
+    state = tracker.initial_state()
+    for k in range(begins + 900):
+        drift = to * np.clip((k - begins) / 400, 0, 1)
+        state = tracker.update(state, gained(rng, np.array([drift, 0, 0, 0, 0, 0])), EPOCH + k * SECOND)
+        state = TrackerState.from_dict(state.to_dict()) if k % 100 == 0 else state
+    assert all(a.kind == "sensor" for a in state.alarms)
+    assert [a.parameter for a in state.active] == ([] if to < dev.CREPT["gain"] else ["c0.gain"])
+    for alarm in state.active:
+        assert abs(alarm.change - to) < 3 * alarm.std < 0.02
+        assert alarm.opened > EPOCH + begins * SECOND
+    (fault,) = tracker.sensors(state)
+    assert fault.channel == "c0" and abs(fault.value - 1 - to) < 3 * fault.std
+
+
+def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm():
+    rng, tracker = np.random.default_rng(7), make(GAINS)
+    state = tracker.initial_state()
+    for k in range(200):
+        state = tracker.update(state, gained(rng, np.array([0, 0.05, 0, 0, 0, 0])), EPOCH + k * SECOND)
+    assert state.alarms == ()
+    assert [f.channel for f in tracker.sensors(state)] == ["c1"]
+
+
+def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended():
+    rng, tracker = np.random.default_rng(8), make(GAINS)
+    state = tracker.initial_state()
+    for k in range(1500):
+        drift = 0.06 * np.clip((k - 100) / 400, 0, 1) * (k < 900)
+        state = tracker.update(state, gained(rng, np.array([0, 0, drift, 0, 0, 0])), EPOCH + k * SECOND)
+    assert next(a.parameter for a in state.alarms if a.kind == "sensor") == "c2.gain"
+    assert state.active == ()
