@@ -20,7 +20,10 @@ from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
 
-WEIGHED_OF = 4  # windows, one is weighed for gains and delays: it costs as much as a refinement
+WEIGHED_OF = (
+    2  # windows, one is weighed for gains and delays, so that a gain of 2 % is told in a minute: it costs as much
+)
+# as a refinement
 _SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall far apart
 
 log = logging.getLogger("sprung.engine")

@@ -29,6 +29,7 @@ from torch import Tensor
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import WindowModel, as_rows, as_spectra
+from sprung.model.identification.redundancy import Redundancy
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.linear import ElementValues
@@ -110,6 +111,7 @@ class DeviationSensitivity:
         self.drive = torch.as_tensor(drive)  # of every input channel
         self.share = torch.as_tensor(np.array(share).reshape(-1, len(omega)).T.copy())  # of its drive, (F, inputs)
         self._dropped: dict[bytes, Tensor] = {}
+        self.redundancy = Redundancy(system, model.samples, len(self.deviations))
 
     def motions(self, data: WindowBatch) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Values and rates (B, T, W/2) of the drives as gains change them, and as delays do."""
@@ -165,7 +167,15 @@ class DeviationSensitivity:
             spectra = (self.model.weight[:, None] * self.model.spectra(data.measured @ dropped.mT)).to(torch.complex64)
             information = information + over @ over.mT
             score = score + (over @ as_rows(spectra.unsqueeze(3)).mT)[..., 0].double()
-        return Evidence(-with_x.double(), *self._relative(information.double(), score))
+        information = information.double()
+        of_inputs = self.redundancy.evidence(data.inputs, self.slope, self._bins)
+        if of_inputs is not None:
+            information, score = information + of_inputs[0], score + of_inputs[1]
+        return Evidence(-with_x.double(), *self._relative(information, score))
+
+    def _bins(self, signals: Tensor) -> Tensor:
+        """Weighed bins of signals (B, T, X), (B, F, X)."""
+        return self.model.weight[:, None] * self.model.spectra(signals)
 
     def _relative(self, information: Tensor, score: Tensor) -> tuple[Tensor, Tensor]:
         """Without what no record can tell: one gain, or one delay, that all channels share changes nothing."""

@@ -346,7 +346,7 @@ class Explainer:
         with torch.no_grad():
             data = model.batch(model.knots(windows), windows, present)
             nominal = torch.zeros(1, len(model.system.parameters), dtype=torch.float64)
-            at = model.linearise(nominal, WindowBatch(data.w[:1], data.measured[:1], present))
+            at = model.linearise(nominal, WindowBatch(data.w[:1], data.measured[:1], present, data.inputs[:1]))
             s = model.simulator
             discrete = model.compressed(s.discretise(s.element_values(nominal)), data)
             rest = torch.zeros(len(windows), discrete.Ad.shape[1], dtype=torch.float64)

@@ -17,9 +17,12 @@ class WindowBatch:
     w: Tensor  # knots of the drives, shape (B, T, W)
     measured: Tensor  # sensors present, shape (B, T, S')
     present: BoolArray  # which sensors these are, shape (S,)
+    inputs: Tensor  # as measured, shape (B, T, I)
 
     def take(self, at: Tensor) -> WindowBatch:
-        return self if len(at) == len(self.w) else WindowBatch(self.w[at], self.measured[at], self.present)
+        if len(at) == len(self.w):
+            return self
+        return WindowBatch(self.w[at], self.measured[at], self.present, self.inputs[at])
 
 
 @dataclass(frozen=True, slots=True)

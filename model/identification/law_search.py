@@ -18,6 +18,7 @@ from sprung.model.identification.law_flow import Flow
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import PRIOR_STD
+from sprung.model.identification.noise_share import noise_share
 from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined
 from sprung.model.signals import FloatArray
 
@@ -225,7 +226,7 @@ class LawSearch:
         weak = (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
         if len(weak):
             chosen = data.take(weak)
-            noise = w.model.noise_share(w.model.linearise(found[weak][:, w.linear], chosen), chosen)
+            noise = noise_share(w.model, w.model.linearise(found[weak][:, w.linear], chosen), chosen)
             identifiable[weak, :P] &= noise[:, :P] < NOISE_SHARE
         signals = len(w.model.compression.matrix(data.present))
         taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)

@@ -49,8 +49,9 @@ class WindowModel:
 
     def batch(self, knots: FloatArray, windows: FloatArray, present: BoolArray) -> WindowBatch:
         """Windows (B, T, C), their knots (B, T, W) at hand, in which exactly the sensors `present` are measured."""
-        sensors = windows[:, :, len(self.system.inputs) :][:, :, present]
-        return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present)
+        first = len(self.system.inputs)
+        sensors, inputs = windows[:, :, first:][:, :, present], windows[:, :, :first]
+        return WindowBatch(torch.as_tensor(knots), torch.as_tensor(sensors), present, torch.as_tensor(inputs))
 
     def unknowns(self, present: BoolArray) -> int:
         """Numbers of a window that are eliminated: its first state, and trends."""
@@ -91,14 +92,15 @@ class WindowModel:
         x0 = x0[:, : discrete.Ad.shape[1]]
         noise = self.noise_told(whiten, carried, left)
         states = forced + s.free_states(discrete, x0, self.samples)
-        J, by_load = self._sensitivities(values, transfer.compliance, whiten @ transfer.per_force, states, data, noise)
+        moved = self.moved_by(values, transfer.compliance, noise)
+        J, by_load = self._sensitivities(values, whiten @ transfer.per_force, states, data, moved)
         masses, none = s.m_of[s.m_of.any(dim=1)], s.loading.pattern[:0]
         if len(masses):
             none = none.new_zeros(len(masses), *none.shape[1:])
-            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none))], dim=3)
+            J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none), moved[0])], dim=3)
         if x.shape[1] > len(s.m_of):
             terms = s.loading.exponents, s.loading.pattern
-            of_load = self.by_inertia(values, transfer, whiten, states, data, terms)
+            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0])
             J = torch.cat([J, of_load if by_load is None else of_load + by_load], dim=3)
         J = as_rows(J)
         across_products = basis @ J.mT
@@ -196,7 +198,7 @@ class WindowModel:
                 shown[..., columns] = per_force @ (k * U[..., columns] + c * V[..., columns])
                 if self.frequency.element_sensors:
                     direct = torch.where((s.kind == DEFLECTION)[:, None], s.L, torch.zeros_like(s.L)) @ s.G
-                    seen = whiten @ (self._signal_rows(data, kind) @ direct.to(kind))
+                    seen = whiten @ (self.signal_rows(data, kind) @ direct.to(kind))
                     shown[..., columns] += seen * U[..., columns]
             if len(s.forces):
                 columns = s.forces // 2
@@ -204,48 +206,7 @@ class WindowModel:
             found.append(shown)
         return found
 
-    def noise_share(self, at: Linearisation, data: WindowBatch) -> Tensor:
-        """Share of the power of every sensitivity that the noise of drives and sensors alone would give, (B, P).
-
-        Near one, the window holds no excitation of the parameter: what looks like information is noise.
-        """
-        s, f = self.simulator, self.frequency
-        values = s.element_values(at.x)
-        transfer = self.transfer(values, data)
-        compliance, per_force, carried = (
-            transfer.compliance,
-            transfer.per_force,
-            transfer.drive * self.drive_noise[:, None],
-        )
-        kind = compliance.dtype
-        dynamic = f.dynamic(values)
-        load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)
-        direct = torch.zeros(s.H.shape[0], s.W // 2, dtype=kind)
-        if len(s.supports):
-            load[..., s.supports // 2] = -(s.H.T.to(kind) @ (dynamic.unsqueeze(3) * s.G.to(kind)))
-            direct[:, s.supports // 2] = s.G.to(kind)
-        if len(s.forces):
-            load[..., s.forces // 2] = s.F.to(kind)
-        deflection = (s.H.to(kind) @ (compliance @ load) + direct) * self.drive_noise[:, None]  # (B, F, E, W/2)
-        # Sensor noise reaches the fitted motion, at the least, as the motion that it cannot be told from.
-        motion = torch.linalg.pinv(self._sensing(values, data))
-        power = deflection.abs().square().sum(dim=3) + (s.H.to(kind) @ motion).abs().square().sum(dim=3)
-        power = power * self.samples
-        white = (self.whitening(carried) @ per_force).abs().square().sum(dim=2) * power  # (B, F, E)
-        by_k = (white * values.stiffness.square().unsqueeze(1)).sum(dim=1)
-        by_c = (white * (f.omega.square()[:, None] * values.damping.square().unsqueeze(1))).sum(dim=1)
-        noise = by_k[:, s.element_of] * s.by_stiffness.square() + by_c[:, s.element_of] * s.by_damping.square()
-        shown = at.sensitivities.square().sum(dim=2)
-        share = torch.zeros_like(shown)
-        share[:, : noise.shape[1]] = noise / shown[:, : noise.shape[1]].clamp_min(1e-300)
-        return share
-
-    def _sensing(self, values: ElementValues, data: WindowBatch) -> Tensor:
-        """Compressed signals per degree of freedom, (B, F, R, n)."""
-        kind = self.frequency.jw.dtype
-        return self._signal_rows(data, kind) @ self.frequency.sensing(values)
-
-    def _signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
+    def signal_rows(self, data: WindowBatch, kind: torch.dtype) -> Tensor:
         """The compression as a matrix over all sensors, (R, S); zero columns for absent ones."""
         select = torch.eye(len(data.present), dtype=kind)[data.present]
         return self.compression.matrix(data.present).to(kind) @ select
@@ -282,7 +243,7 @@ class WindowModel:
         s, f = self.simulator, self.frequency
         compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
-        Q = self._signal_rows(data, kind)
+        Q = self.signal_rows(data, kind)
         sensing = Q @ (f.sensing(values) if f.element_sensors else f.motion_sensing)
         per_load = sensing @ compliance
         per_force = -per_load @ s.H.T.to(kind)
@@ -310,26 +271,26 @@ class WindowModel:
     def _sensitivities(
         self,
         values: ElementValues,
-        compliance: Tensor,
         per_force: Tensor,
         states: Tensor,
         data: WindowBatch,
-        noise: Tensor,
+        moved: tuple[Tensor, Tensor],
     ) -> tuple[Tensor, Tensor | None]:
         """Whitened sensitivities to stiffnesses then dampings along the smoothed motion, (B, F, R, P'), and to loads
-        through the stiffnesses that follow them, (B, F, R, X); None: none does."""
+        through the stiffnesses that follow them, (B, F, R, X); None: none does.
+
+        moved: what the residual says that the noise of the drives moves, see `moved_by`.
+        """
         s = self.simulator
         n = s.H.shape[1]
         d = states[:, :, :n] @ s.H.T + data.w[:, :, s.supports] @ s.G.T
         v = states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T
         spectra = self.spectra(torch.cat([d, v], dim=2))
         E = s.H.shape[0]
-        # What the residual says about the noise of the drives moves the trajectory: noise (B, F, W/2).
-        kind = compliance.dtype
-        motion, support = self.moved_by(values, compliance, noise)
-        moved = motion @ s.H.T.to(kind) + support
-        deflection = (spectra[:, :, :E] + moved) * values.stiffness[:, None]
-        rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * moved) * values.damping[:, None]
+        kind = per_force.dtype
+        of_noise = moved[0] @ s.H.T.to(kind) + moved[1]
+        deflection = (spectra[:, :, :E] + of_noise) * values.stiffness[:, None]
+        rate = (spectra[:, :, E:] + self.frequency.jw[:, None] * of_noise) * values.damping[:, None]
         at, powers = s.element_of, s.loading.stiffness
         return (
             per_force[..., at] * (s.by_stiffness * deflection[..., at] + s.by_damping * rate[..., at]).unsqueeze(2),
@@ -344,15 +305,20 @@ class WindowModel:
         states: Tensor,
         data: WindowBatch,
         terms: tuple[Tensor, Tensor],
+        moved: Tensor,
     ) -> Tensor:
-        """Whitened sensitivities to masses and loads, exponents (X, n) and couplings (X, n, n), (B, F, R, X)."""
+        """Whitened sensitivities to masses and loads, exponents (X, n) and couplings (X, n, n), (B, F, R, X).
+
+        moved: what the noise of the drives moves of the coordinates, (B, F, n).
+        """
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
         n = s.H.shape[1]
         acceleration = (
             states @ A[:, n:].mT + data.w[:, :, 0::2] @ b_value[:, n:].mT + data.w[:, :, 1::2] @ b_rate[:, n:].mT
         )
-        force = by_inertia(self.spectra(acceleration), values.mass, values.coupling, *terms)
+        smooth = self.spectra(acceleration) + self.frequency.jw[:, None] ** 2 * moved
+        force = by_inertia(smooth, values.mass, values.coupling, *terms)
         return -(whiten @ transfer.per_load) @ force
 
 

@@ -29,6 +29,7 @@ from sprung.model.chunks import alike, chunks, share
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
 from sprung.model.identification.linearise import WindowModel
+from sprung.model.identification.noise_share import noise_share
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
@@ -227,7 +228,7 @@ class Refiner:
         weak = (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
         if len(weak):
             chosen = data.take(weak)
-            share = self.model.noise_share(self.model.linearise(x[weak], chosen), chosen)
+            share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
             identifiable[weak] &= share < NOISE_SHARE
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)

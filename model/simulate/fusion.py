@@ -67,6 +67,35 @@ def motion_shares(omega: FloatArray, dt: float, noise: Noises) -> dict[int, Floa
     return dict(zip(orders, precision / precision.sum(axis=0), strict=True))
 
 
+def left_by_motion(measured: FloatArray, dt: float, key: tuple[tuple[int, float], ...]) -> FloatArray:
+    """What the fit leaves of several derivatives (B, T, Q), in units of their noise.
+
+    key: of every column, which derivative it is and its noise, in ascending order.
+    """
+    B, T, Q = measured.shape
+    if T * Q <= 2 * _DENSE:
+        rows = np.moveaxis(measured, 1, 2).reshape(B, Q * T) @ _leaving(T, dt, key)
+        return np.asarray(np.moveaxis(rows.reshape(B, Q, T), 1, 2))
+    columns = np.moveaxis(measured, 0, 2)  # (T, Q, B)
+    lowest = key[0][0]
+    shifted = {order - lowest: (columns[:, i] * std, std) for i, (order, std) in enumerate(key)}
+    coefficients = _coefficients(shifted, T, dt)
+    fitted = [_shown(coefficients, order - lowest, T, dt) / std for order, std in key]
+    return np.asarray(np.moveaxis(columns - np.stack(fitted, axis=1), 2, 0))
+
+
+@lru_cache(maxsize=32)
+def _leaving(T: int, dt: float, key: tuple[tuple[int, float], ...]) -> FloatArray:
+    """The projection that leaves it, (Q T, Q T), of columns one below the other."""
+    lowest = key[0][0]
+    unit = np.eye(T + _SPAN - 1)
+    design = np.concatenate([_shown(unit, order - lowest, T, dt) / std for order, std in key])
+    basis, _ = np.linalg.qr(design)
+    found = np.eye(len(design)) - basis @ basis.T
+    found.setflags(write=False)
+    return found
+
+
 def _precision(omega: FloatArray, dt: float, noise: Noises) -> FloatArray:
     """What every used derivative tells of the displacement, (orders, F)."""
     orders = used(noise)
@@ -113,6 +142,17 @@ def _motion(data: FloatArray, T: int, dt: float, key: tuple[tuple[int, float], .
 
 def _smoothed(measured: dict[int, tuple[FloatArray, float]], T: int, dt: float) -> tuple[FloatArray, FloatArray]:
     """Value and slope (T, X) each of the spline that fits derivatives (T, X) with their noises."""
+    coefficients = _coefficients(measured, T, dt)
+    return _shown(coefficients, 0, T, dt), _shown(coefficients, 1, T, dt)
+
+
+def _shown(coefficients: FloatArray, order: int, T: int, dt: float) -> FloatArray:
+    """A derivative (T, X) of splines (T + 4, X) at the samples."""
+    return np.asarray(sum(_SHAPE[order, i] / dt**order * coefficients[i : i + T] for i in range(_SPAN)))
+
+
+def _coefficients(measured: dict[int, tuple[FloatArray, float]], T: int, dt: float) -> FloatArray:
+    """Of the spline that fits derivatives (T, X) with their noises, (T + 4, X)."""
     last = _SPAN - 1
     band = np.zeros((_SPAN, T + last))  # upper form: band[last - j] is the j-th diagonal
     columns = next(iter(measured.values()))[0].shape[1]
@@ -123,9 +163,4 @@ def _smoothed(measured: dict[int, tuple[FloatArray, float]], T: int, dt: float) 
             load[i : i + T] += weights[i] / sigma**2 * rows
             for j in range(i, _SPAN):
                 band[last - (j - i), j : j + T] += weights[i] * weights[j] / sigma**2
-    coefficients = solveh_banded(band, load)
-    value, slope = np.zeros((2, T, columns))
-    for i in range(_SPAN):
-        value += _SHAPE[0, i] * coefficients[i : i + T]
-        slope += _SHAPE[1, i] / dt * coefficients[i : i + T]
-    return value, slope
+    return np.asarray(solveh_banded(band, load))

@@ -128,10 +128,13 @@ def _page(statistic: FloatArray, increment: FloatArray, most: FloatArray, thresh
     return np.minimum(np.maximum(statistic + bounded, 0.0), 2.0 * threshold)
 
 
-def restarted(changes: Changes) -> Changes:
-    """Statistics from zero: what they had gathered was a measurement's doing."""
-    zero = np.zeros_like(changes.up)
-    return replace(changes, up=zero, down=zero, recovery=zero, active=np.zeros_like(changes.active))
+def restarted(changes: Changes, since: int) -> Changes:
+    """Statistics from zero: what they had gathered was a measurement's doing, but for alarms whose onset lies before
+    `since`, ns."""
+    onset = np.where(changes.active > 0, changes.up_since, changes.down_since)
+    own = (changes.active != 0) & (onset < since)
+    kept = {name: np.where(own, getattr(changes, name), 0.0) for name in ("up", "down", "recovery")}
+    return replace(changes, active=np.where(own, changes.active, 0).astype(np.int8), **kept)
 
 
 def relearn(changes: Changes, rows: BoolArray) -> Changes:

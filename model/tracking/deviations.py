@@ -13,17 +13,19 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.special import expit
 
 from sprung.model.identification.deviations import CARGO, Deviation
 from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
 
-FORGETTING = 0.95  # of the evidence for a jump, per window that is weighed: 40 s; some channels show little at once
+FORGETTING = 0.975  # of the evidence for a jump, per window that is weighed: 40 s; some channels show little at once
 EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
 MOST = 5.0  # standard deviations that one window counts at most: two windows at least
 RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped
 POINTING = 6.0  # log-likelihood ratio from which a deviation may be what moves parameters: alarms wait for the next
 # windows; chance alone reaches it in some direction about once in ten weighed windows
+DOUBTED = 2.0  # log-likelihood ratio from which what is believed is stated less surely
 RISING = 3.0  # log-likelihood ratio at which a jump is taken to have begun
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
 SETTLED = 600.0  # s of used windows in which the gains of the learning phase go on being refined
@@ -34,11 +36,11 @@ CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre
 # vehicle: 1 % of the mass, 0.3 % of how it is spread in two minutes; one walks 10 m along the car for 1e-3
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
-JUMPED = {"gain": 0.005, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
+JUMPED = {"gain": 0.01, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
 CREPT = {"gain": 0.03, "delay": 2e-3}  # one that came slowly is an alarm from here on: electronics age by 2 % a month
 KNOWN_SHARE = 0.2  # of that is the standard deviation of one that is known
 STRAYED = 0.5  # of that: so far from where it was first known, a deviation is not what the baseline was learned with
-BENDING = 2.0  # of the square of a gain: what a window in which it was not taken back errs by, being linearised without
+BENDING = 0.5  # of the square of a gain: what a window in which it was not taken back errs by, being linearised without
 TAKEN_BACK = 0.06  # gain from which windows are
 LOST_LOAD = 6.0  # deviations of one window from the believed load beyond which it is taken for another
 STOPPED = 5.0  # s without a used window after which passengers may have boarded
@@ -262,6 +264,20 @@ def crept(record: DeviationRecord, model: DeviationModel, belief: Belief) -> tup
     return off, far
 
 
+def pending(record: DeviationRecord, model: DeviationModel) -> FloatArray:
+    """Variance (H,) of gains and delays for what recent windows say beyond the belief, in the most evident direction.
+
+    The belief follows what wanders as electronics do; what is faster it follows late, until it is found to have jumped.
+    """
+    of_channels = model.directions @ np.isinf(model.crept) == 0
+    ratio = np.where(of_channels, record.ratio, 0.0)
+    if not ratio.max(initial=0.0) > 0:
+        return np.zeros(model.size)
+    best = int(np.argmax(ratio))
+    size = record.slope[best] / record.curvature[best]
+    return np.asarray((model.directions[best] != 0) * expit(ratio[best] - DOUBTED) * size**2)
+
+
 def bending(kind: str, value: float) -> float:
     """Standard deviation that a deviation of this size has because windows are linearised without it."""
     return BENDING * min(abs(value), TAKEN_BACK) ** 2 if kind == "gain" else 0.0
@@ -297,7 +313,7 @@ def _judged(
     """Evidence after a window whose scores count by `bounded`; a jump where there is enough."""
     # Directions for which nothing speaks begin anew: what was quiet before must not outvote a jump.
     old = calibration.slope
-    going = (old**2 > 2 * calibration.curvature * RESTART) & (np.sign(old) == np.sign(along))
+    going = (old**2 > 2 * calibration.curvature * RESTART) & (old * (FORGETTING * old + along * bounded) > 0)
     keep = np.where(going, FORGETTING, 0.0)
     slope = keep * old + along * bounded
     curvature = keep * calibration.curvature + information

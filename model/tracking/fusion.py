@@ -92,7 +92,7 @@ class Fusion:
             return replace(undecided, belief=belief, calibration=calibration), None
         if jump is not None and self.armed(state):
             calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
-            state = replace(state, changes=change_test.restarted(state.changes))
+            state = replace(state, changes=change_test.restarted(state.changes, jump.since))
         window = _Window(mask, time_ns, centre, share, *self._at_belief(estimate, found, calibration, belief, mask))
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)

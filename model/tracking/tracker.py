@@ -244,7 +244,8 @@ class Tracker:
         value, std = state.belief.mean[-H:], self.model.relative_std(state.belief.covariance[-H:, -H:])
         least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
         off = value - self.model.common(value)
-        std = np.hypot(std, [dev.bending(kind, v) for kind, v in zip(self.model.kinds, off, strict=True)])
+        bent = [dev.bending(kind, v) for kind, v in zip(self.model.kinds, off, strict=True)]
+        std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + np.square(bent))
         chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 

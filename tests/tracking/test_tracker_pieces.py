@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.linalg import block_diag, expm
 
 from sprung.benchmarks.drift import CorrelatedErrors, Fleet, step_delays
+from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import misfit, scatter, surprise
 from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
@@ -173,3 +176,16 @@ def test_one_bad_window_is_no_misfit() -> None:
     for k in range(20):
         fit = misfit.update(fit, 1.0, adequate=True, inflation=1.0, time=52 + k)
     assert fit.statistic == 0.0
+
+
+def test_a_jump_of_a_sensor_ends_what_it_may_have_done_and_no_older_alarm() -> None:
+    changes = change_test.start((3,))
+    changed = replace(
+        changes,
+        up=np.array([30.0, 30.0, 8.0]),
+        up_since=np.array([10, 70, 60]),
+        active=np.array([1, 1, 0], dtype=np.int8),
+    )
+    after = change_test.restarted(changed, 50)
+    assert list(after.active) == [1, 0, 0]
+    assert list(after.up) == [30.0, 0.0, 0.0]

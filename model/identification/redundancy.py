@@ -1,0 +1,81 @@
+"""What two measurements of one support's motion say of each other's gains and delays.
+
+Displacement, velocity and acceleration of a support are fused into one motion, the least-squares spline (see
+`model.simulate.fusion`).  What that fit leaves depends on no parameter and on no initial state; it depends on the
+channels' gains and delays: a displacement that reads 2 % too much is not the integral of its velocity.  With Q what the
+fit leaves of the samples z in units of their noise (an orthogonal projection),
+
+    Q z = Q X h + noise,       X = [u^ / sigma, -u^' / sigma] of every channel along the fitted motion u^
+
+restricted to the band of the likelihood.  The fit and what it leaves do not correlate, so that noise biases nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sprung.model.identification.linearise import as_rows
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.drives import drives_of
+from sprung.model.simulate.fusion import left_by_motion, used
+from sprung.model.system import System
+
+
+class Redundancy:
+    """Supports of a system that are measured more than once; C channels, of which H >= 2 C deviations begin with gains
+    and delays."""
+
+    def __init__(self, system: System, samples: int, deviations: int) -> None:
+        self.samples, self.dt, self.deviations = samples, 1 / system.sample_rate, deviations
+        self.channels = len(system.channels)
+        self.alike: dict[tuple[tuple[int, float], ...], list[list[int]]] = {}  # columns of supports, by their noises
+        for drive in drives_of(system):
+            if drive.support and drive.noise and len(used(drive.noise)) > 1 and min(drive.noise.values()) > 0:
+                key = tuple(sorted(drive.noise.items()))
+                self.alike.setdefault(key, []).append([drive.columns[order] for order, _ in key])
+
+    def evidence(
+        self, inputs: Tensor, slope: Tensor, spectra: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor] | None:
+        """Information (B, H, H) on the deviations and score (B, H) of windows whose inputs (B, T, I) are given.
+
+        slope: derivative of signals over their samples, (T, T); spectra: weighed bins of (B, T, X), (B, F, X).
+        None: no support is measured twice.
+        """
+        if not self.alike:
+            return None
+        B, H = len(inputs), self.deviations
+        information, score = inputs.new_zeros(B, H, H), inputs.new_zeros(B, H)
+        for key, supports in self.alike.items():
+            noise = np.array([std for _, std in key])
+            z = np.moveaxis(inputs.numpy()[:, :, np.array(supports)], 1, 2) / noise  # (B, supports, T, Q)
+            M, b = self._of_one(z.reshape(-1, *z.shape[2:]), key, slope, spectra)
+            for i, columns in enumerate(supports):
+                at = torch.tensor([*columns, *(self.channels + c for c in columns)])
+                information[:, at[:, None], at] += M[i :: len(supports)]
+                score[:, at] += b[i :: len(supports)]
+        return information, score
+
+    def _of_one(
+        self, z: FloatArray, key: tuple[tuple[int, float], ...], slope: Tensor, spectra: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Information (B, 2 Q, 2 Q) and score (B, 2 Q) on gains, then delays, of one support's Q channels z (B, T, Q),
+        in units of their noise."""
+        B, T, Q = z.shape
+        left = left_by_motion(z, self.dt, key)  # (B, T, Q)
+        fitted = torch.as_tensor(z - left)
+        motions = torch.cat([fitted, -(slope @ fitted)], dim=2)  # (B, T, 2 Q)
+        alone = motions.new_zeros(B, 2 * Q, T, Q)
+        for x in range(2 * Q):
+            alone[:, x, :, x % Q] = motions[:, :, x]
+        shown = left_by_motion(alone.reshape(B * 2 * Q, T, Q).numpy(), self.dt, key)
+        rows = as_rows(spectra(torch.as_tensor(shown)).reshape(B, 2 * Q, -1, Q).permute(0, 2, 3, 1))  # (B, 2 Q, K)
+        r = as_rows(spectra(torch.as_tensor(left)).unsqueeze(3)).mT  # (B, K, 1)
+        # Beyond its noise the fit leaves what is no gain and no delay: it counts as more noise.
+        freedom = r.shape[1] * (Q - 1) / Q
+        excess = (r.square().sum(dim=(1, 2)) / freedom).clamp_min(1.0)[:, None]
+        return rows @ rows.mT / excess.unsqueeze(2), (rows @ r).squeeze(2) / excess
