@@ -66,7 +66,7 @@ def diagnose(
         options = replace(options, catalogue=(*options.catalogue, *following_laws(system, record)))
         record = RecordedPart(record.sample_rate, channels, record.lost)
     if system.on_track or not system.file.inputs:
-        whole = replace(options.rules.record, longest=len(record.values))
+        whole = replace(options.rules.record, longest=len(record.values), enough=len(record.values))
         prepared = prepare(system, system.undistorted(record.values), record.sample_rate, whole)
         decay = None if system.on_track else decay_stretch(prepared.signals, system.sensor_noise, options.rules)
         if decay is None:

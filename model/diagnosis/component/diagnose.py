@@ -138,9 +138,14 @@ def _with_formula(judged: Judged) -> Judged | None:
 
 
 def _with_surface(judged: Judged) -> Judged:
-    """The rest as an unnamed force, if that serves the held-out part."""
+    """The rest as an unnamed force, if that serves the held-out part.
+
+    Which law stands beside it, or alone in its place, is of no meaning: whatever predicts best.
+    """
     task, before = judged.final.task, judged.final
-    after = fitted(task, judged.final.model.plus(SURFACE, ()))
+    shown = [judged.final.model, *(ranked.fit.model for ranked in judged.found.alone)]
+    forces = [fitted(task, model) for plain in shown for model in (plain, plain.plus(SURFACE, ()))]
+    after = min(forces, key=lambda fit: fit.held_out)
     if after.held_out > after.task.rules.surface_serves * before.held_out:
         return judged
     count = effective_count(after.residual[: task.split])

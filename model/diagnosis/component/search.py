@@ -67,6 +67,7 @@ class Search:
     final: ComponentFit
     steps: tuple[Step, ...]
     screened: dict[str, float]  # law -> gain of its best trial alone, as screened
+    alone: tuple[Ranked, ...] = ()  # models with one law, best first, named or not
 
 
 def search(
@@ -88,12 +89,14 @@ def search(
     current = Ranked(base, 0.0, 0.0, count)
     steps: list[Step] = []
     screened: dict[str, float] = {}
+    alone: tuple[Ranked, ...] = ()
     for number in range(rules.most + rules.per_signal * len(task.signals)):
         if current.fit.at_noise:
             break
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
         ranked = next_laws(current.fit, pieces, rules)
         if number == 0:
+            alone = tuple(ranked)
             for trial in ranked:
                 screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
         step = _accepted(current, ranked, base, rules)
@@ -104,7 +107,7 @@ def search(
         if current is not step.chosen:  # an earlier law gives way to one that suits the later better
             steps = _renamed(steps, current, len(given.pieces))
     final = refined(fine, current.fit.model)
-    return Search(refined(fine, base.model), final, tuple(steps), screened)
+    return Search(refined(fine, base.model), final, tuple(steps), screened, alone)
 
 
 def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules) -> list[Ranked]:

@@ -9,6 +9,7 @@ from scipy.interpolate import CubicSpline
 
 from sprung.model.diagnosis.record.highpass import carries_everything, passed
 from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.record.slower import slower, slower_by
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import ACCELERATION
@@ -67,10 +68,17 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
         notes.append(
             f"gaps too long to close: used {first / sample_rate:.2f} s to {last / sample_rate:.2f} s of the recording"
         )
-    first, last, used = _affordable(system, values, sample_rate, (first, last), rules.longest)
-    values = _close_gaps(values[first:last])
-    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, first)
-    signals, edge = passed(system, prepared.signals, rules)
+    values, begin, factor = _slowed(system, _close_gaps(values[first:last]), sample_rate, rules)
+    if factor > 1:
+        notes.append(
+            f"diagnosed at {sample_rate / factor:g} Hz instead of {sample_rate:g} Hz, behind a linear-phase filter: "
+            "no sensor shows more than noise that is faster"
+        )
+    begin, sample_rate = first / sample_rate + begin, sample_rate / factor
+    start, stop, used = _affordable(system, values, sample_rate, begin, rules.longest)
+    values, begin = values[start:stop], begin + start / sample_rate
+    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin)
+    signals, edge = passed(system, replace(prepared.signals, averaged=factor), rules)
     if edge:
         notes.append(
             f"supports measured by accelerations alone: all signals are compared above {edge:.2g} Hz, "
@@ -85,22 +93,35 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     return replace(prepared, signals=signals, notes=tuple(notes), used=used)
 
 
+def _slowed(
+    system: System, values: FloatArray, sample_rate: float, rules: RecordRules
+) -> tuple[FloatArray, float, int]:
+    """Columns at a lower rate where nothing is lost by it, the time of their first sample, and by what they are so."""
+    factor = slower_by(system, values, sample_rate, rules)
+    if factor == 1:
+        return values, 0.0, factor
+    values, begin = slower(values, factor)
+    return values, begin / sample_rate, factor
+
+
 def _affordable(
-    system: System, values: FloatArray, sample_rate: float, stretch: tuple[int, int], longest: int
+    system: System, values: FloatArray, sample_rate: float, begin: float, longest: int
 ) -> tuple[int, int, str]:
-    """The stretch that is diagnosed, and what of the recording that is, in words."""
-    first, last = stretch
-    if last - first <= longest:
-        return first, last, ""
-    sensors = values[first:last, len(system.inputs) :]
+    """The stretch of gap-free columns (T, C) that is diagnosed, and what of the recording that is, in words.
+
+    begin: time of their first sample, s.
+    """
+    if len(values) <= longest:
+        return 0, len(values), ""
+    sensors = values[:, len(system.inputs) :]
     present = np.isfinite(sensors).any(axis=0)
-    start, stop = liveliest(_close_gaps(sensors[:, present].copy()), longest)
+    start, stop = liveliest(sensors[:, present], longest)
     used = (
-        f"{(first + start) / sample_rate:.0f} s to {(first + stop) / sample_rate:.0f} s of "
-        f"{len(values) / sample_rate:.0f} s were diagnosed, where the sensors move most: memory and time grow with the "
-        "length, and the rest would tell the same values a little more exactly"
+        f"{begin + start / sample_rate:.0f} s to {begin + stop / sample_rate:.0f} s of the recording, which has "
+        f"{len(values) / sample_rate:.0f} s that can be used, were diagnosed, where the sensors move most: memory and "
+        "time grow with the length, and the rest would tell the same values a little more exactly"
     )
-    return first + start, first + stop, used
+    return start, stop, used
 
 
 def _require_motion(system: System, signals: Signals, rules: RecordRules) -> None:
@@ -210,7 +231,7 @@ def _by_role(
     sample_rate: float,
     stuck: tuple[tuple[str, float], ...],
     notes: list[str],
-    first: int,
+    begin: float,
 ) -> Prepared:
     frozen = {name for name, _ in stuck}
     inputs = _inputs(system, values, 1 / sample_rate, frozen, notes)
@@ -237,7 +258,7 @@ def _by_role(
         force_names=tuple(inputs.force_names),
         integrated=np.array(inputs.integrated, dtype=bool),
         accelerated=np.array(inputs.accelerated, dtype=bool),
-        start=first / sample_rate,
+        start=begin,
         speed=values[:, : len(system.inputs)] if system.on_track else empty,
     )
     return Prepared(signals, stuck, tuple(notes))

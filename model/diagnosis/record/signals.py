@@ -46,6 +46,7 @@ class Signals:
     accelerated: np.ndarray  # supports in whose displacement a measured acceleration is fused already, (supports,)
     start: float = 0.0  # s, time of the first sample since the start of the recording
     speed: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # m/s, on a track, where measured, (T, 0 or 1)
+    averaged: int = 1  # samples as they were recorded in every one of these
 
     @property
     def samples(self) -> int:
@@ -140,9 +141,10 @@ def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.
     sensors = [
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
-    levels = np.array(sensors)
+    of_inputs = (np.array(own) / np.sqrt(signals.averaged) for own in (displacement, velocity, acceleration, force))
+    levels = np.array(sensors) / np.sqrt(signals.averaged)
     least = rules.least_noise * np.minimum(levels, roughness(signals.sensors))
-    return Noise(np.array(displacement), np.array(velocity), np.array(acceleration), np.array(force), levels, least)
+    return Noise(*of_inputs, levels, least)
 
 
 def roughness(series: FloatArray) -> FloatArray:

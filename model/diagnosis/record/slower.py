@@ -1,0 +1,66 @@
+"""Recordings sampled far faster than anything in them moves.
+
+Time and memory of a diagnosis grow with the number of samples, and a sample more tells something only where the sensors
+show more than noise at the frequencies that it adds.  Such recordings are diagnosed at a fraction of their rate, behind
+a linear-phase filter that is the same for every signal and so leaves the relation between them as it was.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.signal import firwin, kaiserord, upfirdn
+
+from sprung.model.diagnosis.record.spectra import BAND
+from sprung.model.diagnosis.rules import RecordRules
+from sprung.model.mechanics import DISPLACEMENT
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+_PASS, _STOP = 0.4, 0.55  # of the new rate: up to where signals pass, from where they are gone
+_DAMPED = 80.0  # dB
+_MOST = 20  # of the old rate over the new one
+
+
+def slower_by(system: System, values: FloatArray, sample_rate: float, rules: RecordRules) -> int:
+    """By which whole number a recording's rate can be divided; 1: not at all.
+
+    values (T, C): gap-free columns in the order of `system.channels`; sensors that are absent are NaN.
+    """
+    samples, kinds = len(values), system.mechanics.sensor_kind
+    sensors = values[:, len(system.inputs) :]
+    noise = np.array([sensor.noise for sensor in system.file.sensors.values()])
+    fastest = max((mode.frequency for mode in system.mechanics.modes(system.bodies)), default=0.0)
+    frequency = np.fft.rfftfreq(samples, 1 / sample_rate)
+    taper = np.hanning(samples)[:, None]
+    present = np.isfinite(sensors).all(axis=0)
+    level = sensors[:, present] - np.linspace(sensors[0, present], sensors[-1, present], samples)
+    power = np.abs(np.fft.rfft(level * taper, axis=0)) ** 2
+    of_noise = np.sum(taper**2) * noise[present] ** 2 * np.ones_like(power)
+    rates = np.where(kinds[present] == DISPLACEMENT, frequency[:, None] ** 2, 1.0)  # a position by its rate
+    power, of_noise = power * rates, of_noise * rates
+
+    def loses_nothing(factor: int) -> bool:
+        compared = BAND * sample_rate / factor
+        if fastest * rules.modes_within > compared:
+            return False
+        above = frequency > compared
+        most = rules.faster * power.sum(axis=0) + rules.by_noise * of_noise[above].sum(axis=0)
+        return bool(np.all(power[above].sum(axis=0) <= most))
+
+    factor = 1
+    while samples > rules.enough * factor and factor < _MOST and loses_nothing(factor + 1):
+        factor += 1
+    return factor
+
+
+def slower(values: FloatArray, factor: int) -> tuple[FloatArray, int]:
+    """Columns (T, C) at a fraction of their rate, (T', C), and which sample of the old ones is the first.
+
+    What the filter does not know at either end is cut off; columns of NaN stay so.
+    """
+    taps, beta = kaiserord(_DAMPED, (_STOP - _PASS) * 2 / factor)
+    half = taps // 2 + 1
+    low = firwin(2 * half + 1, (_PASS + _STOP) / 2, window=("kaiser", beta), fs=factor)
+    first = -(-half // factor) * factor
+    filtered = upfirdn(low, values, down=1, axis=0)[half : half + len(values)]
+    return filtered[first : len(values) - half : factor], first
