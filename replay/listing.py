@@ -19,14 +19,15 @@ from sprung.replay.frames import EXTENDED
 from sprung.replay.mcapfields import Field, Topic
 from sprung.replay.mcapfile import McapFile
 from sprung.replay.recording import CAN_READERS, TEXT_TABLES, kind_of
-from sprung.replay.tables import Column, time_name, time_of
+from sprung.replay.tables import Column, some, time_name, time_of
 
 PROBED_BATCHES = 50  # of an MCAP file, in which its topics are looked for
 MOST_CHANNELS = 2_000
 MOST_ELEMENTS = 64  # of an array in a message that are listed
 DEEPEST = 6
 NO_TIME = (
-    "no column of times is recognised, so rates are per sample and times count samples; say `time: {column: NAME}`"
+    "no column of times is recognised, so rates are per sample and times count samples; say `time: {column: NAME}` "
+    "or `time: {rate: HZ}`"
 )
 
 
@@ -71,7 +72,11 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
         names = [n if layout.names.count(n) == 1 else str(i + 1) for i, n in enumerate(layout.names)]
         times = time_name(layout.names, time, layout.headed)
         every = zip(names, layout.units, layout.numeric, strict=True)
-        listed = [(name, unit) for name, unit, numeric in every if numeric]
+        listed, others = [], []
+        for name, unit, numeric in every:
+            listed.append((name, unit)) if numeric else others.append(name)
+        if others:
+            notes.append(f"left out, since they hold no plain numbers: {some(others)}")
     else:
         listed = parquet.listing(path)
         times = time_name([name for name, _ in listed], time)

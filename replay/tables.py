@@ -22,7 +22,8 @@ MOST_COLUMNS = 10_000
 TIME_NAMES = (
     *("time", "t", "timestamp", "timestamps", "time stamp", "datetime", "date time", "date/time", "seconds", "secs"),
     *("sec", "elapsed time", "elapsed", "zeit", "zeitstempel", "temps", "tempo", "tiempo", "x_time", "rel time"),
-    *("time_s", "t_s", "epoch", "unix time", "utc", "stamp"),
+    *("time_s", "t_s", "epoch", "unix time", "utc", "stamp", "ts", "abs time", "date & time", "datum/uhrzeit"),
+    *("datum uhrzeit", "x_value", "x value", "uhrzeit", "date", "datum"),
 )
 
 

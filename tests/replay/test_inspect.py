@@ -99,6 +99,30 @@ def test_a_table_without_times_is_looked_at_by_samples_and_likely_times_are_name
     assert "evenly rising, so perhaps a time: counter" in found.problems
 
 
+@pytest.mark.parametrize(
+    ("name", "stamp"),
+    [
+        ("Datum", "22.11.2026 12:00:{:06.3f}"),
+        ("Date", "11/22/2026 12:00:{:06.3f}"),
+        ("Uhrzeit", "12:00:{:06.3f}"),
+        ("ts", "17953488{:012.9f}"),
+    ],
+)
+def test_columns_of_times_are_known_by_name(tmp_path, name, stamp):
+    rows = [f"{stamp.format(x).replace(chr(46), '') if name == 'ts' else stamp.format(x)};{x:g}" for x in TIME[:500]]
+    (tmp_path / "a.csv").write_text("\n".join([f"{name};d", *rows]))
+    (signal,) = inspect(tmp_path / "a.csv").signals
+    assert signal.name == "d" and signal.rate == pytest.approx(1 / (TIME[1] - TIME[0]), rel=1e-3)
+
+
+def test_what_holds_no_plain_numbers_is_named(tmp_path):
+    rows = [f"{x:.2f};{x:.2f};1.{int(100 + x)},5".replace(".", ",", 2) for x in TIME[:200]]
+    (tmp_path / "a.csv").write_text("\n".join(["time;d;F", *rows]))
+    found = inspect(tmp_path / "a.csv")
+    assert [signal.name for signal in found.signals] == ["d"]
+    assert "left out, since they hold no plain numbers: F" in found.problems
+
+
 def test_the_command_prints_a_table_remarks_and_json(ride, capfd):
     assert main(["inspect", str(ride)]) == 0
     out, err = capfd.readouterr()
