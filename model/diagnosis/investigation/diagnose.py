@@ -36,7 +36,7 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
 from sprung.model.system import System
 
 
@@ -284,6 +284,8 @@ def _hopeless(state: Investigation, hit: Candidate) -> bool:
 
 def _minor(state: Investigation, trial: Trial) -> bool:
     """What a first finding leaves at its own place, when it is little, is its law's inaccuracy and no second law."""
+    if _takes_up(state, trial):
+        return True
     rules = state.options.rules.acceptance
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
@@ -299,6 +301,16 @@ def _minor(state: Investigation, trial: Trial) -> bool:
         elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index):
             return True
     return False
+
+
+def _takes_up(state: Investigation, trial: Trial) -> bool:
+    """Whether a part of the bodies that an unlisted force acts on explains less than it: what that force leaves."""
+    if not isinstance(trial.term.law, StructureLaw | BodyLaw):
+        return False
+    parts, elements = set(trial.term.location.split("|")), state.system.file.elements
+    unlisted = [found.trial for found in state.found if not found.trial.term.law.listed]
+    stronger = [one.term.location for one in unlisted if one.gain > trial.gain and one.term.location in elements]
+    return any(parts & {place, elements[place].upper, elements[place].lower} for place in stronger)
 
 
 def _worth(fit: Fit, index: int) -> float:
