@@ -235,10 +235,16 @@ def _continued(value: FloatArray, slope: FloatArray, parts: int) -> FloatArray:
     return np.concatenate([inner.reshape(len(value), -1), value[:, -1:]], axis=1)
 
 
+@lru_cache(maxsize=4)
+def _low_pass(parts: int) -> FloatArray:
+    """Taps of a filter at half the sample rate, on a grid `parts` times finer."""
+    return np.asarray(firwin(2 * _REACH * parts + 1, 1 / parts, window=("kaiser", 6.0)))
+
+
 def band_limited(fine: FloatArray, parts: int) -> FloatArray:
     """Signals (..., fine grid) behind a filter at half the sample rate, at the samples (..., T)."""
     reach = _REACH * parts
-    taps = firwin(2 * reach + 1, 1 / parts, window=("kaiser", 6.0))
+    taps = _low_pass(parts)
     padded = np.concatenate(
         [2 * fine[..., :1] - fine[..., reach:0:-1], fine, 2 * fine[..., -1:] - fine[..., -2 : -reach - 2 : -1]], -1
     )
