@@ -95,7 +95,7 @@ class Along:
         p: (B, values); stiffness, damping and first: (B,).
         """
         values, whole = list(p.T[:, :, None]), SpringDamper(*(np.asarray(x)[:, None] for x in element))
-        memory = self.memory(values, whole, first) if self.law.memory else np.empty(0)
+        memory = self.memory(values, whole, first) if self.law.memory else np.zeros((0, *self.d.shape))
         motion = Motion(self.d, self.v, 0.0, memory)
         around = [_moved(values, whole, i) for i in (*free, *range(len(values), len(values) + 2))]
         found = np.stack([self._difference(self.law.force, motion, *pair) for pair in around])
