@@ -18,8 +18,18 @@ class PlainCommand(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """As the library does, with its types taken out before lines are filled."""
+        write = formatter.write_dl
+
+        def write_plain(rows: Any, *given: Any, **options: Any) -> None:
+            write([(_plain(name), text) for name, text in rows], *given, **options)
+
+        formatter.write_dl = write_plain
         super().format_help(ctx, formatter)
-        formatter.buffer[:] = [BRACED.sub(r"\1", TYPE.sub("", part)) for part in formatter.buffer]
+        formatter.buffer[:] = [_plain(part) for part in formatter.buffer]
+
+
+def _plain(text: str) -> str:
+    return BRACED.sub(r"\1", TYPE.sub("", text))
 
 
 class PlainTyper(typer.Typer):

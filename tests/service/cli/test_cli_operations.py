@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -44,6 +45,11 @@ def test_help_is_in_full_words(command: str, capsys: pytest.CaptureFixture[str])
     text = capsys.readouterr().out
     for machine in ("<bool>", "<path>", "<str>", "<Path>", "list[", "range>", "{FILE"):
         assert machine not in text
+    lines = text.splitlines()
+    for i, line in enumerate(lines[:-1]):  # what goes on in the next line stands below where it began
+        began = re.match(r"  (\S+(?: [A-Z]+)?)  +(?=\S)", line)
+        if began and re.match(r"   +\S", lines[i + 1]):
+            assert len(lines[i + 1]) - len(lines[i + 1].lstrip()) == began.end(), lines[i : i + 2]
 
 
 def test_wrong_usage_points_to_the_help_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
