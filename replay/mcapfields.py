@@ -31,6 +31,12 @@ TimeSource = Literal["auto", "header", "publish", "log"]
 STAMP_PATHS = (("header", "stamp"), ("timestamp",), ("stamp",))
 STAMP_PARTS = (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs"))
 LOOKED_AT = 8  # messages of a batch in which a stamp is looked for: some may be damaged
+SAID = {  # why a message cannot be decoded; other decoders' errors are called by their names
+    KeyTwice: "a key is there twice",
+    RecursionError: "nested too deeply",
+    json.JSONDecodeError: "no JSON",
+    UnicodeDecodeError: "no text",
+}
 TOKEN = re.compile(r"[^.\[\]]+")
 Path = tuple[str | int, ...]
 
@@ -108,7 +114,7 @@ class Topic:
                 documents.append(self.decode(item))
                 good[index] = True
             except Exception as error:  # decoders raise what their generated code happens to raise
-                reasons["a key is there twice" if isinstance(error, KeyTwice) else type(error).__name__] += 1
+                reasons[SAID.get(type(error), type(error).__name__)] += 1
         self.account.corrupt(len(data) - len(documents), f"message of {self.name} cannot be decoded")
         for reason, count in reasons.items():
             self.account.problem(f"{count} messages of {self.name} cannot be decoded ({reason})")

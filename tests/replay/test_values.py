@@ -92,6 +92,7 @@ def test_a_message_that_is_none_costs_itself(message, tmp_path):
         assert np.array_equal(value[kept], VALUES[GOOD, index])
     assert recording.tally.used == ROWS - 1
     assert recording.tally.corrupt + recording.tally.dropped == 1
+    assert not any("Error" in line for line in recording.problems)
 
 
 def test_a_message_of_another_era_is_left_out_and_told(tmp_path):
