@@ -36,6 +36,9 @@ from sprung.model.system import System
 IDENTIFIABLE_STD = 0.3  # a log-ratio less certain than this is reported as not identifiable
 WEAK_STD = 0.1  # beyond this the excitation of a window is held against its noise
 NOISE_SHARE = 0.15  # of a sensitivity's power, at most
+VAGUE_SHARE = (
+    0.05  # of all of them, beyond which a load that is less certain than that is not told, nor what goes with it
+)
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _SLACK = (
     0.5  # rise of the weighted squares that is no failure: the solution with smoothed inputs is not quite its minimum
@@ -229,7 +232,9 @@ class Refiner:
         if len(weak):
             chosen = data.take(weak)
             share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
-            identifiable[weak] &= share < NOISE_SHARE
+            P = len(self.system.parameters)
+            vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (share[:, :P].mean(dim=1) > VAGUE_SHARE)
+            identifiable[weak] &= (share < NOISE_SHARE) & ~(vague[:, None] & (std[weak] > WEAK_STD))
         signals = len(self.model.compression.matrix(data.present))
         freedom = 2 * self.model.bins * signals - self.model.unknowns(data.present) - identifiable.sum(dim=1)
         chi_square = progress.cost[rows] / freedom.clamp_min(1)
