@@ -25,7 +25,7 @@ MOST = 5.0  # standard deviations that one window counts at most: two windows at
 RESTART = 1.0  # log-likelihood ratio below which the evidence of earlier windows is dropped
 POINTING = 6.0  # log-likelihood ratio from which a deviation may be what moves parameters: alarms wait for the next
 # windows; chance alone reaches it in some direction about once in ten weighed windows
-DOUBTED = 2.0  # log-likelihood ratio from which what is believed is stated less surely
+DOUBTED = 6.0  # log-likelihood ratio from which what is believed is stated less surely
 RISING = 3.0  # log-likelihood ratio at which a jump is taken to have begun
 MEMORY = 0.3  # weight of the newest window in the mean sensitivities
 SETTLED = 600.0  # s of used windows in which the gains of the learning phase go on being refined

@@ -190,8 +190,8 @@ def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jum
     after, jump = dev._judged(record, tracker.model, along, information, 1.0, EPOCH)
     assert jump is None
     np.testing.assert_allclose(after.slope, dev.FORGETTING * 3e4 - 1e3)
-    turned, _ = dev._judged(record, tracker.model, -40 * np.full(6, 1e3), information, 1.0, EPOCH)
-    np.testing.assert_allclose(turned.slope, -4e4)  # begins anew
+    turned, _ = dev._judged(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
+    np.testing.assert_allclose(turned.slope, -3e4)  # begins anew
 
 
 def test_chance_names_no_sensor():
