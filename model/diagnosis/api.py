@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from sprung.model.diagnosis.ambient.decay import decay_stretch
 from sprung.model.diagnosis.ambient.diagnose import diagnose_unforced
 from sprung.model.diagnosis.component.diagnose import diagnose_components
 from sprung.model.diagnosis.component.measured import covariates, is_component_test
-from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
+from sprung.model.diagnosis.investigation.course import Options, Outcome, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.narrate import narrate
 from sprung.model.diagnosis.report.report import Finding, Report
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.following import Covariate, following_law
+from sprung.model.schema import ForceInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -73,7 +76,23 @@ def diagnose(
             return diagnose_unforced(system, prepared, record, options, tell)
         record = RecordedPart(record.sample_rate, record.values[decay], record.lost)
     outcome = investigate(system, record, options, tell)
+    if not system.file.inputs and outcome.judgement.strange is not None:
+        outcome = _along_what_was_seen(system, record, options, tell) or outcome
     tell(0.95, "report")
     report = narrate(outcome, record)
     tell(1.0, "done")
     return report
+
+
+def _along_what_was_seen(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome | None:
+    """A free decay whose phase no simulation keeps, laws acting along the motion that the sensors saw; None: nor so.
+
+    A law that shifts the frequency takes a linear start astray within a few periods.  With forces that nobody measured
+    on every body, as strong as they have to be, the fit is one of forces along the measured motion.
+    """
+    forces = {f"disturbance of {body}": ForceInput(kind="force", body=body) for body in system.bodies}
+    pushed = System(system.file.model_copy(update={"inputs": forces}))
+    none = np.zeros((len(record.values), len(forces)))
+    values = np.column_stack([none, record.values])
+    outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, tell)
+    return None if outcome.judgement.strange is not None else outcome

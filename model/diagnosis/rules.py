@@ -251,6 +251,9 @@ class ComponentRules:
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)
     surface_serves: float = rule(0.9, "of the held-out power that an unnamed force may leave; chosen", 0.8, 0.97)
     named: float = rule(0.8, "of the excess power; chosen: laws that leave more are not the component's", 0.6, 0.9)
+    together: float = rule(
+        0.02, "of the excess power, that several laws may leave; chosen: true ones leave less", 0.01, 0.05
+    )
     at_noise: float = rule(1.2, "of the power of the record's own noise; derived: a level's scatter", 1.1, 1.4)
     drift: float = rule(0.05, "of the record, within which a change is no drift but its beginning; chosen", 0.03, 0.1)
     as_well: float = rule(1.05, "of the held-out power, up to which a plainer law serves as well; chosen", 1.02, 1.1)

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentTask, covariance, fitted, spread
+from sprung.model.diagnosis.component.fit import (
+    ComponentFit,
+    ComponentTask,
+    covariance,
+    fitted,
+    left_open,
+    refined,
+    spread,
+)
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
@@ -40,7 +49,7 @@ from sprung.model.diagnosis.report.report import (
     ReportedParameter,
     Unexplained,
 )
-from sprung.model.diagnosis.rules import VerdictRules
+from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -63,6 +72,12 @@ class Judged:
     def size(self) -> float:
         """Deviation of the held-out force, N."""
         return float(np.std(self.record.task.force[self.record.task.split :])) or 1.0
+
+    @cached_property
+    def covariance(self) -> tuple[FloatArray, list[str]]:
+        """Covariance of what the final model has, with what noise and sampling of the motion leave open, and names."""
+        full, names = covariance(self.final)
+        return (full + left_open(self.final) if self.named and self.found.steps else full), names
 
     @property
     def errors(self) -> HeldOutErrors:
@@ -96,20 +111,40 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, tell=tell, given=one.given)
     base, final = found.base, found.final
-    judged = Judged(one, found, base, final, final.floor, turned)
+    judged = _established(Judged(one, found, base, final, final.floor, turned))
     share = judged.errors.explained(rules)
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
-    # three laws imitate much that is none of them: the more there are, the less they may leave
-    least = 1 - (1 - one.task.rules.named) / max(1, len(found.steps))
-    carried = bool(found.steps) and share is not None and share >= least
+    least = _least(judged.found.steps, one.task.rules)
+    carried = bool(judged.found.steps) and share is not None and share >= least
     if left and not carried:
         tell("what is left, as a formula")
         told = _with_formula(judged)
         if told is not None:
             return told
         tell("what is left, as an unnamed force")
-        judged = replace(_with_surface(judged), named=False)
+        judged = replace(_with_surface(_closest(judged)), named=False)
     return judged
+
+
+def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
+    """Share of the excess power that laws explain if they are the component's; several imitate much that is none."""
+    return rules.named if len(steps) < 2 else 1 - rules.together
+
+
+def _established(judged: Judged) -> Judged:
+    """With the first law alone, where that is enough and several leave too much to be named.
+
+    Where the first is not enough by itself, all stay, for what comes closest, and nothing is named.
+    """
+    task, steps = judged.final.task, judged.found.steps
+    share = judged.errors.explained()
+    if len(steps) < 2 or share is None or share >= _least(steps, task.rules):
+        return judged
+    first = steps[0].chosen
+    final = refined(task, first.fit.model)
+    one = replace(judged, found=replace(judged.found, steps=steps[:1]), final=final, floor=final.floor)
+    alone = one.errors.explained()
+    return one if alone is not None and alone >= task.rules.named else judged
 
 
 def _turned(task: ComponentTask) -> bool:
@@ -137,15 +172,28 @@ def _with_formula(judged: Judged) -> Judged | None:
     return told if share is not None and share >= judged.record.task.rules.named else None
 
 
+def _closest(judged: Judged) -> Judged:
+    """With the single law that predicts best, where it does so better than those that were not enough together."""
+    task, found = judged.final.task, judged.found
+    alone = [replace(ranked, fit=fitted(task, ranked.fit.model)) for ranked in found.alone]
+    best = min(alone, key=lambda ranked: ranked.fit.held_out, default=None)
+    if best is None or best.fit.held_out >= judged.final.held_out:
+        return judged
+    p_value = chance(best.gain, best.fit.model.count - judged.base.model.count, len(alone))
+    if p_value > task.rules.alpha:
+        return judged
+    step = Step(best, Ranked(judged.base, 0.0, 0.0, best.count), (), p_value)
+    return replace(judged, found=replace(found, steps=(step,)), final=best.fit, floor=best.fit.floor)
+
+
 def _with_surface(judged: Judged) -> Judged:
     """The rest as an unnamed force, if that serves the held-out part.
 
-    Which law stands beside it, or alone in its place, is of no meaning: whatever predicts best.
+    Which law stands beside it is of no meaning: whatever predicts best.
     """
     task, before = judged.final.task, judged.final
-    shown = [judged.final.model, *(ranked.fit.model for ranked in judged.found.alone)]
-    forces = [fitted(task, model) for plain in shown for model in (plain, plain.plus(SURFACE, ()))]
-    after = min(forces, key=lambda fit: fit.held_out)
+    beside = [judged.final.model, *(ranked.fit.model for ranked in judged.found.alone)]
+    after = min((fitted(task, model.plus(SURFACE, ())) for model in beside), key=lambda fit: fit.held_out)
     if after.held_out > after.task.rules.surface_serves * before.held_out:
         return judged
     count = effective_count(after.residual[: task.split])
@@ -176,10 +224,10 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
             options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
         ),
         verdict=verdict,
-        baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base)),
+        baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base, covariance(j.base))),
         baseline_validation=_figures(names, errors.before),
         findings=tuple(findings),
-        augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final)),
+        augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final, j.covariance)),
         augmented_validation=_figures(names, errors.after),
         noise_floor=_figures(names, errors.bounded(rules)),
         localization={
@@ -203,7 +251,7 @@ def _rank(finding: Finding) -> tuple[int, float]:
 
 
 def _findings(one: Judged) -> list[Finding]:
-    full, names = covariance(one.final)
+    full, names = one.covariance
     findings = []
     if one.reversed:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
@@ -229,11 +277,13 @@ def _findings(one: Judged) -> list[Finding]:
 def _laws(one: Judged) -> tuple[IdentifiedLaw, ...]:
     """What a system file takes over: laws that are given or named, and the preload."""
     count = len(one.record.given.pieces) + (len(one.found.steps) if one.named else 0)
-    return identified_laws(one.final, one.record.element, count, *covariance(one.final), -1.0 if one.reversed else 1.0)
+    return identified_laws(one.final, one.record.element, count, *one.covariance, -1.0 if one.reversed else 1.0)
 
 
-def _parameters(system: System, element: str, fit: ComponentFit) -> list[ReportedParameter]:
-    full, names = covariance(fit)
+def _parameters(
+    system: System, element: str, fit: ComponentFit, told: tuple[FloatArray, list[str]]
+) -> list[ReportedParameter]:
+    full, names = told
     sigma = dict(zip(names, np.sqrt(np.maximum(np.diag(full), 0.0)).tolist(), strict=False))
     values = []
     for parameter in system.parameters:

@@ -86,8 +86,9 @@ class ComponentTask:
         found = np.zeros(len(self.force))
         for one in self.held:
             assert isinstance(one.law, ElementLaw)
-            d = motion.deflection - motion.middle
-            found += force_along(one.law, one.values, d, motion.rate, motion.time, element)
+            along, stride = (motion.followed, motion.stride) if one.law.path is not None else (motion, 1)
+            d = along.deflection - motion.middle
+            found += force_along(one.law, one.values, d, along.rate, along.time, element)[::stride]
         return found
 
 
@@ -289,6 +290,26 @@ def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
     full = sandwich * np.outer(grow, grow) / np.outer(scale, scale)
     names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
     return full, names
+
+
+def left_open(fit: ComponentFit) -> FloatArray:
+    """Squares of what the motion's noise and its sampling leave open, as `covariance` counts the numbers.
+
+    Both bias what is fitted along a measured motion.  As much noise again moves the numbers by about as much as what
+    is there has done (Cook and Stefanski 1994), half the samples by no less than what is missing between them.
+    """
+    task = fit.task
+    half = task.every(2)
+    others = [replace(task, motion=task.motion.noisier()), replace(half, motion=half.motion.undersampled())]
+    moved = [_numbers(refined(other, fit.model)) - _numbers(fit) for other in others]
+    found: FloatArray = sum((np.outer(change, change) for change in moved), np.zeros((len(moved[0]),) * 2))
+    return found
+
+
+def _numbers(fit: ComponentFit) -> FloatArray:
+    """Everything that is fitted, in the order of `covariance`."""
+    linear = np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
+    return np.concatenate([linear, fit.strengths, *(np.array(shape, dtype=float) for shape in fit.model.shapes)])
 
 
 def _per_lag(fit: ComponentFit) -> FloatArray:

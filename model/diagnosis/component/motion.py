@@ -13,7 +13,7 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
 from sprung.model.diagnosis.rules import RULES, ComponentRules
@@ -21,6 +21,7 @@ from sprung.model.signals import FloatArray
 
 ComplexArray = NDArray[np.complexfloating]
 
+_FINER, _MOST = 4, 100_000  # steps per sample along which memories are followed, and all of them at most
 _ORDER = 6  # of the differences that tell white noise
 _BLOCKS = 40  # of them, the median counts: bursts are no noise
 _STILL_SAMPLES = 25  # at least, of a standstill
@@ -35,6 +36,27 @@ class ElementMotion:
     rate: FloatArray  # m/s, (T,)
     deflection_noise: float  # m, what is left of the measurement's noise
     rate_noise: float  # m/s
+    dense: ElementMotion | None = None  # the same between samples, too
+    stride: int = 1  # of its samples per sample
+
+    @classmethod
+    def of(
+        cls, time: FloatArray, deflection: FloatArray, rate: FloatArray, deflection_noise: float, rate_noise: float
+    ) -> ElementMotion:
+        """A motion with what it does between samples: it turns there, which a memory must not miss."""
+        finer = int(np.clip(_MOST // len(time), 1, _FINER))
+        motion = cls(time, deflection, rate, deflection_noise, rate_noise)
+        if finer == 1:
+            return motion
+        between = np.linspace(time[0], time[-1], (len(time) - 1) * finer + 1)
+        cubic = CubicHermiteSpline(time, deflection, rate)
+        dense = cls(between, cubic(between), cubic(between, 1), deflection_noise, rate_noise)
+        return replace(motion, dense=dense, stride=finer)
+
+    @property
+    def followed(self) -> ElementMotion:
+        """The motion as a memory follows it, of which every `stride`-th sample is this one's."""
+        return self if self.dense is None else self.dense
 
     @property
     def step(self) -> float:
@@ -55,16 +77,45 @@ class ElementMotion:
         if late == 0.0:
             return self
         earlier = self._between(np.clip(self.time - late, self.time[0], self.time[-1]))
-        return replace(self, deflection=earlier[:, 0], rate=earlier[:, 1])
+        dense = None if self.dense is None else self.dense.delayed(late)
+        return replace(self, deflection=earlier[:, 0], rate=earlier[:, 1], dense=dense)
 
     @cached_property
     def _between(self) -> CubicSpline:
         return CubicSpline(self.time, np.column_stack([self.deflection, self.rate]))
 
+    def noisier(self, seed: int = 0) -> ElementMotion:
+        """The motion with as much noise again as it is known to have, at low frequencies alone as that is."""
+        if self.deflection_noise <= 0:
+            return self
+        fastest = np.sqrt(3.0) * self.rate_noise / self.deflection_noise  # of a flat spectrum with these deviations
+        count = len(self.time)
+        omega = 2 * np.pi * np.fft.rfftfreq(count, self.step)
+        low = np.fft.rfft(np.random.default_rng(seed).standard_normal(count)) * (omega <= fastest)
+        noise = np.fft.irfft(low, count)
+        size = self.deflection_noise / max(float(np.std(noise)), 1e-300)
+        rate = np.fft.irfft(1j * omega * low, count)
+        return ElementMotion.of(
+            self.time,
+            self.deflection + size * noise,
+            self.rate + size * rate,
+            self.deflection_noise,
+            self.rate_noise,
+        )
+
+    def undersampled(self) -> ElementMotion:
+        """The motion as these samples alone tell it."""
+        return ElementMotion.of(self.time, self.deflection, self.rate, self.deflection_noise, self.rate_noise)
+
     def every(self, stride: int) -> ElementMotion:
         """Every so many samples."""
-        return ElementMotion(
-            self.time[::stride], self.deflection[::stride], self.rate[::stride], self.deflection_noise, self.rate_noise
+        return replace(
+            self,
+            time=self.time[::stride],
+            deflection=self.deflection[::stride],
+            rate=self.rate[::stride],
+            dense=self.followed,
+            stride=stride * self.stride,
         )
 
 
@@ -141,7 +192,7 @@ def element_motion(
     periodic = np.asarray(np.fft.irfft(passed * spectrum, 3 * count - 2)[here], dtype=np.float64)
     smooth = np.add(periodic, _line(displacement, sample_rate, count, line), dtype=np.float64)
     left = float(np.sqrt(np.mean(passed**2)) * noise)
-    return ElementMotion(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
+    return ElementMotion.of(time, smooth, rate, left, float(np.sqrt(np.mean(rate_power))))
 
 
 def _line(series: FloatArray, sample_rate: float, count: int, slope: float) -> FloatArray:

@@ -127,12 +127,14 @@ class Piece:
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
         """Force per strength along a motion, (T, m); deflections count from the middle of the travel."""
-        d = motion.deflection - motion.middle
         law, of = self.acting or self.law, self.acting_parameters or self.parameters
-        total, found = np.zeros(len(d)), []
+        follows = self.kind is HYSTERESIS and law.path is not None
+        along, stride = (motion.followed, motion.stride) if follows else (motion, 1)
+        d = along.deflection - motion.middle
+        total, found = np.zeros(len(motion.time)), []
         for count in range(1, len(self.signs) + 1):
             strengths = (np.arange(len(self.signs)) < count).astype(float)
-            force = force_along(law, of(strengths, shape, _UNIT), d, motion.rate, motion.time, _UNIT)
+            force = force_along(law, of(strengths, shape, _UNIT), d, along.rate, along.time, _UNIT)[::stride]
             found.append(force - total)
             total = force
         return np.column_stack(found)
@@ -245,7 +247,8 @@ class SliderSurface:
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
         seen = Seen.of(motion)
         x, v = (motion.deflection - motion.middle) / seen.travel, motion.rate / max(seen.rate_rms, 1e-12)
-        columns = [stop_path(motion.deflection, reach * seen.travel) / (reach * seen.travel) for reach in _REACHES]
+        path, stride = motion.followed.deflection, motion.stride
+        columns = [stop_path(path, reach * seen.travel)[::stride] / (reach * seen.travel) for reach in _REACHES]
         columns += [np.clip(motion.rate, -knee, knee) / knee for knee in rates_at(seen, _RATES.tolist())]
         columns += [np.maximum(v, 0.0), x**2, x**3, x * v, x**2 * v, v * np.abs(v)]
         return np.column_stack(columns)

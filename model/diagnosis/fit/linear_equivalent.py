@@ -22,6 +22,7 @@ from sprung.model.signals import FloatArray
 
 _ROUNDS = 4  # of equivalent law and motion
 _SETTLED = 1e-3  # largest change of an equivalent stiffness or damping, as a share of it and the element's
+_ROUGH = 1e-3  # of the laws' forces, along which an equivalent is read
 _NEAR = 0.2  # the same where the loop converges anyway
 
 
@@ -35,7 +36,7 @@ def with_equivalents(problem: Problem, point: Point, inputs: SmoothedInputs | No
         return point
     for _ in range(_ROUNDS):
         forward = problem.forward(point, inputs)
-        forces = law_forces(forward, point, inputs)
+        forces = law_forces(forward, point, inputs, _ROUGH)
         if forces is None:
             return point
         start = particular_start(forward, forces)

@@ -71,7 +71,12 @@ class Fit:
     @property
     def converged(self) -> bool:
         """Whether another step would change nothing that matters."""
-        return self.left < _UNSETTLED
+        return self.left < _UNSETTLED * self.grain
+
+    @property
+    def grain(self) -> float:
+        """Fall of the objective that is worth one of evidence, which counts ratios where more than noise is left."""
+        return 1.0 if self.noise.process_noise else max(1.0, self.reduced)
 
     @property
     def deviance(self) -> float:
@@ -156,11 +161,12 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
     for count in range(1, iterations + 1):
         step, sigma, promised = _step(problem, state.lin, state.point, damping)
         size = float(np.max(np.abs(step[: len(sigma)]) / np.maximum(sigma, 1e-300))) if len(sigma) else 0.0
+        grain = _grain(problem, state)
         trial, working = smoothed(problem, advance(state.point, step), state.working, state.lin.spectrum)
         proposed = _state(problem, trial, working)
         if unforced:
             proposed = _begun_anew(problem, proposed)
-        if proposed.value >= state.value and promised < _NUMERICAL:
+        if proposed.value >= state.value and promised < _NUMERICAL * grain:
             left = promised
             break
         rise = proposed.value - state.value
@@ -170,7 +176,7 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
             left = state.value - proposed.value
             state = proposed
             damping = max(damping / 10, _DAMPING[0] / 1e3)
-            if size < tolerance or left < _SMALL * max(1.0, size):
+            if size < tolerance or left < _SMALL * grain * max(1.0, size):
                 break
             if count in (2, 4):
                 state = replace(state, point=with_equivalents(problem, state.point, state.working.inputs))
@@ -180,6 +186,13 @@ def _optimised(problem: Problem, start: Point, iterations: int, tolerance: float
             if damping > _DAMPING[1]:
                 break
     return _finish(problem, state, left, count)
+
+
+def _grain(problem: Problem, state: _State) -> float:
+    """Fall of the objective that matters: of a misfit that is no noise, a share."""
+    rows, columns = state.lin.jacobian.shape
+    chi_square = float(state.lin.residual @ state.lin.residual)
+    return 1.0 if problem.process_noise else max(1.0, chi_square / max(1, rows - columns))
 
 
 def _begun(problem: Problem, start: Point, whitener: Whitener | None) -> tuple[Point, Working]:

@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
-from sprung.model.diagnosis.response.harmonic_balance import LawForces
+from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, LawForces
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
@@ -109,9 +109,11 @@ class Problem:
         return found
 
 
-def law_forces(forward: Forward, point: Point, inputs: SmoothedInputs | None = None) -> LawForces | None:
+def law_forces(
+    forward: Forward, point: Point, inputs: SmoothedInputs | None = None, tolerance: float = TOLERANCE
+) -> LawForces | None:
     """Forces of the laws: along the smoothed motion where they are known there, else of a free run."""
     if inputs is None or inputs.force is None:
-        return forward.law_forces(point.state)
+        return forward.law_forces(point.state, tolerance)
     loop = forward.loop(point.state)
     return None if loop is None else loop.answer(inputs.force)

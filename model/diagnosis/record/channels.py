@@ -13,7 +13,7 @@ from sprung.model.diagnosis.record.slower import slower, slower_by
 from sprung.model.diagnosis.record.stretch import liveliest, standstill
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import ACCELERATION
-from sprung.model.schema import SupportInput, TrackInput
+from sprung.model.schema import ForceInput, SupportInput, TrackInput
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import ORDERS
 from sprung.model.simulate.fusion import motion
@@ -49,7 +49,9 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     values = np.array(values, dtype=float)
     notes: list[str] = []
     resting = {n for n, s in system.file.inputs.items() if s.kind == "force" and not np.any(values[:, names.index(n)])}
-    notes += [f"input {name} is zero throughout: taken for no force" for name in sorted(resting)]
+    notes += [
+        f"input {name} is zero throughout: taken for no force" for name in sorted(resting) if _recorded(system, name)
+    ]
     still = standstill(values, max(int(sample_rate), 20), rules.resting)
     if still.any() and not still.all():
         values[still] = np.nan
@@ -122,6 +124,12 @@ def _affordable(
         "time grow with the length, and the rest would tell the same values a little more exactly"
     )
     return start, stop, used
+
+
+def _recorded(system: System, name: str) -> bool:
+    """Whether a force is one that recordings are said to hold."""
+    source = system.file.inputs[name]
+    return isinstance(source, ForceInput) and any((source.mcap, source.can, source.csv, source.column))
 
 
 def _require_motion(system: System, signals: Signals, rules: RecordRules) -> None:

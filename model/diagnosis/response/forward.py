@@ -15,7 +15,7 @@ from scipy.linalg import expm
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
 from sprung.model.diagnosis.response.frf import Plant
-from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
+from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
@@ -274,13 +274,13 @@ class Forward:
         free = propagate(A, rows, state, grid.step / OVERSAMPLING, len(d))
         return d + free[:, : len(ports)], v + free[:, len(ports) :]
 
-    def law_forces(self, state: FloatArray) -> LawForces | None:
-        """Forces of the laws along their own trajectory; None when no law needs it."""
+    def law_forces(self, state: FloatArray, tolerance: float = TOLERANCE) -> LawForces | None:
+        """Forces of the laws along their own trajectory, to a share of themselves; None when no law needs it."""
         loop = self.loop(state)
         if loop is None:
             return None
         start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
-        return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start))
+        return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start, tolerance))
 
     def loop(self, state: FloatArray) -> HarmonicBalance | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""

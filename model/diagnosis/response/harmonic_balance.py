@@ -23,7 +23,7 @@ from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.signals import FloatArray
 
-_TOLERANCE = 1e-6  # of the law's force
+TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
 _PATIENCE, _PROGRESS = 16, 0.5  # it is given up when the error has not fallen by this factor in so many iterations
 _HISTORY = 8
@@ -154,7 +154,7 @@ class HarmonicBalance:
 
 
 def fixed_point(
-    step: Callable[[FloatArray], FloatArray], start: FloatArray, tolerance: float = _TOLERANCE
+    step: Callable[[FloatArray], FloatArray], start: FloatArray, tolerance: float = TOLERANCE
 ) -> tuple[FloatArray, bool]:
     """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
     shape = start.shape

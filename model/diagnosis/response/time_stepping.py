@@ -24,41 +24,38 @@ from sprung.model.simulate.etd import Site, force_steps
 from sprung.model.simulate.segments import solve
 
 _PARTS = 2 * OVERSAMPLING  # steps per sample
-_ROUNDS = 4  # for the start: the periodic motion that `forward` works with begins where it ends
-_SETTLED = 1e-3
+_HANDED = 1e-4  # change of the states that one stretch hands to the next
 
 
-def march_forces(forward: Forward, state: FloatArray, first: int | None = None) -> FloatArray:
-    """Force of every law along its trajectory less its equivalent, (OVERSAMPLING N, laws).
+def march_from_rest(forward: Forward, state: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Forces of every law along its trajectory less its equivalent, (OVERSAMPLING N, laws), and a state, (2n + b,).
 
-    state (2n + b,): the free motion at the first sample, as `forward` counts it.  From sample `first` on, the forces
-    up to there being known: those that `forward` starts from.  By default over the whole trajectory, which is periodic.
+    state (2n + b,): the free motion at the first sample, beside which the laws' part begins at rest.  `forward` counts
+    the free motion beside a periodic part, which moves at the first sample: what is returned is to be taken off.
     """
+    loop = _loop(forward, state)
+    force = _march(loop, slice(0, None), np.zeros(loop.plant.structure.states))
+    return force, _state_at(loop.plant, loop.answer(force), 0)
+
+
+def march_on(forward: Forward, state: FloatArray, first: int) -> FloatArray:
+    """The same from sample `first` on, the forces up to there being known: those that `forward` starts from."""
+    loop = _loop(forward, state)
+    force = np.column_stack(forward.start_force)
+    held = slice(first * OVERSAMPLING, None)
+    force[held] = _march(loop, held, _state_at(loop.plant, loop.answer(force), first))
+    return force
+
+
+def _loop(forward: Forward, state: FloatArray) -> HarmonicBalance:
     loop = forward.loop(state)
     if loop is None:
         raise ValueError("no law of this model acts along a trajectory")
-    if first is None:
-        return _periodic(loop)
-    force = np.column_stack(forward.start_force)
-    held = slice(first * OVERSAMPLING, None)
-    begin = _state_at(loop.plant, loop.answer(force), first)
-    force[held] = _march(loop, held, begin)[0]
-    return force
+    return loop
 
 
-def _periodic(loop: HarmonicBalance) -> FloatArray:
-    """Forces over the whole trajectory, which begins where it ends."""
-    begin = np.zeros(loop.plant.structure.states)
-    for _ in range(_ROUNDS):
-        force, size = _march(loop, slice(0, None), begin)
-        before, begin = begin, _state_at(loop.plant, loop.answer(force), 0)
-        if np.max(np.abs(begin - before)) <= _SETTLED * size:
-            break
-    return force
-
-
-def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> tuple[FloatArray, float]:
-    """Forces along a part of the fine axis, (4N', laws), from the state of their motion, and its largest size."""
+def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> FloatArray:
+    """Forces along a part of the fine axis, (4N', laws), from the state of their motion."""
     grid, s, d0, v0 = loop.grid, loop.plant.structure, loop.d0[part], loop.v0[part]
     A, rows = s.state_matrix(), s.motion_rows(loop.wide)
     step = grid.step / _PARTS
@@ -75,10 +72,10 @@ def _march(loop: HarmonicBalance, part: slice, begin: FloatArray) -> tuple[Float
         (inputs + propagate(A, rows, begin, step / 2, len(nodes)))[..., None],
         parts=_PARTS,
         start=grid.start + part.start * grid.step / OVERSAMPLING + CLOCK_LEAD,
+        tolerance=_HANDED,
     )
     force = solution.force[:: _PARTS // OVERSAMPLING, :, 0]
-    force = np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
-    return force, float(np.max(np.abs(solution.states)))
+    return np.concatenate([force, np.repeat(force[-1:], len(d0) - len(force), axis=0)])
 
 
 def _without_equivalent(term: Term, reach: FloatArray) -> ElementLaw:

@@ -122,6 +122,8 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
     names = [n for n, s in problem.system.file.inputs.items() if s.kind == "force"]
     plant = fit.forward.plant
     for i, name in enumerate(names):
+        if not np.any(part.force[:, i]):
+            continue  # zero throughout: nobody measured it
         direction = plant.structure.F[:, i]
         load = np.zeros((part.force_polynomial.shape[0], len(direction)))
         load[0] = -direction

@@ -140,7 +140,8 @@ def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence, none of which could lead if only it were fitted on: a fit that still falls is no gain."""
     for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
-        falling = [t for t in trials if t.finished and not t.fit.converged and t.evidence + t.fit.left > best]
+        unsettled = [t for t in trials if t.finished and not t.fit.converged]
+        falling = [t for t in unsettled if t.evidence + t.fit.left / t.fit.grain > best]
         if not falling:
             break
         others = [t for t in trials if all(t is not one for one in falling)]

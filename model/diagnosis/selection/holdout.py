@@ -17,13 +17,15 @@ from sprung.model.diagnosis.record.spectra import ComplexArray, Grid
 from sprung.model.diagnosis.response.forward import Forward, propagate
 from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.time_stepping import march_forces
+from sprung.model.diagnosis.response.time_stepping import march_from_rest, march_on
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.diagnosis.selection.evidence import process_gain
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.system import System
 
 _ROUNDS = 4  # of laws' forces and the state at the start
+_SETTLED = 1e-4  # of the laws' forces
+_MARCHED = 2  # of them, in which what does not settle is marched through time: then it starts from what that came to
 
 
 @dataclass(frozen=True)
@@ -120,10 +122,10 @@ class HeldOut:
         state = np.zeros_like(point.state)
         trained = slice(0, self.split)
         weights = 1 / self.noise.sensors
-        near = point.warm_start if problem.process_noise else ()
+        near, rest = (point.warm_start if problem.process_noise else ()), np.zeros_like(state)
         for number in range(2 if problem.process_noise else _ROUNDS):
             forward = problem.forward(replace(point, state=state, warm_start=near))
-            shown, forces = self._free_run(problem, forward, state, number > 0)
+            shown, forces, rest = self._free_run(problem, forward, state, rest, number)
             near = warm_start_of(forces)
             rows = forward.free_rows_at_start()
             free = forward.plant.free_motion(rows, part.grid.step, self.split)
@@ -180,26 +182,30 @@ class HeldOut:
         return point, transform(replace(signals, force=force), self.noise)
 
     def _free_run(
-        self, problem: Problem, forward: Forward, state: FloatArray, started: bool
-    ) -> tuple[ComplexArray, LawForces | None]:
-        """Shown sensor signals (F, S) and the laws' forces of a run that is free from the split on.
+        self, problem: Problem, forward: Forward, state: FloatArray, rest: FloatArray, number: int
+    ) -> tuple[ComplexArray, LawForces | None, FloatArray]:
+        """Shown sensor signals (F, S) and the laws' forces of a run that is free from the split on, in one round.
 
-        Forces that follow the sensors until there tell the state (`started`) from which the run goes on.
+        Forces that follow the sensors until there tell the state from which the run goes on in the next.  rest: what
+        the state lacks of that beside which the laws' part begins at rest; it comes back as this round has it.
         """
         loop = forward.loop(state)
         if loop is None:
-            return problem.shown(forward, None), None
+            return problem.shown(forward, None), None, rest
         forces: LawForces | None
         if problem.process_noise:
             known = np.column_stack(forward.start_force)
-            forces = loop.answer(march_forces(forward, state, self.split) if started else known)
+            forces = loop.answer(march_on(forward, state, self.split) if number else known)
         else:
-            forces = forward.law_forces(state)
+            forces = forward.law_forces(state, _SETTLED)
             assert forces is not None
             if not forces.converged and not forward.plant.floats:  # those never forget
-                led = replace(forward, start_force=tuple(march_forces(forward, state).T))
-                forces = led.law_forces(state)
-        return problem.shown(forward, forces), forces
+                if number < _MARCHED:
+                    force, rest = march_from_rest(forward, state + rest)
+                else:
+                    force = np.column_stack(forward.start_force)
+                forces = loop.answer(force)
+        return problem.shown(forward, forces), forces, rest
 
     def _judged(self, simulated: FloatArray, point: Point) -> FreeRun:
         measured = self.signals.sensors[self.split :]
