@@ -71,10 +71,9 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
         layout, _ = csvtable.read_layout(path)
         names = [n if layout.names.count(n) == 1 else str(i + 1) for i, n in enumerate(layout.names)]
         times = time_name(layout.names, time, layout.headed)
-        every = zip(names, layout.units, layout.numeric, strict=True)
-        listed, others = [], []
-        for name, unit, numeric in every:
-            listed.append((name, unit)) if numeric else others.append(name)
+        every = list(zip(names, layout.units, layout.numeric, strict=True))
+        listed = [(name, unit) for name, unit, numeric in every if numeric]
+        others = [name for name, _, numeric in every if not numeric]
         if others:
             notes.append(f"left out, since they hold no plain numbers: {some(others)}")
     else:

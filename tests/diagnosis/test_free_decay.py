@@ -12,13 +12,15 @@ from tests.diagnosis_cases import MadeRecord
 RATE, FINE, NOISE, MASS = 200, 50, 2e-5, 10.0
 
 
-def let_go(stiffness: float, damping: float, friction: float, start: float, seconds: float) -> np.ndarray:
+def let_go(
+    stiffness: float, damping: float, friction: float, start: float, seconds: float, cubic: float = 0.0
+) -> np.ndarray:
     """Positions (T,), m; dry friction stops the mass where the spring does not overcome it."""
     x, v, step, found = start, 0.0, 1 / (RATE * FINE), []
     for i in range(int(seconds * RATE * FINE)):
         if i % FINE == 0:
             found.append(x)
-        free = v - step * (stiffness * x + damping * v) / MASS
+        free = v - step * (stiffness * x + cubic * x**3 + damping * v) / MASS
         v = float(np.sign(free)) * max(abs(free) - step * friction / MASS, 0.0)
         x += step * v
     return np.array(found)
@@ -53,3 +55,13 @@ def test_friction_that_brings_the_mass_to_rest_is_named_with_its_force() -> None
     assert finding.effect == "coulomb_friction"
     force = finding.parameters[0]
     assert force.value == pytest.approx(6.0, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_spring_that_stiffens_is_named_although_no_linear_decay_keeps_its_phase() -> None:
+    report = diagnosed(let_go(2000.0, 2.0, 0.0, 0.05, 10.0, cubic=4e5), 1800.0, 3.0)
+    assert report.verdict == "missing_physics", report.summary
+    (finding,) = report.findings
+    assert finding.effect == "cubic_stiffness"
+    k3 = finding.parameters[0]
+    assert abs(k3.value - 4e5) < 3 * k3.std and k3.std < 4e4

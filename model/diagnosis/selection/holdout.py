@@ -111,8 +111,19 @@ class HeldOut:
         """The same for several models, simulated beside each other."""
         return [self._judged(*simulated) for simulated in share(self._simulated, points, WORKERS)]
 
+    @cached_property
+    def _known(self) -> dict[int, tuple[Point, tuple[FloatArray, Point]]]:
+        """What was simulated already, with its point, by the point's identity."""
+        return {}
+
     def _simulated(self, point: Point) -> tuple[FloatArray, Point]:
-        """Held-out samples (T, S), and the point with its starting state.
+        """Held-out samples (T, S), and the point with its starting state."""
+        if id(point) not in self._known:
+            self._known[id(point)] = point, self._simulate(point)
+        return self._known[id(point)][1]
+
+    def _simulate(self, point: Point) -> tuple[FloatArray, Point]:
+        """The same, simulated anew.
 
         The periodic solution over the whole recording is another one than over the fitted part, so the free motion
         is fitted again, to the fitted part alone.

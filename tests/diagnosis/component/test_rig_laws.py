@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from sprung.benchmarks.real_reference import bouc_wen
 from sprung.model.diagnosis.api import Report, diagnose
 from sprung.model.system import parse_system
 from tests.diagnosis.component.test_component import RATE, C, K, RigRecording, sweep
@@ -95,3 +96,15 @@ def test_what_does_not_follow_a_signal_is_not_said_to() -> None:
 def test_a_signal_that_does_not_change_tells_nothing_and_is_said_so() -> None:
     report = diagnosed(K * D + C * V + 200 * V * np.abs(V) / C, signals={"valve": np.full(len(T), 2.0)})
     assert not any("by_valve" in f.effect for f in report.findings)
+
+
+@pytest.mark.slow
+def test_what_an_unmeasured_current_controls_is_unknown_and_predicted_no_worse_than_by_hand() -> None:
+    held = np.repeat(np.random.default_rng(8).uniform(0.0, 2.0, 40), int(0.5 * RATE))[: len(T)]
+    force = (600 + 1500 * held) * V + 900 * D + (40 + 400 * held) * np.tanh(25 * V + 0.8 * np.sign(D)) + 90
+    report = diagnosed(force)
+    assert report.verdict == "unknown_physics"
+    split = int(0.7 * len(T))
+    by_hand = force - bouc_wen(D, V, force, split)
+    error = np.sqrt(np.mean(by_hand[split:] ** 2)) / np.std(force[split:])
+    assert report.augmented_validation.nrmse < 1.01 * error
