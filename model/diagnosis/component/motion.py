@@ -108,14 +108,21 @@ class ElementMotion:
         return ElementMotion.of(self.time, self.deflection, self.rate, self.deflection_noise, self.rate_noise)
 
     def every(self, stride: int) -> ElementMotion:
-        """Every so many samples."""
+        """Every so many samples; memories follow it in steps of half of that."""
+        if stride == 1:
+            return self
+        between = stride * self.stride
+        skip = between // 2 if between % 2 == 0 else 1
+        return replace(self._thinned(stride), dense=self.followed._thinned(skip), stride=between // skip)
+
+    def _thinned(self, stride: int) -> ElementMotion:
         return replace(
             self,
             time=self.time[::stride],
             deflection=self.deflection[::stride],
             rate=self.rate[::stride],
-            dense=self.followed,
-            stride=stride * self.stride,
+            dense=None,
+            stride=1,
         )
 
 
