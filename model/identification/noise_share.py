@@ -31,7 +31,8 @@ def noise_share(model: WindowModel, at: Linearisation, data: WindowBatch) -> Ten
     if noise.shape[1] < shown.shape[1]:
         of_inertia = _of_inertia(model, values, whiten @ transfer.per_load, motion)
         noise = torch.cat([noise, of_inertia[:, : shown.shape[1] - noise.shape[1]]], dim=1)
-    return noise / shown.clamp_min(1e-300)
+    share: Tensor = noise / shown.clamp_min(1e-300)
+    return share
 
 
 def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data: WindowBatch) -> tuple[Tensor, Tensor]:

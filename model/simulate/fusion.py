@@ -91,7 +91,7 @@ def _leaving(T: int, dt: float, key: tuple[tuple[int, float], ...]) -> FloatArra
     unit = np.eye(T + _SPAN - 1)
     design = np.concatenate([_shown(unit, order - lowest, T, dt) / std for order, std in key])
     basis, _ = np.linalg.qr(design)
-    found = np.eye(len(design)) - basis @ basis.T
+    found: FloatArray = np.eye(len(design)) - basis @ basis.T
     found.setflags(write=False)
     return found
 

@@ -141,10 +141,12 @@ def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.
     sensors = [
         listed[index].noise or 1e-3 * _size(signals.sensors[:, i]) for i, index in enumerate(signals.sensor_index)
     ]
-    of_inputs = (np.array(own) / np.sqrt(signals.averaged) for own in (displacement, velocity, acceleration, force))
+    moved, rates, shaken, pushed = (
+        np.array(own) / np.sqrt(signals.averaged) for own in (displacement, velocity, acceleration, force)
+    )
     levels = np.array(sensors) / np.sqrt(signals.averaged)
     least = rules.least_noise * np.minimum(levels, roughness(signals.sensors))
-    return Noise(*of_inputs, levels, least)
+    return Noise(moved, rates, shaken, pushed, levels, least)
 
 
 def roughness(series: FloatArray) -> FloatArray:
