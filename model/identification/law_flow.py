@@ -142,13 +142,13 @@ class Flow:
         if self.memories:
             gains = [gain.mT[:, :, None, :, None] for gain in self.carried]  # (B, Z, 1, T-1, 1)
             d, v = d[:, self.memories], v[:, self.memories]
-            z = d.new_zeros(B, len(self.memories), L, T)
-            for k in range(T - 1):
-                ends = (d[..., k, :], d[..., k + 1, :], v[..., k, :], v[..., k + 1, :])
-                z = self.keep[:, k, :, None] * z
-                for gain, end in zip(gains, ends, strict=True):
-                    z = torch.addcmul(z, gain[..., k, :], end)
-                force[:, self.memories, :, k + 1] += self.by_memory[:, k, :, None] * z
+            ends = (d[..., :-1, :], d[..., 1:, :], v[..., :-1, :], v[..., 1:, :])
+            z = gains[0] * ends[0]
+            for gain, end in zip(gains[1:], ends[1:], strict=True):
+                z.addcmul_(gain, end)
+            for k in range(1, T - 1):
+                z[..., k, :].addcmul_(self.keep[:, k, :, None], z[..., k - 1, :])
+            force[:, self.memories, :, 1:] += self.by_memory.permute(0, 2, 3, 1).unsqueeze(4) * z
         whole = force.permute(0, 3, 1, 4, 2).flip(3).reshape(B, T, L, T * L)
         whole[:, 1:] = self.small @ whole[:, 1:]
         return -whole.flatten(1, 2)

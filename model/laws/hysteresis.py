@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -165,6 +166,20 @@ def _bouc_wen_rate(motion: Motion, p: Values, element: SpringDamper) -> FloatArr
     return found
 
 
+def _bouc_wen_rates(motion: Motion, p: Values) -> Callable[[int, FloatArray], FloatArray]:
+    _, beta, n, *further = p
+    v = motion.rate
+    turning, yielding = beta * v, (further[0] if further else GAMMA) * beta * v
+    linear = np.ndim(n) == 0 and n == 1
+
+    def rate(i: int, z: FloatArray) -> FloatArray:
+        size = np.abs(z) if linear else np.abs(z) ** n
+        found: FloatArray = v[i] - size * (np.copysign(turning[i], z) + yielding[i])
+        return found
+
+    return rate
+
+
 def _bouc_wen_path(motion: Motion, p: Values) -> FloatArray:
     alpha, beta, exponent, *gamma = p
     found: FloatArray = alpha * bouc_wen_memory(motion.deflection, beta, exponent, *gamma)
@@ -210,6 +225,7 @@ _BOUC_WEN = ElementLaw(
     sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n})",
     memory=1,
     memory_rate=_bouc_wen_rate,
+    memory_rates=_bouc_wen_rates,
     path=_bouc_wen_path,
     alike=_other_yields,
 )

@@ -81,6 +81,15 @@ def recall(
     step = MemoryStep(law, p, element, h)
     path = np.zeros((len(time), law.memory, *shape))
     path[0] = law.memory_start(Motion(d[0], v[0], time[0]), p, element) if first is None else first
+    if law.memory_rates and not law.memory_decay:
+        node, half = law.memory_rates(Motion(d, v, time), p), law.memory_rates(Motion(d_half, v_half, time[1:]), p)
+        for i in range(len(time) - 1):
+            z = path[i]
+            n0 = node(i, z)
+            na = half(i, z + h / 2 * n0)
+            nb = half(i, z + h / 2 * na)
+            path[i + 1] = z + h / 6 * (n0 + 2 * (na + nb) + node(i + 1, z + h * nb))
+        return np.moveaxis(path, 0, -1)
     for i in range(len(time) - 1):
         t = float(time[i])
         middle = d_half[i], v_half[i], t + h / 2
