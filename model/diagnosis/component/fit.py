@@ -302,7 +302,9 @@ def left_open(fit: ComponentFit) -> FloatArray:
     half = task.every(2)
     others = [replace(task, motion=task.motion.noisier()), replace(half, motion=half.motion.undersampled())]
     moved = [_numbers(refined(other, fit.model)) - _numbers(fit) for other in others]
-    found: FloatArray = sum((np.outer(change, change) for change in moved), np.zeros((len(moved[0]),) * 2))
+    found: FloatArray = sum(
+        (np.outer(change, change) for change in moved if np.all(np.isfinite(change))), np.zeros((len(moved[0]),) * 2)
+    )
     return found
 
 

@@ -86,12 +86,14 @@ class ElementMotion:
 
     def noisier(self, seed: int = 0) -> ElementMotion:
         """The motion with as much noise again as it is known to have, at low frequencies alone as that is."""
-        if self.deflection_noise <= 0:
+        if self.deflection_noise <= 0 or self.rate_noise <= 0:
             return self
         fastest = np.sqrt(3.0) * self.rate_noise / self.deflection_noise  # of a flat spectrum with these deviations
         count = len(self.time)
         omega = 2 * np.pi * np.fft.rfftfreq(count, self.step)
-        low = np.fft.rfft(np.random.default_rng(seed).standard_normal(count)) * (omega <= fastest)
+        low = np.fft.rfft(np.random.default_rng(seed).standard_normal(count)) * ((omega > 0) & (omega <= fastest))
+        if not np.any(low):
+            return self
         noise = np.fft.irfft(low, count)
         size = self.deflection_noise / max(float(np.std(noise)), 1e-300)
         rate = np.fft.irfft(1j * omega * low, count)

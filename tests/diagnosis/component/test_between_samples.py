@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,3 +50,13 @@ def test_noise_and_sampling_are_in_the_deviations(noise: float) -> None:
     deviation = np.sqrt(np.diag(full))[-2:]
     assert np.all(np.abs(found - (FORCE, REACH)) < 3 * deviation)
     assert np.all(deviation < 0.1 * found)
+
+
+def test_a_motion_without_noise_is_made_no_noisier() -> None:
+    motion = element_motion(shaken(100.0), None, 100.0)
+    for deflection, rate in ((0.0, 0.0), (1e-5, 0.0), (1e-5, 1e-9)):
+        quiet = replace(motion, deflection_noise=deflection, rate_noise=rate)
+        assert np.array_equal(quiet.noisier().deflection, motion.deflection)
+    moved = replace(motion, deflection_noise=1e-4, rate_noise=1e-3).noisier()
+    assert np.std(moved.deflection - motion.deflection) == pytest.approx(1e-4)
+    assert np.std(moved.rate - motion.rate) == pytest.approx(1e-3, rel=0.2)
