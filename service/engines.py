@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection
@@ -58,12 +58,24 @@ class Engines:
         the service's file takes its place.
         """
         served = self._usable(connection, vehicle)
+        self._note({vehicle: served})
+        return served
+
+    def of_all(self, connection: Connection, vehicles: Collection[str]) -> dict[str, ServedModel]:
+        """As `of`, for several: only those that were ever given a model of their own are asked for one by one."""
+        own = vehicle_models.with_own_models(connection, vehicles) if self._own else set()
+        found = {v: self._usable(connection, v) if v in own else self.shared for v in vehicles}
+        self._note(found)
+        return found
+
+    def _note(self, found: Mapping[str, ServedModel]) -> None:
+        now = time.monotonic()
         with self._lock:
-            self._lately[vehicle] = (time.monotonic(), served)
-            self._lately.move_to_end(vehicle)
+            for vehicle, served in found.items():
+                self._lately[vehicle] = (now, served)
+                self._lately.move_to_end(vehicle)
             while len(self._lately) > MOST_LATELY:
                 self._lately.popitem(last=False)
-        return served
 
     def lately(self, store: Store, vehicle: str) -> ServedModel:
         """As `of`, out of memory where that was asked a few seconds ago.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
-from collections import Counter, OrderedDict
-from collections.abc import Callable, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,23 +13,22 @@ from sqlalchemy import Connection
 
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
+from sprung.service.changes import Change, OnAlarms, keep_changes, keep_statuses, new_status
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
 from sprung.service.following import Followed
-from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, outcome_of
-from sprung.service.store import Store, fleet, history, status
-from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold, outcome_of
+from sprung.service.store import Store, fleet, status
+from sprung.service.store.circumstances import Ran
 from sprung.service.store.partitions import prepare
-from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows, latest_window
+from sprung.service.store.windows import Posterior, Solved, WindowRecord, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.views import body_loads, running, vehicle_view
+from sprung.service.views import body_loads, running
 
 LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
 FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after which they are asked again
 FORGET_BEYOND = 1000  # vehicles in memory when the settings do not say
-
-OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
 
 
 class Pipeline:
@@ -124,7 +123,7 @@ class Pipeline:
     def state(self, vehicle: str) -> TrackerState:
         """The vehicle's tracker state as stored; the initial one for a vehicle never seen."""
         with self.store.read() as connection:
-            return self._current(connection, vehicle).state
+            return self._current(connection, [vehicle])[vehicle].state
 
     def _identify(
         self, engine: Engine, windows: list[Window], priority: Priority
@@ -162,7 +161,6 @@ class Pipeline:
         windows: list[Window],
         estimates: Sequence[Estimate | None],
         recording_id: str | None = None,
-        held: HeldVehicle | None = None,
         served: ServedModel | None = None,
     ) -> Folded:
         """Track and store windows inside a transaction of the caller's; hand what comes back to `settle` after it.
@@ -170,39 +168,50 @@ class Pipeline:
         served: with which they were identified; left out: the caller has looked in this transaction.  Raises
         ModelChanged, before anything is stored, where the vehicle is followed with another model by now.
 
-        The vehicle is held until the transaction ends: whoever folds several takes them in the order of their ids, and
-        calls `partitions.prepare` before.  `held`: what `hold` said in this transaction; the caller has left out what
-        is stored already.
+        The vehicle is held until the transaction ends: whoever folds several uses `fold_all`.  The caller has called
+        `partitions.prepare` before.
         """
-        now = self._clock()
-        started = time.perf_counter()
-        at = held or self.hold(connection, vehicle)
-        model_id = at.served.model_id
-        if served is not None and served.model_id != model_id:
+        at = self.hold_all(connection, [vehicle])[vehicle]
+        if served is not None and served.model_id != at.served.model_id:
             raise ModelChanged(vehicle)
-        raced: dict[int, WindowRecord] = {}
-        if held is None:  # another process may have stored some of them while this one was identifying
-            raced = known_windows(connection, vehicle, model_id, [w.start for w in windows])
-        records, after, ran = self._follow(at, windows, estimates, set(raced), now)
-        new = [record for record in records if record.start not in raced]
+        # another process may have stored some of them while this one was identifying
+        raced = known_windows(connection, vehicle, at.served.model_id, [w.start for w in windows])
+        left = [(w, e) for w, e in zip(windows, estimates, strict=True) if w.start not in raced]
+        asked = ToFold(vehicle, [w for w, _ in left], [e for _, e in left], at)
+        folded = self.fold_all(connection, [asked], recording_id)[0]
+        if raced:
+            stored = {record.start: record for record in folded.batch.records} | raced
+            folded.batch.records = [stored[w.start] for w in windows]
+        return folded
+
+    def fold_all(
+        self, connection: Connection, asked: Sequence[ToFold], recording_id: str | None = None
+    ) -> list[Folded]:
+        """As `fold`, of several vehicles that are held (`hold_all`), each once, with the statements of one."""
+        if not asked:
+            return []
+        now, started = self._clock(), time.perf_counter()
+        followed = [self._follow(one, now) for one in asked]
         tracked = time.perf_counter()
-        if new:
-            add_windows(connection, vehicle, model_id, new, now, recording_id)
-            history.add_to_rollups(connection, vehicle, model_id, new, now)
-            if self._shown:
-                add_circumstances(connection, vehicle, ran, now)
-            after = replace(after, revision=at.revision + 1)
-            self._save(connection, vehicle, after, now, new)
-        done = time.perf_counter()
-        batch = Batch(
-            vehicle,
-            [raced.get(record.start, record) for record in records],
-            [w for w in windows if w.start not in raced],
-            sum(record.solved is not None and not record.tracked for record in new),
-            after.state,
-            at.served,
-            {"track": tracked - started, "store": done - tracked},
-        )
+        changes = [
+            Change(one.vehicle, after.with_stored(r.start for r in records), records, ran)
+            for one, (records, after, ran) in zip(asked, followed, strict=True)
+            if records
+        ]
+        if changes:
+            keep_changes(connection, changes, now, self._on_alarms if self._shown else None, recording_id)
+        held = {one.vehicle: one.after for one in changes}
+        share = {"track": (tracked - started) / len(asked), "store": (time.perf_counter() - tracked) / len(asked)}
+        return [
+            self._folded(one, records, held.get(one.vehicle, after), dict(share))
+            for one, (records, after, _) in zip(asked, followed, strict=True)
+        ]
+
+    def _folded(
+        self, one: ToFold, records: list[WindowRecord], after: HeldVehicle, seconds: dict[str, float]
+    ) -> Folded:
+        late = sum(record.solved is not None and not record.tracked for record in records)
+        batch = Batch(one.vehicle, records, list(one.windows), late, after.state, one.at.served, seconds)
         return Folded(batch, after)
 
     def settle(self, folded: Folded) -> None:
@@ -210,33 +219,25 @@ class Pipeline:
         self._remember(folded.batch.vehicle, folded.after)
         self.tell(folded.batch)
 
-    def hold(self, connection: Connection, vehicle: str) -> HeldVehicle:
-        """Keep others from folding windows of a vehicle until the transaction ends; how its tracker stands."""
-        fleet.take_vehicle(connection, vehicle, self._clock(), listed=self._shown)
-        return self._current(connection, vehicle)
+    def hold_all(self, connection: Connection, vehicles: Collection[str]) -> dict[str, HeldVehicle]:
+        """Keep others from folding windows of some vehicles until the transaction ends; how their trackers stand."""
+        fleet.take_vehicles(connection, vehicles, self._clock(), listed=self._shown)
+        return self._current(connection, vehicles)
 
-    def _follow(
-        self,
-        at: HeldVehicle,
-        windows: list[Window],
-        estimates: Sequence[Estimate | None],
-        skip: set[int],
-        now: int,
-    ) -> tuple[list[WindowRecord], HeldVehicle, list[Ran]]:
-        """Feed the windows that are not skipped, in order."""
+    def _follow(self, asked: ToFold, now: int) -> tuple[list[WindowRecord], HeldVehicle, list[Ran]]:
+        """Feed the windows, in order."""
+        at = asked.at
         tracker, system = at.served.engine.tracker, at.served.engine.system
         followed = Followed(at.state, at.last_window_ns)
         records, ran = [], []
-        for window, estimate in zip(windows, estimates, strict=True):
+        for window, estimate in zip(asked.windows, asked.estimates, strict=True):
             posterior, before = None, followed
-            if window.start not in skip:
-                followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
+            followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
             fed = estimate is not None and followed.last == window.start and followed is not before
             if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
                 posterior = Posterior(*tracker.posterior(followed.state))
-            if window.start not in skip:
-                loads = body_loads(at.served.engine, followed.state) if fed else {}
-                ran.append(Ran(window.start, running(system, window, loads)))
+            loads = body_loads(at.served.engine, followed.state) if fed else {}
+            ran.append(Ran(window.start, running(system, window, loads)))
             records.append(
                 WindowRecord(
                     window.start,
@@ -249,14 +250,20 @@ class Pipeline:
             )
         return records, replace(at, state=followed.state, last_window_ns=followed.last), ran
 
-    def _current(self, connection: Connection, vehicle: str) -> HeldVehicle:
-        """The vehicle's tracker: from memory when that is still what is stored, else read anew."""
+    def _current(self, connection: Connection, vehicles: Collection[str]) -> dict[str, HeldVehicle]:
+        """The vehicles' trackers: from memory when that is still what is stored, else read anew."""
         with self._lock:
-            held = self._vehicles.get(vehicle)
-        served = self.engines.of(connection, vehicle)
-        revision = fleet.tracker_revision(connection, vehicle, served.model_id)
-        if held is not None and held.revision == revision and held.served is served:
-            return held
+            found = {vehicle: self._vehicles[vehicle] for vehicle in vehicles if vehicle in self._vehicles}
+        models = self.engines.of_all(connection, vehicles)
+        revisions = fleet.tracker_revisions(connection, vehicles)
+        for vehicle, served in models.items():
+            held = found.get(vehicle)
+            revision = revisions.get((vehicle, served.model_id))
+            if held is None or held.revision != revision or held.served is not served:
+                found[vehicle] = self._read(connection, vehicle, served)
+        return found
+
+    def _read(self, connection: Connection, vehicle: str, served: ServedModel) -> HeldVehicle:
         row = fleet.load_tracker(connection, vehicle, served.model_id)
         if row is None:
             # a back-fill must not depend on which vehicle is done first
@@ -289,9 +296,10 @@ class Pipeline:
         now = self._clock()
         fleet.ensure_vehicle(connection, vehicle, now)
         fleet.hold_vehicle(connection, vehicle)
-        at = self._current(connection, vehicle)
+        at = self._current(connection, [vehicle])[vehicle]
         after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
-        self._save(connection, vehicle, after, now, [])
+        on_alarms = self._on_alarms if self._shown else None
+        keep_changes(connection, [Change(vehicle, after)], now, on_alarms)
         return Batch(vehicle, [], [], 0, after.state, at.served)
 
     def tell(self, batch: Batch) -> None:
@@ -306,58 +314,25 @@ class Pipeline:
         for vehicle in missing:
             with self.store.write() as connection:
                 fleet.hold_vehicle(connection, vehicle)
-                at = self._current(connection, vehicle)
-                self._save_status(connection, vehicle, at, self._clock(), [])
+                at = self._current(connection, [vehicle])[vehicle]
+                keep_statuses(connection, [Change(vehicle, at)], self._clock())
         return len(missing)
 
     def show(self, connection: Connection, vehicle: str) -> None:
         """Make the vehicle's line in the fleet's list anew from what is stored; hold the vehicle before."""
-        now, at = self._clock(), self._current(connection, vehicle)
+        now, at = self._clock(), self._current(connection, [vehicle])[vehicle]
         fleet.ensure_vehicle(connection, vehicle, now)
-        engine, model_id = at.served.engine, at.served.model_id
-        view = vehicle_view(engine, vehicle, at.state, latest_window(connection, vehicle, model_id))
+        last = latest_window(connection, vehicle, at.served.model_id)
         status.forget_counts(connection, vehicle)
-        counts = status.count_windows(connection, vehicle, model_id)
-        status.save_status(connection, vehicle, model_id, at.revision, view.status(engine.system.elements), counts, now)
+        counts = status.count_windows(connection, vehicle, at.served.model_id)
+        status.save_statuses(connection, [new_status(vehicle, at, last, counts)], now)
 
     def switched(self, connection: Connection, vehicle: str) -> Batch:
         """After a vehicle was given another model, inside the transaction that did it: its line in the fleet's list
         is that of the model.  Hand the batch to `tell` once the transaction is committed."""
         self.show(connection, vehicle)
-        at = self._current(connection, vehicle)
+        at = self._current(connection, [vehicle])[vehicle]
         return Batch(vehicle, [], [], 0, at.state, at.served)
-
-    def _save_status(
-        self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
-    ) -> None:
-        last = next((record for record in reversed(new) if record.solved is not None), None)
-        engine, model_id = at.served.engine, at.served.model_id
-        view = vehicle_view(engine, vehicle, at.state, last)
-        counts = Counter(record.outcome for record in new)
-        unfitting = [
-            record
-            for record in new
-            if record.outcome != "uninformative" and record.solved is not None and not record.solved.adequate
-        ]
-        counts["unfitting"] = len(unfitting)
-        found = view.status(engine.system.elements)
-        status.save_status(connection, vehicle, model_id, at.revision, found, counts, now)
-        reasons = [(record.outcome, record.reason, record.start) for record in new if record.reason]
-        reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
-        status.add_reasons(connection, vehicle, model_id, reasons)
-
-    def _save(
-        self, connection: Connection, vehicle: str, at: HeldVehicle, now: int, new: Sequence[WindowRecord]
-    ) -> None:
-        row = fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
-        model_id = at.served.model_id
-        fleet.save_tracker(connection, vehicle, model_id, row, now)
-        changes = fleet.save_alarms(connection, vehicle, model_id, at.state.alarms)
-        if not self._shown:
-            return
-        if changes:
-            self._on_alarms(connection, vehicle, changes)
-        self._save_status(connection, vehicle, at, now, new)
 
     def _remember(self, vehicle: str, at: HeldVehicle) -> None:
         with self._lock:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
@@ -59,6 +59,22 @@ class HeldVehicle:
     revision: int
     last_window_ns: int  # start of the newest window that it has seen; -1 before the first
     state: TrackerState
+    newest_ns: int | None = None  # start of the newest window that is stored; None: nobody has looked
+
+    def with_stored(self, starts: Iterable[int]) -> HeldVehicle:
+        """One revision later, with windows stored that start then."""
+        newest = None if self.newest_ns is None else max(self.newest_ns, *starts)
+        return replace(self, revision=self.revision + 1, newest_ns=newest)
+
+
+@dataclass(frozen=True, slots=True)
+class ToFold:
+    """Windows of a vehicle that are to be tracked and stored, none of which is stored."""
+
+    vehicle: str
+    windows: Sequence[Window]  # in order of time
+    estimates: Sequence[Estimate | None]  # None where dropped
+    at: HeldVehicle
 
 
 @dataclass(frozen=True, slots=True)

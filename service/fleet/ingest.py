@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from sqlalchemy import Connection
@@ -19,8 +20,8 @@ from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
 from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Folded
-from sprung.service.store import pending, vehicle_models
+from sprung.service.processed import Folded, HeldVehicle, ToFold
+from sprung.service.store import pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting
 from sprung.service.store.windows import known_starts, newest_start
@@ -65,21 +66,23 @@ class Ingest:
         Raises UserError for a message that cannot be folded, before anything is stored.
         """
         now = self._clock()
-        with self._pipeline.store.read() as connection:
-            own = vehicle_models.with_own_models(connection, {message.vehicle for message in messages})
-            engines = {vehicle: self._pipeline.engines.of(connection, vehicle).engine for vehicle in own}
         for message in messages:
-            self._check(message, engines.get(message.vehicle, self._pipeline.engine), now)
+            _check_times(message, now)
         prepare(self._pipeline.store, (w.start for message in messages for w in message.windows))
-        by_vehicle: dict[str, list[int]] = {}
-        for i, message in enumerate(messages):
-            by_vehicle.setdefault(message.vehicle, []).append(i)
         taken: dict[int, Taken] = {}
         folded: list[Folded] = []
         with self._pipeline.store.write() as connection:
-            for vehicle in sorted(by_vehicle):  # in the order of their ids: nobody waits in a circle
-                for i in by_vehicle[vehicle]:
-                    taken[i] = self._fold_due(connection, messages[i], now, folded)
+            held = self._pipeline.hold_all(connection, {message.vehicle for message in messages})
+            for message in messages:
+                _check(message, held[message.vehicle].served.engine)
+            for turn in _turns(messages):
+                asked = [messages[i] for i in turn]
+                done = self._fold_due(connection, asked, held, now)
+                for i, message, (one, changed) in zip(turn, asked, done, strict=True):
+                    taken[i] = one
+                    if changed is not None:
+                        held[message.vehicle] = changed.after
+                        folded.append(changed)
         self._settle(folded)
         return [taken[i] for i in range(len(messages))]
 
@@ -108,34 +111,49 @@ class Ingest:
             overdue = pending.overdue(connection, models, now - self._late)
         count = 0
         for vehicle in overdue:
-            folded: list[Folded] = []
             with self._pipeline.store.write() as connection:
-                taken = self._fold_due(connection, Message(vehicle, self._pipeline.engine.digest, ()), now, folded)
+                held = self._pipeline.hold_all(connection, [vehicle])
+                [(taken, folded)] = self._fold_due(connection, [Message(vehicle, "", ())], held, now)
             count += taken.folded
-            self._settle(folded)
+            self._settle([] if folded is None else [folded])
         return count
 
     def _settle(self, folded: Sequence[Folded]) -> None:
         for one in folded:
             self._pipeline.settle(one)
 
-    def _fold_due(self, connection: Connection, message: Message, now: int, folded: list[Folded]) -> Taken:
-        """Fold what is due of what waited and what came; keep the rest."""
-        vehicle = message.vehicle
-        if folded and folded[-1].batch.vehicle == vehicle:  # by a message before, in this transaction
-            at = folded[-1].after
-        else:
-            at = self._pipeline.hold(connection, vehicle)
-        engine, model = at.served.engine, at.served.model_id
-        if message.windows:
-            _same_model(message, engine)  # the vehicle may have been given another one meanwhile
-        waited = pending.waiting(connection, vehicle, model)
+    def _fold_due(
+        self, connection: Connection, messages: Sequence[Message], held: Mapping[str, HeldVehicle], now: int
+    ) -> list[tuple[Taken, Folded | None]]:
+        """Fold what is due of what waited and what came of some vehicles, each once; keep the rest."""
+        models = {message.vehicle: held[message.vehicle].served.model_id for message in messages}
+        waited = pending.waiting(connection, models)
+        dues = [
+            self._due(connection, message, held[message.vehicle], waited.get(message.vehicle, []), now)
+            for message in messages
+        ]
+        folded = iter(self._pipeline.fold_all(connection, [due.to_fold() for due in dues if due.order]))
+        for due in dues:
+            pending.release(connection, due.message.vehicle, due.at.served.model_id, due.released)
+            pending.keep(connection, due.message.vehicle, due.at.served.model_id, due.rest)
+        return [(due.taken, next(folded) if due.order else None) for due in dues]
+
+    def _due(
+        self, connection: Connection, message: Message, at: HeldVehicle, waited: Sequence[Waiting], now: int
+    ) -> DueWindows:
+        """What of a vehicle's windows may be folded now."""
+        vehicle, model = message.vehicle, at.served.model_id
+        newest = at.newest_ns
+        if newest is None:
+            newest = newest_start(connection, vehicle, model, at.last_window_ns)
+            at = replace(at, newest_ns=newest)
+        last = max(at.last_window_ns, newest)  # a window that was dropped is no gap
         starts = {row.start for row in waited} | {w.start for w in message.windows}
-        known = known_starts(connection, vehicle, model, starts)
+        older = [start for start in starts if start <= last]
+        known = known_starts(connection, vehicle, model, older) if older else set()
         fresh = [w for w in message.windows if w.start not in known]
         held = {row.start: row for row in waited if row.start not in known}
         came = {w.start: w for w in fresh if w.start not in held}
-        last = newest_start(connection, vehicle, model, at.last_window_ns)  # a window that was dropped is no gap
         stepped_back = next((i for i, w in enumerate(fresh) if w.new_segment and w.start <= last), None)
         if stepped_back is not None:  # the clock was set: what waits is from before, then the rest as it came
             due = sorted((*held, *(w.start for w in fresh[:stepped_back] if w.start in came)))
@@ -144,38 +162,71 @@ class Ingest:
             received = {start: held[start].received if start in held else now for start in (*held, *came)}
             due = due_windows(received, last, self._hop, self._late, now)
         order = [came[start] if start in came else _restored(held[start]) for start in due]
-        if order:
-            width = len(engine.system.channels)
-            windows = [w.window(engine.system.sample_rate, width) for w in order]
-            estimates = [w.estimate for w in order]
-            folded.append(self._pipeline.fold(connection, vehicle, windows, estimates, held=at))
         done = set(due) | known
-        pending.release(connection, vehicle, model, [row.start for row in waited if row.start in done])
-        rest = set(came) - set(due)
-        rows = [Waiting(s, now, encode(Message(vehicle, engine.digest, (came[s],)), "exact")) for s in sorted(rest)]
-        pending.keep(connection, vehicle, model, rows)
+        digest = at.served.engine.digest
+        rest = [
+            Waiting(start, now, encode(Message(vehicle, digest, (came[start],)), "exact"))
+            for start in sorted(set(came) - set(due))
+        ]
         waits = sum(w.start not in done for w in fresh)
-        return Taken(vehicle, len(order), waits, len(message.windows) - len(fresh))
+        taken = Taken(vehicle, len(order), waits, len(message.windows) - len(fresh))
+        return DueWindows(message, at, order, [row.start for row in waited if row.start in done], rest, taken)
 
-    def _check(self, message: Message, engine: Engine, now: int) -> None:
-        _same_model(message, engine)
-        P, S, H = len(engine.system.tracked), len(engine.system.sensors), len(engine.tracker.deviations)
-        for window in message.windows:
-            if not FIRST_TIME <= window.start <= now + AHEAD:
-                raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
-            beside = len(engine.system.auxiliary)
-            if window.auxiliary is not None and window.auxiliary.shape != (beside,):
-                raise UserError(f"{window.auxiliary.size} measurements beside a window came; the system has {beside}")
-            e = window.estimate
-            if e is None:
-                continue
-            if e.log_ratio.shape != (P,) or e.per_sensor.shape != (S,):
-                raise UserError(f"an estimate of {e.log_ratio.size} parameters and {e.per_sensor.size} sensors came")
-            d = e.deviating
-            if d is not None and (d.cross.shape != (P, H) or d.information.shape != (H, H) or d.point.shape != (H,)):
-                raise UserError(f"an estimate of {d.point.size} deviations came; the model has {H}")
-            if not (np.isfinite(e.log_ratio).all() and np.isfinite(e.covariance).all() and np.isfinite(e.chi_square)):
-                raise UserError(f"window {to_iso(window.start)}: numbers that are not finite")
+
+@dataclass(frozen=True, slots=True)
+class DueWindows:
+    """What is to become of a vehicle's windows."""
+
+    message: Message
+    at: HeldVehicle
+    order: list[WindowEstimate]  # to be folded now
+    released: list[int]  # starts of those that wait no longer
+    rest: list[Waiting]  # that wait from now on
+    taken: Taken
+
+    def to_fold(self) -> ToFold:
+        """As the pipeline takes it."""
+        system = self.at.served.engine.system
+        windows = [one.window(system.sample_rate, len(system.channels)) for one in self.order]
+        return ToFold(self.message.vehicle, windows, [one.estimate for one in self.order], self.at)
+
+
+def _turns(messages: Sequence[Message]) -> list[list[int]]:
+    """Which messages are folded together: of every vehicle one a turn, in the order in which they came."""
+    count: Counter[str] = Counter()
+    turns: list[list[int]] = []
+    for i, message in enumerate(messages):
+        turn = count[message.vehicle]
+        count[message.vehicle] += 1
+        if turn == len(turns):
+            turns.append([])
+        turns[turn].append(i)
+    return turns
+
+
+def _check_times(message: Message, now: int) -> None:
+    for window in message.windows:
+        if not FIRST_TIME <= window.start <= now + AHEAD:
+            raise UserError(f"window {to_iso(window.start)}: before the year 2000 or in the future")
+
+
+def _check(message: Message, engine: Engine) -> None:
+    _same_model(message, engine)
+    P, S, H = len(engine.system.tracked), len(engine.system.sensors), len(engine.tracker.deviations)
+    beside = len(engine.system.auxiliary)
+    for window in message.windows:
+        if window.auxiliary is not None and window.auxiliary.shape != (beside,):
+            raise UserError(f"{window.auxiliary.size} measurements beside a window came; the system has {beside}")
+        e = window.estimate
+        if e is None:
+            continue
+        if e.log_ratio.shape != (P,) or e.per_sensor.shape != (S,):
+            raise UserError(f"an estimate of {e.log_ratio.size} parameters and {e.per_sensor.size} sensors came")
+        d = e.deviating
+        if d is not None and (d.cross.shape != (P, H) or d.information.shape != (H, H) or d.point.shape != (H,)):
+            raise UserError(f"an estimate of {d.point.size} deviations came; the model has {H}")
+        if not (np.isfinite(e.log_ratio).all() and np.isfinite(e.covariance).all() and np.isfinite(e.chi_square)):
+            raise UserError(f"window {to_iso(window.start)}: numbers that are not finite")
 
 
 def _same_model(message: Message, engine: Engine) -> None:

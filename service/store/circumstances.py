@@ -6,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from sqlalchemy import Connection, or_, select
+from sqlalchemy import Connection, select, tuple_
 
 from sprung.service.store.engine import upsert
 from sprung.service.store.history import LEVELS, NICE
 from sprung.service.store.schema import circumstances
+from sprung.service.store.windows import IN_LIMIT
 from sprung.service.times import NANOSECONDS
 
 KEY = ("vehicle_id", "resolution_s", "bucket_ns")
@@ -34,25 +35,23 @@ class RanSeries:
     values: dict[str, list[float | None]]  # by name; None where nobody measured it
 
 
-def add_circumstances(connection: Connection, vehicle: str, found: Sequence[Ran], now: int) -> None:
-    """Merge windows that were stored for the first time into their minutes and hours."""
-    fresh: dict[tuple[int, int], Means] = {}
-    for ran in found:
-        for level in LEVELS if ran.values else ():
-            bucket = ran.start // (level * NANOSECONDS) * (level * NANOSECONDS)
-            _merge(fresh.setdefault((level, bucket), {}), {name: [1, value] for name, value in ran.values.items()})
-    if not fresh:
-        return
-    table = circumstances
-    places = [
-        (table.c.resolution_s == level) & table.c.bucket_ns.in_([b for of, b in fresh if of == level])
-        for level in LEVELS
-    ]
-    for row in connection.execute(select(table).where(table.c.vehicle_id == vehicle, or_(*places))):
-        _merge(fresh[row.resolution_s, row.bucket_ns], row.means)
+def add_circumstances(connection: Connection, found: Mapping[str, Sequence[Ran]], now: int) -> None:
+    """Merge windows that were stored for the first time into the minutes and hours of their vehicles."""
+    fresh: dict[tuple[str, int, int], Means] = {}
+    for vehicle, windows in found.items():
+        for ran in windows:
+            for level in LEVELS if ran.values else ():
+                bucket = ran.start // (level * NANOSECONDS) * (level * NANOSECONDS)
+                one = {name: [1, value] for name, value in ran.values.items()}
+                _merge(fresh.setdefault((vehicle, level, bucket), {}), one)
+    table, places = circumstances, list(fresh)
+    by = tuple_(*(table.c[name] for name in KEY))
+    for first in range(0, len(places), IN_LIMIT // len(KEY)):
+        for row in connection.execute(select(table).where(by.in_(places[first : first + IN_LIMIT // len(KEY)]))):
+            _merge(fresh[row.vehicle_id, row.resolution_s, row.bucket_ns], row.means)
     rows = [
         {"vehicle_id": vehicle, "resolution_s": level, "bucket_ns": bucket, "means": means, "updated_ns": now}
-        for (level, bucket), means in fresh.items()
+        for (vehicle, level, bucket), means in fresh.items()
     ]
     upsert(connection, table, rows, key=KEY)
 

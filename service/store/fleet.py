@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -63,15 +63,19 @@ def ensure_vehicle(connection: Connection, vehicle: str, now: int, listed: bool 
         insert_or_ignore(connection, fleet_status, [blank | dict.fromkeys(numbers, 0)])
 
 
-def take_vehicle(connection: Connection, vehicle: str, now: int, listed: bool = True) -> None:
-    """`hold_vehicle`; one that is not known, or is to be listed and is not, is made so before."""
+def take_vehicles(connection: Connection, wanted: Collection[str], now: int, listed: bool = True) -> None:
+    """`hold_vehicle` of several, in the order of their ids; one that is not known, or is to be listed and is not, is
+    made so."""
     there = select(vehicles.c.id, fleet_status.c.vehicle_id.label("listed"))
     there = there.join(fleet_status, fleet_status.c.vehicle_id == vehicles.c.id, isouter=True)
-    there = there.where(vehicles.c.id == vehicle).with_for_update(key_share=True, of=vehicles)
-    row = connection.execute(there).first()
-    if row is None or (listed and row.listed is None):
+    there = there.where(vehicles.c.id.in_(sorted(wanted))).order_by(vehicles.c.id)
+    held = there.with_for_update(key_share=True, of=vehicles)
+    fine = {row.id for row in connection.execute(held) if not listed or row.listed is not None}
+    missing = sorted(set(wanted) - fine)
+    for vehicle in missing:
         ensure_vehicle(connection, vehicle, now, listed)
-        hold_vehicle(connection, vehicle)
+    if missing:
+        connection.execute(held).all()
 
 
 def staging_models() -> Select[tuple[int]]:
@@ -156,25 +160,27 @@ def latest_trackers(connection: Connection, model_id: int, most: int) -> list[Tr
     return [TrackerRow(*row) for row in rows]
 
 
-def tracker_revision(connection: Connection, vehicle: str, model_id: int) -> int | None:
-    """The revision of the stored tracker, without reading its state."""
-    query = select(tracker_states.c.revision).where(
-        tracker_states.c.vehicle_id == vehicle, tracker_states.c.model_id == model_id
-    )
-    return connection.execute(query).scalar_one_or_none()
+def tracker_revisions(connection: Connection, wanted: Collection[str]) -> dict[tuple[str, int], int]:
+    """The revisions of stored trackers, by vehicle and model, without reading their states."""
+    table = tracker_states
+    query = select(table.c.vehicle_id, table.c.model_id, table.c.revision).where(table.c.vehicle_id.in_(list(wanted)))
+    return {(row[0], row[1]): row[2] for row in connection.execute(query)}
 
 
-def save_tracker(connection: Connection, vehicle: str, model_id: int, row: TrackerRow, now: int) -> None:
-    """Replace the vehicle's tracker."""
-    values = {
-        "vehicle_id": vehicle,
-        "model_id": model_id,
-        "last_window_ns": row.last_window_ns,
-        "revision": row.revision,
-        "state": row.state,
-        "updated_ns": now,
-    }
-    upsert(connection, tracker_states, [values], key=("vehicle_id", "model_id"))
+def save_trackers(connection: Connection, found: Mapping[tuple[str, int], TrackerRow], now: int) -> None:
+    """Replace trackers, by vehicle and model."""
+    rows = [
+        {
+            "vehicle_id": vehicle,
+            "model_id": model_id,
+            "last_window_ns": row.last_window_ns,
+            "revision": row.revision,
+            "state": row.state,
+            "updated_ns": now,
+        }
+        for (vehicle, model_id), row in found.items()
+    ]
+    upsert(connection, tracker_states, rows, key=("vehicle_id", "model_id"))
 
 
 def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iterable[Alarm]) -> list[AlarmChange]:

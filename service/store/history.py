@@ -15,7 +15,7 @@ from sprung.model.signals import FloatArray, IntArray
 from sprung.service.store.archive import Archive, ArchivedPosterior
 from sprung.service.store.engine import upsert
 from sprung.service.store.schema import rollups, windows
-from sprung.service.store.windows import IN_LIMIT, WindowRecord, pack, unpack
+from sprung.service.store.windows import IN_LIMIT, Posterior, VehicleWindows, pack, unpack
 from sprung.service.times import NANOSECONDS
 
 Older = Callable[[int, int], Iterable[ArchivedPosterior]]  # of since and until
@@ -48,17 +48,17 @@ class HistoryPoint:
         )
 
 
-def add_to_rollups(
-    connection: Connection, vehicle: str, model_id: int, records: Sequence[WindowRecord], now: int
-) -> None:
+Place = tuple[str, int, int, int]  # of a bucket: vehicle, model, level in s, start in ns
+
+
+def add_to_rollups(connection: Connection, found: Sequence[VehicleWindows], now: int) -> None:
     """Merge windows that were stored for the first time into their buckets."""
-    points = [
-        HistoryPoint(r.start, 1, r.posterior.log_ratio, r.posterior.std, r.posterior.log_ratio, r.posterior.log_ratio)
-        for r in records
-        if r.posterior is not None
-    ]
-    fresh = {(level, point.time): point for level in LEVELS for point in bucketed(points, level)}
-    for place, stored in _stored(connection, vehicle, model_id, list(fresh)):
+    fresh: dict[Place, HistoryPoint] = {}
+    for one in found:
+        points = [_point(record.start, record.posterior) for record in one.records if record.posterior is not None]
+        for level in LEVELS:
+            fresh |= {(one.vehicle, one.model_id, level, point.time): point for point in bucketed(points, level)}
+    for place, stored in _stored(connection, list(fresh)):
         fresh[place] = stored.merged(fresh[place])
     rows = [
         {
@@ -73,7 +73,7 @@ def add_to_rollups(
             "high": pack(point.high),
             "updated_ns": now,
         }
-        for (level, _), point in fresh.items()
+        for (vehicle, model_id, level, _), point in fresh.items()
     ]
     upsert(connection, rollups, rows, key=("vehicle_id", "model_id", "resolution_s", "bucket_ns"))
 
@@ -225,17 +225,19 @@ def bucketed(points: Iterable[HistoryPoint], resolution: float) -> Iterator[Hist
         yield current
 
 
-def _stored(
-    connection: Connection, vehicle: str, model_id: int, places: list[tuple[int, int]]
-) -> Iterator[tuple[tuple[int, int], HistoryPoint]]:
-    """Stored buckets among `places`, each the level and the bucket."""
+def _point(start: int, posterior: Posterior) -> HistoryPoint:
+    mean = posterior.log_ratio
+    return HistoryPoint(start, 1, mean, posterior.std, mean, mean)
+
+
+def _stored(connection: Connection, places: list[Place]) -> Iterator[tuple[Place, HistoryPoint]]:
+    """Stored buckets among `places`."""
     table = rollups
-    by = (table.c.resolution_s, table.c.bucket_ns)
+    by = (table.c.vehicle_id, table.c.model_id, table.c.resolution_s, table.c.bucket_ns)
     query = select(*by, table.c.windows, table.c.mean, table.c.std, table.c.low, table.c.high)
-    query = query.where(table.c.vehicle_id == vehicle, table.c.model_id == model_id)
-    for first in range(0, len(places), IN_LIMIT // 2):
-        for row in connection.execute(query.where(tuple_(*by).in_(places[first : first + IN_LIMIT // 2]))):
-            yield (row[0], row[1]), HistoryPoint(row[1], row[2], *map(unpack, row[3:]))
+    for first in range(0, len(places), IN_LIMIT // len(by)):
+        for row in connection.execute(query.where(tuple_(*by).in_(places[first : first + IN_LIMIT // len(by)]))):
+            yield (row[0], row[1], row[2], row[3]), HistoryPoint(row[3], row[4], *map(unpack, row[5:]))
 
 
 def fitting_resolution(

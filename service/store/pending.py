@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from sqlalchemy import Connection, delete, select
@@ -20,14 +20,18 @@ class Waiting:
     message: bytes  # as `service.fleet.message` writes one window
 
 
-def waiting(connection: Connection, vehicle: str, model_id: int) -> list[Waiting]:
-    """What waits of a vehicle, in order of time."""
+def waiting(connection: Connection, models: Mapping[str, int]) -> dict[str, list[Waiting]]:
+    """What waits of vehicles under their `models`, in order of time; vehicles of which nothing waits are left out."""
     query = (
-        select(pending.c.start_ns, pending.c.received_ns, pending.c.message)
-        .where(pending.c.vehicle_id == vehicle, pending.c.model_id == model_id)
+        select(pending.c.vehicle_id, pending.c.model_id, pending.c.start_ns, pending.c.received_ns, pending.c.message)
+        .where(pending.c.vehicle_id.in_(list(models)))
         .order_by(pending.c.start_ns)
     )
-    return [Waiting(*row) for row in connection.execute(query)]
+    found: dict[str, list[Waiting]] = {}
+    for vehicle, model_id, *row in connection.execute(query):
+        if model_id == models[vehicle]:
+            found.setdefault(vehicle, []).append(Waiting(*row))
+    return found
 
 
 def keep(connection: Connection, vehicle: str, model_id: int, rows: Iterable[Waiting]) -> None:

@@ -14,7 +14,7 @@ from sqlalchemy import Connection, delete, func, select, update
 from sprung.service.store import fleet, history, status
 from sprung.service.store.engine import upsert
 from sprung.service.store.schema import STAGING, alarms, rollups, tracker_states, window_reasons, windows
-from sprung.service.store.windows import windows_between
+from sprung.service.store.windows import VehicleWindows, windows_between
 from sprung.service.times import NANOSECONDS
 
 HOUR = 3600 * NANOSECONDS
@@ -55,7 +55,7 @@ def _rollups(connection: Connection, vehicle: str, staged: int, target: int, spa
     inside = (rollups.c.bucket_ns >= begin, rollups.c.bucket_ns < end)
     connection.execute(delete(rollups).where(own, rollups.c.model_id == target, *inside))
     for records in windows_between(connection, vehicle, target, begin, end, TOGETHER):
-        history.add_to_rollups(connection, vehicle, target, records, now)
+        history.add_to_rollups(connection, [VehicleWindows(vehicle, target, records)], now)
 
 
 def _reasons(connection: Connection, vehicle: str, staged: int, target: int) -> None:
@@ -87,4 +87,5 @@ def _tracker(connection: Connection, vehicle: str, staged: int, target: int, now
     connection.execute(delete(table).where(table.c.vehicle_id == vehicle, table.c.model_id == staged))
     if new is not None and (old is None or old.last_window_ns <= new.last_window_ns):
         revision = 1 + max(new.revision, 0 if old is None else old.revision)
-        fleet.save_tracker(connection, vehicle, target, fleet.TrackerRow(new.last_window_ns, revision, new.state), now)
+        row = fleet.TrackerRow(new.last_window_ns, revision, new.state)
+        fleet.save_trackers(connection, {(vehicle, target): row}, now)

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
-from sqlalchemy import ColumnElement, Connection, Select, and_, func, literal, or_, select
+from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
 
 from sprung.service.store.engine import upsert
 from sprung.service.store.fleet import staging_models
@@ -84,38 +84,48 @@ class Reason:
     last_ns: int
 
 
-def save_status(
-    connection: Connection,
-    vehicle: str,
-    model_id: int,
-    revision: int,
-    status: Status,
-    counts: Counter[str],
-    now: int,
-) -> None:
-    """Replace a vehicle's row; `counts` are added to its windows, `earlier` alarms looked up."""
-    table = fleet_status
-    asked = select(literal(vehicle).label("id")).subquery()  # one row, whether the vehicle has one or not
-    query = select(table, *_open_alarms(vehicle, model_id))
-    query = query.select_from(asked.outerjoin(table, table.c.vehicle_id == asked.c.id))
-    row = connection.execute(query).one()
+@dataclass(frozen=True, slots=True)
+class NewStatus:
+    """What is new of a vehicle's row."""
+
+    vehicle: str
+    model_id: int
+    revision: int
+    status: Status
+    counts: Counter[str]  # of windows, added to those that were there
+
+
+def save_statuses(connection: Connection, found: Sequence[NewStatus], now: int) -> None:
+    """Replace the rows of vehicles that are known; `earlier` alarms are looked up."""
+    table, rows = fleet_status, []
+    for model_id in sorted({one.model_id for one in found}):
+        of_model = {one.vehicle: one for one in found if one.model_id == model_id}
+        query = select(vehicles.c.id, table, *_open_alarms(vehicles.c.id, model_id))
+        query = query.select_from(vehicles.outerjoin(table, table.c.vehicle_id == vehicles.c.id))
+        for row in connection.execute(query.where(vehicles.c.id.in_(list(of_model)))):
+            rows.append(_merged(of_model[row.id], row, now))
+    upsert(connection, table, rows, key=("vehicle_id",))
+
+
+def _merged(new: NewStatus, row: Any, now: int) -> dict[str, Any]:
+    """A vehicle's row, made of what is new and of the row that was there, if any, beside counts of open alarms."""
+    status, counts = new.status, new.counts
     old = None if row.vehicle_id is None else row
-    same = old is not None and old.model_id == model_id
+    same = old is not None and old.model_id == new.model_id
     earlier = row.open_of_others
     numbers = {name: (getattr(old, name) if same else 0) + counts[name] for name in COUNTED}
     values = asdict(status)
     if status.nrmse is None and same and old is not None:
         values["nrmse"] = old.nrmse
     values |= numbers | {
-        "vehicle_id": vehicle,
-        "model_id": model_id,
-        "revision": revision,
+        "vehicle_id": new.vehicle,
+        "model_id": new.model_id,
+        "revision": new.revision,
         "health": _worse(status.health, "maintenance_required" if earlier else "ok"),
         "earlier": earlier,
         "received_ns": now if old is None or any(counts.values()) else old.received_ns,
     }
-    values |= _urgency(values["health"], row.open_in_all, row.open_unseen)
-    upsert(connection, table, [values], key=("vehicle_id",))
+    return values | _urgency(values["health"], row.open_in_all, row.open_unseen)
 
 
 def refresh_urgency(connection: Connection, vehicle: str) -> None:
@@ -123,7 +133,8 @@ def refresh_urgency(connection: Connection, vehicle: str) -> None:
     table = fleet_status
     row = connection.execute(select(table.c.health).where(table.c.vehicle_id == vehicle)).first()
     if row is not None:
-        _, *counts = connection.execute(select(*_open_alarms(vehicle, 0))).one()
+        query = select(*_open_alarms(vehicles.c.id, 0)).select_from(vehicles).where(vehicles.c.id == vehicle)
+        _, *counts = connection.execute(query).one()
         values = _urgency(row.health, *counts)
         connection.execute(table.update().where(table.c.vehicle_id == vehicle).values(**values))
 
@@ -328,8 +339,8 @@ def _fleet_row(row: Any) -> FleetRow:
     return FleetRow(id=row.vehicle_id, windows={name: getattr(row, name) for name in COUNTED}, **own)
 
 
-def _open_alarms(vehicle: str, model_id: int) -> Sequence[ColumnElement[int]]:
-    """Open alarms of a vehicle: how many of other models, in all, and not acknowledged."""
+def _open_alarms(vehicle: ColumnElement[str], model_id: int) -> Sequence[ColumnElement[int]]:
+    """Open alarms of the vehicle of a row: how many of other models, in all, and not acknowledged."""
     shown = alarms.c.model_id.not_in(staging_models())
     open_ = select(func.count()).where(alarms.c.vehicle_id == vehicle, alarms.c.closed_ns.is_(None), shown)
     return (

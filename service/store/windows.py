@@ -68,23 +68,27 @@ class WindowRecord:
     posterior: Posterior | None  # None where not tracked
 
 
+@dataclass(frozen=True, slots=True)
+class VehicleWindows:
+    """Windows of one vehicle under one model, in order of time."""
+
+    vehicle: str
+    model_id: int
+    records: Sequence[WindowRecord]
+
+
 def add_windows(
-    connection: Connection,
-    vehicle: str,
-    model_id: int,
-    records: Sequence[WindowRecord],
-    stored_ns: int,
-    recording_id: str | None,
+    connection: Connection, found: Sequence[VehicleWindows], stored_ns: int, recording_id: str | None
 ) -> None:
     """Store windows whose key is not there yet; the others are left as they are."""
-    shared = {
-        "vehicle_id": vehicle,
-        "model_id": model_id,
-        "stored_ns": stored_ns,
-        "recording_id": recording_id,
-    }
-    ensure_months(connection, (record.start for record in records))
-    insert_new(connection, windows, [shared | _window_row(record) for record in records])
+    rows = [
+        {"vehicle_id": one.vehicle, "model_id": one.model_id, "stored_ns": stored_ns, "recording_id": recording_id}
+        | _window_row(record)
+        for one in found
+        for record in one.records
+    ]
+    ensure_months(connection, (row["start_ns"] for row in rows))
+    insert_new(connection, windows, rows)
 
 
 def known_windows(

@@ -69,7 +69,7 @@ def _rides(core: Core, system: System) -> None:
     core.pipeline.process("car-18", [make_window(system, i) for i in range(80)])
     ran = [Ran(START + i * 10**9, {"car.load": 4e3 + 30.0 * i, "temperature": 12 + i / 40}) for i in range(140)]
     with core.store.write() as connection:
-        add_circumstances(connection, "car-17", ran, START)
+        add_circumstances(connection, {"car-17": ran}, START)
 
 
 @pytest.fixture(scope="module")
@@ -348,7 +348,7 @@ def test_a_morning_on_screen(served: tuple[str, Core], browser: Any, system: Sys
         core.pipeline.process("car-19", [make_window(system, first + i, level) for i in range(count)])
         with core.store.write() as connection:
             ran = [Ran(START + i * 10**9, {"car.load": 5e3 + 9.0 * i}) for i in range(first, first + count)]
-            add_circumstances(connection, "car-19", ran, START)
+            add_circumstances(connection, {"car-19": ran}, START)
         page.goto(f"{address}/pages/vehicles/car-19")
         page.wait_for_timeout(900)
 

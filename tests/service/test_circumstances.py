@@ -37,8 +37,8 @@ def test_means_are_of_all_windows_however_they_came(store: Store) -> None:
             ran = [
                 Ran(START + i * SECOND, {"car.load": loads[i]} | ({"temperature": 3.0} if i < 60 else {})) for i in part
             ]
-            add_circumstances(connection, "a", ran, 1)
-        add_circumstances(connection, "a", [Ran(START, {})], 1)  # nothing known: nothing kept
+            add_circumstances(connection, {"a": ran}, 1)
+        add_circumstances(connection, {"a": [Ran(START, {})]}, 1)  # nothing known: nothing kept
         minutes = circumstances_between(connection, "a", START, START + 2 * HOUR, 2000)
         hours = circumstances_between(connection, "a", START, START + 2 * HOUR, 2)
         part_of = circumstances_between(connection, "a", START + HOUR, START + HOUR + 60 * SECOND, 2000)
@@ -52,7 +52,7 @@ def test_means_are_of_all_windows_however_they_came(store: Store) -> None:
 def test_they_go_with_their_vehicle(store: Store) -> None:
     with store.write() as connection:
         fleet.ensure_vehicle(connection, "a", 1)
-        add_circumstances(connection, "a", [Ran(START, {"speed": 20.0})], 1)
+        add_circumstances(connection, {"a": [Ran(START, {"speed": 20.0})]}, 1)
         remove(connection, "a")
         assert connection.execute(circumstances.select()).all() == []
 

@@ -51,7 +51,8 @@ def fill(core: Core, count: int) -> None:
             found = status.Status(
                 health, int(bad), 0, "secondary_1l.damping", drift, 0.01, 0.03, 1.0, "o" * 12, 10**18 + i
             )
-            status.save_status(connection, vehicle, core.pipeline.model_id, 1, found, Counter(used=5), now_ns())
+            new = status.NewStatus(vehicle, core.pipeline.model_id, 1, found, Counter(used=5))
+            status.save_statuses(connection, [new], now_ns())
 
 
 def test_the_alarmed_vehicle_comes_first_on_the_page_and_in_the_api(

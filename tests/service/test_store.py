@@ -18,7 +18,7 @@ from sprung.service.errors import UserError
 from sprung.service.fleet.local_postgres import PostgresServer
 from sprung.service.store import Store, fleet, history, open_store, partitions, retention, work
 from sprung.service.store.schema import metadata, windows
-from sprung.service.store.windows import Posterior, Solved, WindowRecord, add_windows, known_windows
+from sprung.service.store.windows import Posterior, Solved, VehicleWindows, WindowRecord, add_windows, known_windows
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 P, S = 3, 2
@@ -39,8 +39,9 @@ def fill(store: Store, records: list[WindowRecord], stored_ns: int = START) -> i
     with store.write() as connection:
         fleet.ensure_vehicle(connection, "a", stored_ns)
         model = fleet.ensure_model(connection, "digest", "toy", {}, stored_ns)
-        add_windows(connection, "a", model, records, stored_ns, None)
-        history.add_to_rollups(connection, "a", model, records, stored_ns)
+        stored = [VehicleWindows("a", model, records)]
+        add_windows(connection, stored, stored_ns, None)
+        history.add_to_rollups(connection, stored, stored_ns)
     return model
 
 

@@ -20,7 +20,7 @@ from sprung.service.fleet.knowledge import (
 from sprung.service.store import Store, fleet, history
 from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.levels import FleetLevels, fleet_levels
-from sprung.service.store.windows import add_windows
+from sprung.service.store.windows import VehicleWindows, add_windows
 from tests.service.test_store import DAY, HOP, START, record
 
 NAMES = ("secondary_1l.damping", "secondary_2l.damping", "primary_11l.stiffness")
@@ -143,10 +143,11 @@ def test_levels_of_a_fleet_are_read_from_hours(any_store: Store) -> None:
             fleet.ensure_vehicle(connection, vehicle, START)
             hours = [(day, day * (DAY // HOP) + hour * 7200) for day in range(4) for hour in (0, 2)]
             rows = [record(number, level=0.01 * day + v) for day, number in hours]
-            add_windows(connection, vehicle, model, rows, START, None)
-            history.add_to_rollups(connection, vehicle, model, rows, START)
+            stored = [VehicleWindows(vehicle, model, rows)]
+            add_windows(connection, stored, START, None)
+            history.add_to_rollups(connection, stored, START)
             ran = [Ran(row.start, {"temperature": 5.0 + v}) for row in rows] if v else []
-            add_circumstances(connection, vehicle, ran, START)
+            add_circumstances(connection, {vehicle: ran}, START)
     with any_store.read() as connection:
         found = fleet_levels(connection, model, START // DAY * DAY, START // DAY * DAY + 5 * DAY, 5)
         north = fleet_levels(connection, model, START // DAY * DAY, START // DAY * DAY + 5 * DAY, 5, "north-")

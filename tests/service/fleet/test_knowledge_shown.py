@@ -14,7 +14,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import fleet, history
-from sprung.service.store.windows import Posterior, WindowRecord
+from sprung.service.store.windows import Posterior, VehicleWindows, WindowRecord
 from sprung.service.times import NANOSECONDS, now_ns
 
 DAY = 86_400 * NANOSECONDS
@@ -41,7 +41,7 @@ def fill(core: Core, parameter: int) -> None:
                 WindowRecord(begin + day * DAY, "used", None, 0, True, None, Posterior(level[day], std))
                 for day in range(DAYS)
             ]
-            history.add_to_rollups(connection, name, core.pipeline.model_id, records, begin)
+            history.add_to_rollups(connection, [VehicleWindows(name, core.pipeline.model_id, records)], begin)
 
 
 @pytest.fixture

@@ -1,0 +1,84 @@
+"""What folding has changed into the store: of many vehicles with the statements of one."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from sqlalchemy import Connection
+
+from sprung.service.processed import HeldVehicle
+from sprung.service.store import fleet, history, status
+from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.status import NewStatus
+from sprung.service.store.windows import VehicleWindows, WindowRecord, add_windows
+from sprung.service.views import vehicle_view
+
+OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """A vehicle whose tracker is another one now."""
+
+    vehicle: str
+    after: HeldVehicle
+    records: Sequence[WindowRecord] = ()  # that are not stored yet
+    ran: Sequence[Ran] = ()  # how the vehicle ran in them
+
+
+def keep_changes(
+    connection: Connection,
+    changes: Sequence[Change],
+    now: int,
+    on_alarms: OnAlarms | None,
+    recording_id: str | None = None,
+) -> None:
+    """Windows, roll-ups, trackers, alarms and lines of the fleet's list, each vehicle once; all of them are held.
+
+    on_alarms: None while nobody is to see anything of it (`service.store.staging`): only the history is kept then.
+    """
+    stored = [VehicleWindows(one.vehicle, one.after.served.model_id, one.records) for one in changes if one.records]
+    if stored:
+        add_windows(connection, stored, now, recording_id)
+        history.add_to_rollups(connection, stored, now)
+    if on_alarms is not None:
+        add_circumstances(connection, {one.vehicle: one.ran for one in changes}, now)
+    fleet.save_trackers(connection, {(one.vehicle, one.after.served.model_id): _row(one.after) for one in changes}, now)
+    for one in changes:
+        found = fleet.save_alarms(connection, one.vehicle, one.after.served.model_id, one.after.state.alarms)
+        if found and on_alarms is not None:
+            on_alarms(connection, one.vehicle, found)
+    if on_alarms is not None:
+        keep_statuses(connection, changes, now)
+
+
+def keep_statuses(connection: Connection, changes: Sequence[Change], now: int) -> None:
+    """Lines of the fleet's list, with the windows that are new."""
+    statuses = []
+    for one in changes:
+        unfitting = [
+            record
+            for record in one.records
+            if record.outcome != "uninformative" and record.solved is not None and not record.solved.adequate
+        ]
+        counts = Counter(record.outcome for record in one.records)
+        counts["unfitting"] = len(unfitting)
+        last = next((record for record in reversed(one.records) if record.solved is not None), None)
+        statuses.append(new_status(one.vehicle, one.after, last, counts))
+        reasons = [(record.outcome, record.reason, record.start) for record in one.records if record.reason]
+        reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
+        status.add_reasons(connection, one.vehicle, one.after.served.model_id, reasons)
+    status.save_statuses(connection, statuses, now)
+
+
+def new_status(vehicle: str, at: HeldVehicle, last: WindowRecord | None, counts: Counter[str]) -> NewStatus:
+    """A vehicle's line, `last` being its newest window that was identified."""
+    engine = at.served.engine
+    found = vehicle_view(engine, vehicle, at.state, last).status(engine.system.elements)
+    return NewStatus(vehicle, at.served.model_id, at.revision, found, counts)
+
+
+def _row(at: HeldVehicle) -> fleet.TrackerRow:
+    return fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())
