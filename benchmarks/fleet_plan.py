@@ -19,13 +19,15 @@ import numpy as np
 from sqlalchemy import text
 
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.signals import Window
+from sprung.model.signals import Estimate, Window
 from sprung.service.compute import Compute
 from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
 from sprung.service.pipeline import Pipeline
+from sprung.service.processed import ToFold
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
+from sprung.service.store.partitions import prepare
 
 Figures = Iterator[dict[str, Any]]
 WORKERS = (4, 8, 16, 32, 64)
@@ -48,6 +50,8 @@ class FleetStages:
     fold: float  # tracker and packing, on a worker
     database: float  # the server's own, one transaction of `together` windows, a window
     together: int
+    fold_live: float  # as the two above, one window each of some vehicles in a transaction
+    database_live: float
     window_bytes: float  # in the store, indices included
     rollup_bytes: float  # a vehicle and day
     parquet_bytes: float  # a window in the archive
@@ -60,6 +64,8 @@ class FleetStages:
             ("identify, batched over vehicles", self.identify_batched),
             ("fold", self.fold),
             ("database", self.database),
+            ("fold, one each of many vehicles", self.fold_live),
+            ("database, one each of many vehicles", self.database_live),
         ):
             yield {"figure": f"processor time a window, {name}", "value": round(1e3 * value, 3), "unit": "ms"}
         yield {"figure": "store, bytes a window", "value": round(self.window_bytes), "on": self.store}
@@ -88,7 +94,8 @@ def measured_stages(vehicles: int = 12, seconds: float = 30.0) -> FleetStages:
 
 
 def _stored(engine: Any, estimates: list[Any], vehicles: int, alone: float, batched: float) -> FleetStages:
-    """Fold them, 20 windows a transaction, and look at what the server took and how much it holds."""
+    """Fold them, 20 windows of a vehicle in a transaction, then one each of all, and look at what the server took and
+    how much it holds."""
     together, system = 20, engine.system
     with tempfile.TemporaryDirectory(prefix="sprung-bench-") as folder:
         missing = postgres.missing()
@@ -97,19 +104,16 @@ def _stored(engine: Any, estimates: list[Any], vehicles: int, alone: float, batc
         url = f"sqlite:///{folder}/x.db" if running is None else running.database()
         store, compute = open_store(url), Compute(1)
         pipeline = Pipeline(engine, store, compute)
-        empty = np.empty((0, len(system.channels)))
-        before, begun = _server_seconds(running), time.process_time()
-        for v in range(vehicles):
-            for first in range(0, len(estimates), together):
-                part = estimates[first : first + together]
-                windows = [Window(at, system.sample_rate, empty) for at, _ in part]
-                with store.write() as connection:
-                    folded = pipeline.fold(connection, f"plan-{v}", windows, [found[v] for _, found in part])
-                pipeline.settle(folded)
-        count = vehicles * len(estimates)
-        fold = (time.process_time() - begun) / count
-        database = (_server_seconds(running) - before) / count if running is not None else 0.0
-        size = _window_bytes(store, count)
+        prepare(store, (at for at, _ in estimates))
+        parts = [
+            {f"plan-{v}": [(at, found[v]) for at, found in estimates[first : first + together]]}
+            for v in range(vehicles)
+            for first in range(0, len(estimates), together)
+        ]
+        fold, database = _fold(pipeline, parts, running)
+        size = _window_bytes(store, vehicles * len(estimates))
+        each = [{f"live-{v}": [(at, found[v])] for v in range(vehicles)} for at, found in estimates[:together]]
+        fold_live, database_live = _fold(pipeline, each, running)
         parquet = _parquet_bytes(store, Path(folder))
         compute.close()
         store.close()
@@ -118,7 +122,28 @@ def _stored(engine: Any, estimates: list[Any], vehicles: int, alone: float, batc
     points = 1440 * RUNNING_SHARE + 24 * RUNNING_SHARE
     rollups = points * (4 * 8 * len(system.tracked) + 120)
     name = f"SQLite ({missing})" if missing else "PostgreSQL"
-    return FleetStages(alone, batched, fold, database, together, size, rollups, parquet, name)
+    times = (alone, batched, fold, database, together, fold_live, database_live)
+    return FleetStages(*times, size, rollups, parquet, name)
+
+
+def _fold(pipeline: Pipeline, parts: list[dict[str, list[tuple[int, Estimate]]]], running: Any) -> tuple[float, float]:
+    """Processor seconds a window, of this process and of the server: a part, of vehicles, is one transaction."""
+    system = pipeline.engine.system
+    empty = np.empty((0, len(system.channels)))
+    before, begun = _server_seconds(running), time.process_time()
+    for part in parts:
+        with pipeline.store.write() as connection:
+            held = pipeline.hold_all(connection, part)
+            asked = [
+                ToFold(v, [Window(at, system.sample_rate, empty) for at, _ in found], [e for _, e in found], held[v])
+                for v, found in part.items()
+            ]
+            done = pipeline.fold_all(connection, asked)
+        for one in done:
+            pipeline.settle(one)
+    count = sum(len(found) for part in parts for found in part.values())
+    database = (_server_seconds(running) - before) / count if running is not None else 0.0
+    return (time.process_time() - begun) / count, database
 
 
 def _server_seconds(running: Any) -> float:
@@ -202,9 +227,9 @@ def plan(stages: FleetStages, vehicles: int) -> Figures:
     """Cores, memory, database and cost of a fleet, a vehicle and year."""
     peak = vehicles * WINDOWS_PER_SECOND  # all run at once
     named: dict[str, tuple[float, float]] = {}  # cores at the peak: workers, database
-    named["raw windows to the server"] = (
-        peak * (stages.identify_batched + stages.fold) / HEADROOM,
-        peak * stages.database / HEADROOM,
+    named["raw windows, one in a request"] = (
+        peak * (stages.identify_batched + stages.fold_live) / HEADROOM,
+        peak * stages.database_live / HEADROOM,
     )
     named["identified on board"] = (peak * stages.fold / HEADROOM, peak * stages.database / HEADROOM)
     per_day = WINDOWS_PER_SECOND * 86_400 * RUNNING_SHARE

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from contextlib import ExitStack, closing
 from dataclasses import asdict
 from pathlib import Path
@@ -81,20 +82,33 @@ def run_backfill(
 
 def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, workers: int | None, json_lines: bool) -> int:
     """Diagnose many; 1 when one is not consistent, or cannot be diagnosed."""
+    settings, started = settings_with(options), time.perf_counter()
     tasks = tasks_for(_on(on), workers)
-    bad = 0
+    verdicts: Counter[str] = Counter()
+    before, problems = 0, []
     try:
-        for found in diagnose_many(settings_with(options), _place(place), out, tasks):
-            bad += found.verdict != "consistent"
+        diagnosed = diagnose_many(settings, _place(place), out, tasks, workers or os.cpu_count() or 1)
+        for done, (found, of) in enumerate(diagnosed, 1):
+            verdicts[found.verdict or "not diagnosed"] += 1
+            before += found.before
+            problems += [f"{found.path}: {found.problem}"] if found.problem else []
             if json_lines:
                 print(json.dumps(asdict(found)), flush=True)
-            elif found.problem:
-                print(f"sprung: {found.path}: {found.problem}", file=sys.stderr)
             else:
-                print(f"{found.path}: {found.verdict}{''.join(f'; {text}' for text in found.findings)}", flush=True)
+                said = found.problem or "; ".join((found.verdict, *found.findings))
+                print(f"{done}/{of} {found.path}: {said}{' (done before)' if found.before else ''}", flush=True)
     finally:
         tasks.close()
-    return 1 if bad else 0
+    seconds = time.perf_counter() - started
+    if json_lines:
+        told = {"verdicts": verdicts, "done_before": before, "problems": problems, "wall_seconds": round(seconds, 1)}
+        print(json.dumps({"summary": told | {"on": tasks.name}}), flush=True)
+    else:
+        for problem in problems:
+            print(f"sprung: {problem}", file=sys.stderr)
+        counted = ", ".join(f"{count} {verdict}" for verdict, count in verdicts.most_common())
+        print(f"{counted}; {before} of them done before; {seconds:.0f} s on {tasks.name}; reports in {out}")
+    return 0 if set(verdicts) == {"consistent"} else 1
 
 
 def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None, workers: int | None) -> int:
@@ -117,9 +131,11 @@ def run_serve(options: dict[str, Any], sizes: ServingSizes, address: str | None,
     os._exit(1)  # Ray's threads wait for a head that is gone
 
 
-def run_consume(options: dict[str, Any], address: str) -> int:
+def run_consume(options: dict[str, Any], address: str, alive: Path | None) -> int:
     """Take messages until told to stop."""
     settings = settings_with(options)
+    if alive is not None:
+        alive.touch()  # told now where it cannot be
     set_up(settings.log_format, settings.log_level)
     engine = load_engine(settings)
     counts = ConsumerCounts()
@@ -132,12 +148,12 @@ def run_consume(options: dict[str, Any], address: str) -> int:
         ingest = Ingest(pipeline, settings.late_seconds)
         ingest.start()
         stack.callback(ingest.close)
-        asyncio.run(_consume(address, ingest, counts))
+        asyncio.run(_consume(address, ingest, counts, alive))
     print(f"{counts.messages} messages with {counts.windows} windows stored, {counts.refused} refused", flush=True)
     return 0
 
 
-async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts) -> None:
+async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts, alive: Path | None) -> None:
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -145,7 +161,7 @@ async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts) -> None
     broker = await _broker(address)
     print(f"sprung fleet: folding what {address} holds; Ctrl-C stops", flush=True)
     try:
-        await consume(broker, ingest, stopping, counts)
+        await consume(broker, ingest, stopping, counts, (lambda: None) if alive is None else alive.touch)
     finally:
         await broker.close()
 

@@ -145,6 +145,9 @@ def serve(
 @fleet.command("consume")
 def consume(
     broker: Annotated[str, typer.Argument(help="nats://HOST:PORT or kafka://HOST:PORT/TOPIC.")],
+    alive: Annotated[
+        Path | None, typer.Option("--alive", metavar="FILE", help="Touched every second or so: a probe looks at it.")
+    ] = None,
     store: StoreUrl = None,
     system: System = None,
     weights: Weights = None,
@@ -153,7 +156,7 @@ def consume(
     one_thread_each()
     from sprung.service.cli.fleet import run_consume
 
-    return run_consume({"system": system, "weights": weights, "store": store}, broker)
+    return run_consume({"system": system, "weights": weights, "store": store}, broker, alive)
 
 
 @fleet.command("migrate")

@@ -26,7 +26,7 @@ from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import vehicle_of
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
-from sprung.service.fleet.tasks import Tasks
+from sprung.service.fleet.tasks import Tasks, WorkLost
 from sprung.service.pipeline import Pipeline
 from sprung.service.reading import Here, ReadRequest
 from sprung.service.settings import Settings
@@ -121,13 +121,19 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
     with opened_store(plan.settings) as store, store.read() as connection:
         rows = {file.id: work.get_recording(connection, _row_id(plan, file)) for file in files}
     last: dict[str, Any] = {}
-    waiting: list[Any] = []
+    waiting: list[tuple[FoundFile, Any]] = []
+    lost: set[str] = set()  # vehicles of which a piece of work was lost: they stay as they are, for the next time
     done = 0
 
     def settle(most: int) -> None:
         nonlocal done
         while len(waiting) > most:
-            folded = tasks.result(waiting.pop(0))
+            file, pending = waiting.pop(0)
+            try:
+                folded = tasks.result(pending)
+            except WorkLost as error:
+                lost.add(file.vehicle)
+                folded = FoldedFile(file, problem=str(error))
             done += 1
             told.windows += folded.windows
             if folded.problem:
@@ -143,11 +149,11 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
             continue
         identified = tasks.submit(identify_file, plan, file)
         last[file.vehicle] = tasks.submit(fold_file, plan, identified, last.get(file.vehicle))
-        waiting.append(last[file.vehicle])
-        settle(AHEAD * cores)
+        waiting.append((file, last[file.vehicle]))
+        settle(0 if tasks.at_once else AHEAD * cores)
     settle(0)
     told.vehicles = sorted({file.vehicle for file in files})
-    for one in [tasks.submit(swap_vehicle, plan, vehicle) for vehicle in told.vehicles]:
+    for one in [tasks.submit(swap_vehicle, plan, vehicle) for vehicle in told.vehicles if vehicle not in lost]:
         told.swapped += tasks.result(one)
     return told
 
@@ -198,8 +204,8 @@ def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
         if first is None:
             return replace(file, problem="no samples of the system's channels")
         return replace(file, vehicle=vehicle_of(None, recording.vehicle, Path(file.path).name), first_ns=first)
-    except (ValueError, OSError) as error:
-        return replace(file, problem=_line(error))
+    except Exception as error:  # the others go on
+        return replace(file, problem=told_of(error))
 
 
 def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
@@ -227,8 +233,8 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
             for piece in reading.pieces(lambda: None):
                 add(piece.windows)
             ending = reading.ending
-    except (ValueError, OSError) as error:
-        return IdentifiedFile(file, tuple(messages), True, _line(error))
+    except Exception as error:  # the others go on
+        return IdentifiedFile(file, tuple(messages), True, told_of(error))
     problem = "; ".join(ending.problems[:3]) if ending.incomplete else ""
     return IdentifiedFile(file, tuple(messages), ending.incomplete, problem)
 
@@ -345,5 +351,8 @@ def _row_id(plan: BackfillPlan, file: FoundFile) -> str:
     return hashlib.sha256(key.encode()).hexdigest()[:36]
 
 
-def _line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]
+def told_of(error: Exception) -> str:
+    """What is wrong with a recording, in one line."""
+    expected = isinstance(error, ValueError | OSError)  # as readers say it
+    text = str(error) or type(error).__name__ if expected else f"unexpected {type(error).__name__}: {error}"
+    return " ".join(text.split())[:500]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -60,9 +60,16 @@ class ConsumerCounts:
     again: int = 0
 
 
-async def consume(broker: Broker, ingest: Ingest, stopping: asyncio.Event, counts: ConsumerCounts) -> None:
-    """Take messages until told to stop."""
+async def consume(
+    broker: Broker,
+    ingest: Ingest,
+    stopping: asyncio.Event,
+    counts: ConsumerCounts,
+    alive: Callable[[], None] = lambda: None,
+) -> None:
+    """Take messages until told to stop; `alive` is called every second or so, between transactions."""
     while not stopping.is_set():
+        alive()
         deliveries = await broker.fetch(TOGETHER, WAIT_SECONDS)
         if not deliveries:
             continue

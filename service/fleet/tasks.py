@@ -17,16 +17,21 @@ OBJECT_STORE_BYTES = 200_000_000  # of a Ray that is started here; more goes to 
 RETRIES = 10  # of a piece of work whose worker died
 
 
+class WorkLost(RuntimeError):
+    """A piece of work ended its process every time that it was tried."""
+
+
 class Tasks(Protocol):
     """Somebody who does work."""
 
     name: str
+    at_once: bool  # `submit` returns when the work is done
 
     def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """Have work done; arguments that `submit` returned stand for their results.  What stands for the result."""
 
     def result(self, pending: Any) -> Any:
-        """Wait for a result; raises what the work raised."""
+        """Wait for a result; raises what the work raised, WorkLost where it ended its process."""
 
     def close(self) -> None:
         """Let go of what was started for it."""
@@ -36,6 +41,7 @@ class HereTasks:
     """Does everything at once, in this process."""
 
     name = "this process"
+    at_once = True
 
     def submit(self, work: Callable[..., Any], *arguments: Any) -> Any:
         """The result itself."""
@@ -51,6 +57,8 @@ class HereTasks:
 
 class RayTasks:
     """Ray: the cluster that RAY_ADDRESS names, else one on this machine with `workers` cores."""
+
+    at_once = False
 
     def __init__(self, workers: int | None = None) -> None:
         """Raises UserError where Ray is not installed or cannot be reached."""
@@ -88,7 +96,12 @@ class RayTasks:
         try:
             return self._ray.get(pending)
         except self._ray.exceptions.RayTaskError as error:
-            raise error.cause from None  # as it was raised, without the worker's traceback in its text
+            if not isinstance(error.cause, self._ray.exceptions.RayError):  # else of what the work depended on
+                raise error.cause from None  # as it was raised, without the worker's traceback in its text
+            raise WorkLost(f"what came before it was lost ({type(error.cause).__name__})") from None
+        except self._ray.exceptions.RayError as error:
+            lost = f"its process ended {RETRIES + 1} times ({type(error).__name__}): too little memory?"
+            raise WorkLost(lost) from None
 
     def close(self) -> None:
         """Stop a Ray that was started here."""

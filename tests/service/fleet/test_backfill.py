@@ -17,8 +17,9 @@ from sprung.service.errors import UserError
 from sprung.service.feed import feed_file
 from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
-from sprung.service.fleet.tasks import HereTasks
+from sprung.service.fleet.tasks import HereTasks, WorkLost
 from sprung.service.pipeline import Pipeline
+from sprung.service.reading import ReadRequest
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, history, open_store, status
 from sprung.service.store.fleet import WantedAlarms
@@ -145,6 +146,43 @@ def test_a_backfill_that_was_interrupted_goes_on(
     alone = replayed(engine, place, tmp_path)
     assert everything(any_store, engine.digest) == everything(alone, engine.digest)
     alone.close()
+
+
+def test_a_vehicle_of_which_work_was_lost_stays_as_it_was_until_the_next_time(
+    plan: BackfillPlan, place: Path, engine: Engine, any_store: Store, tmp_path: Path
+) -> None:
+    """As when a worker runs out of memory with one recording, again and again."""
+
+    class Losing(HereTasks):
+        def submit(self, work: object, *arguments: object) -> object:
+            lost = work is module.fold_file and arguments[1].file.path.endswith("a-north-2.mcap")  # type: ignore[attr-defined]
+            return None if lost else super().submit(work, *arguments)  # type: ignore[arg-type]
+
+        def result(self, pending: object) -> object:
+            if pending is None:
+                raise WorkLost("its process ended")
+            return pending
+
+    told = backfill(plan, Losing(), 2, shown)
+    assert told.swapped == 1 and any("a-north-2.mcap: its process ended" in one for one in told.problems)
+    with any_store.read() as connection:
+        assert [row.id for row in status.fleet_page(connection, status.Wanted(), "id", 10)] == ["north-1"]
+
+
+def test_a_recording_that_breaks_a_reader_is_told_of_and_the_others_go_on(
+    plan: BackfillPlan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    identify = module.Here
+
+    def breaking(request: ReadRequest) -> object:
+        if request.path.name == "b-north-1.mcap":
+            raise KeyError("nobody has thought of it")
+        return identify(request)
+
+    monkeypatch.setattr(module, "Here", breaking)
+    told = backfill(plan, HereTasks(), 2, shown)
+    assert told.swapped == 2
+    assert any("b-north-1.mcap: unexpected KeyError: 'nobody has thought of it'" in one for one in told.problems)
 
 
 def test_what_was_there_is_replaced_and_other_times_stay(

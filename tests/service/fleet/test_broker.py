@@ -91,12 +91,14 @@ async def until(
 ) -> None:
     stopping = asyncio.Event()
     broker = await open_broker()
-    task = asyncio.create_task(consume(broker, ingest, stopping, counts))
+    turns: list[int] = []
+    task = asyncio.create_task(consume(broker, ingest, stopping, counts, lambda: turns.append(1)))
     deadline = time.monotonic() + 30
     while not ends() and time.monotonic() < deadline:
         await asyncio.sleep(0.02)
     stopping.set()
     await task
+    assert turns  # a probe sees that it lives
     await broker.close()
 
 

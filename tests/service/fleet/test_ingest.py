@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sqlalchemy import event
 
 from sprung.model.system import System
 from sprung.service.compute import Compute
@@ -17,6 +18,7 @@ from sprung.service.fleet.ingest import Ingest, due_windows
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
+from sprung.service.store.status import Wanted, fleet_page
 from sprung.service.store.windows import known_windows
 from sprung.service.times import NANOSECONDS
 from tests.service_fakes import HOP, START, make_window
@@ -86,6 +88,30 @@ def test_messages_sent_twice_and_in_any_order_come_to_the_same(
     ingest.sweep()
     assert pipeline.state("north-1").to_dict() == alone(engine, tmp_path_factory, sent)
     assert ingest.sweep() == 0
+
+
+def test_many_vehicles_are_folded_with_the_statements_of_one(
+    engine: Engine, system: System, pipeline: Pipeline, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """And come to the same as each alone, two messages of one vehicle among them."""
+    ingest = Ingest(pipeline, 0.0, Clock())
+    one = messages(engine, system, 24, 4)
+    names = [f"north-{number}" for number in range(12)]
+    statements: list[str] = []
+    event.listen(pipeline.store.engine, "before_cursor_execute", lambda *told: statements.append(told[2]))
+    counts = []
+    for some in (["north-0"], names):
+        for message in one[:4] if some == names else one[:2]:
+            statements.clear()
+            ingest.take([replace(message, vehicle=name) for name in some])
+            counts.append(len(statements))
+    assert counts[-1] <= counts[1] + 2  # of one vehicle that is known, and of twelve
+    ingest.take([replace(message, vehicle=name) for message in one[4:] for name in names])
+    expected = alone(engine, tmp_path_factory, one)
+    assert all(pipeline.state(name).to_dict() == expected for name in names)
+    with pipeline.store.read() as connection:
+        lines = {row.id: row.windows for row in fleet_page(connection, Wanted(), "id", 50)}
+    assert lines.keys() == set(names) and all(sum(counted.values()) >= 24 for counted in lines.values())
 
 
 def test_what_is_told_of_a_message(engine: Engine, system: System, pipeline: Pipeline) -> None:
