@@ -27,7 +27,7 @@ from sprung.service.compute import Compute
 from sprung.service.errors import UserError
 from sprung.service.feed import feed_file
 from sprung.service.fleet import local_postgres as postgres
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, list_files, opened_store
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, list_recordings, opened_store
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.spool import Spool
 from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
@@ -131,7 +131,7 @@ def replay_in_order(settings: Settings, place: Path) -> None:
     with opened_store(settings) as store:
         compute = Compute(4)
         pipeline = Pipeline(engine, store, compute)
-        for file in list_files(str(place)):
+        for file in list_recordings(str(place)):
             feed_file(pipeline, Path(file.path))
         compute.close()
 

@@ -86,6 +86,7 @@ def run(
         sending = Sending(spool, link)
         onboard = Onboard(engine, name, spool, rates)
         sending.start()
+        stack.callback(sending.stop)  # whatever ends it: the spool is closed next
         if files:
             _from_files(onboard, engine, files, name, speed, sending)
         else:

@@ -19,7 +19,7 @@ from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.fleet import ray_serving
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings
 from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import open_kafka
@@ -52,14 +52,19 @@ def run_backfill(
     plan = BackfillPlan(
         settings_with(options), _place(place), _time("--since", since, 0), _time("--until", until, FOREVER)
     )
+    if plan.since >= plan.until:
+        raise UserError(f"--until {until}: is not after --since {since}")
+    list_recordings(plan.place)  # told before anything is started
     started = time.perf_counter()
 
     def show(file: FoldedFile, done: int, of: int) -> None:
         if json_lines:
             told = {"file": file.file.path, "vehicle": file.file.vehicle, "windows": file.windows}
-            print(json.dumps(told | {"problem": file.problem, "before": file.before}), flush=True)
+            told |= {"known": file.known, "problem": file.problem, "before": file.before}
+            print(json.dumps(told), flush=True)
         else:
-            said = "done before" if file.before else file.problem or f"{file.windows} windows"
+            known = f", {file.known} known from another recording" if file.known else ""
+            said = "done before" if file.before else file.problem or f"{file.windows} windows{known}"
             print(f"{done}/{of} {file.file.path} ({file.file.vehicle}): {said}", flush=True)
 
     tasks = tasks_for(_on(on), workers)
@@ -83,6 +88,7 @@ def run_backfill(
 def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, workers: int | None, json_lines: bool) -> int:
     """Diagnose many; 1 when one is not consistent, or cannot be diagnosed."""
     settings, started = settings_with(options), time.perf_counter()
+    list_recordings(_place(place))  # told before anything is started
     tasks = tasks_for(_on(on), workers)
     verdicts: Counter[str] = Counter()
     before, problems = 0, []

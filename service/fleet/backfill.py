@@ -89,6 +89,7 @@ class FoldedFile:
 
     file: FoundFile
     windows: int = 0
+    known: int = 0  # that were there before, as from a copy of the same recording
     incomplete: bool = False
     problem: str = ""
     before: bool = False  # it was done in an earlier run
@@ -111,12 +112,10 @@ OnFile = Callable[[FoldedFile, int, int], None]  # with how many are done, of ho
 
 def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> Backfilled:
     """Do it all; what cannot be read is collected, everything else goes on."""
-    found = list_files(plan.place)
-    if not found:
-        raise UserError(f"{plan.place}: no recordings ({' '.join(KINDS)})")
+    found = list_recordings(plan.place)
     looked = [tasks.result(one) for one in [tasks.submit(look, plan, file) for file in found]]
     told = Backfilled(files=len(found))
-    told.problems += [f"{file.path}: {file.problem}" for file in looked if file.problem]
+    told.problems += [_of_file(file, file.problem) for file in looked if file.problem]
     files = sorted((f for f in looked if not f.problem), key=lambda f: (f.first_ns, f.vehicle, f.path))
     with opened_store(plan.settings) as store, store.read() as connection:
         rows = {file.id: work.get_recording(connection, _row_id(plan, file)) for file in files}
@@ -137,7 +136,7 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
             done += 1
             told.windows += folded.windows
             if folded.problem:
-                told.problems.append(f"{folded.file.path}: {folded.problem}")
+                told.problems.append(_of_file(folded.file, folded.problem))
             on_file(folded, done, len(files))
 
     for file in files:
@@ -158,8 +157,15 @@ def backfill(plan: BackfillPlan, tasks: Tasks, cores: int, on_file: OnFile) -> B
     return told
 
 
-def list_files(place: str) -> list[FoundFile]:
-    """Recordings in a folder and those below it.  Raises UserError for a place that cannot be listed."""
+def list_recordings(place: str) -> list[FoundFile]:
+    """Recordings in a folder and those below it.  Raises UserError for a place that has none or cannot be listed."""
+    found = _list_files(place)
+    if not found:
+        raise UserError(f"{place}: no recordings ({' '.join(KINDS)})")
+    return found
+
+
+def _list_files(place: str) -> list[FoundFile]:
     if "://" not in place:
         folder = Path(place)
         if not folder.is_dir():
@@ -241,7 +247,7 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
 
 def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | None) -> FoldedFile:
     """Fold a file's estimates into its vehicle's tracker, after those of the file `before`."""
-    count = 0
+    count, known = 0, 0
     with staging_pipeline(plan) as pipeline:
         row = RecordingRow(
             _row_id(plan, found.file),
@@ -267,13 +273,14 @@ def fold_file(plan: BackfillPlan, found: IdentifiedFile, before: FoldedFile | No
                     connection, found.file.vehicle, windows, [w.estimate for w in message.windows], row.id
                 )
             pipeline.settle(folded)
-            count += len(windows)
+            count += len(folded.batch.fresh)
+            known += len(windows) - len(folded.batch.fresh)
         if not found.problem or found.messages:
             with pipeline.store.write() as connection:
                 tally = {"windows": count, "incomplete": found.incomplete, "problem": found.problem}
-                vehicle = found.file.vehicle if count else None
+                vehicle = found.file.vehicle if count or known else None
                 work.finish_recording(connection, row.id, vehicle, tally, now_ns())
-    return FoldedFile(found.file, count, found.incomplete, found.problem)
+    return FoldedFile(found.file, count, known, found.incomplete, found.problem)
 
 
 def swap_vehicle(plan: BackfillPlan, vehicle: str) -> bool:
@@ -349,6 +356,10 @@ def _row_id(plan: BackfillPlan, file: FoundFile) -> str:
     """One row a file, back-fill and model."""
     key = f"{file.id} {plan.name} {engine_of(plan.settings).digest}"
     return hashlib.sha256(key.encode()).hexdigest()[:36]
+
+
+def _of_file(file: FoundFile, problem: str) -> str:
+    return problem if problem.startswith(file.path) else f"{file.path}: {problem}"  # readers mostly say whose it is
 
 
 def told_of(error: Exception) -> str:

@@ -58,12 +58,14 @@ class KafkaDelivery:
 
 async def open_kafka(address: str) -> KafkaBroker:
     """The consumer group `sprung-fold` of a topic, kafka://HOST:PORT/TOPIC.  Raises UserError."""
+    parts = urlsplit(address)
+    if not parts.hostname:
+        raise UserError(f"{address}: give an address as in kafka://HOST:9092/TOPIC")
     try:
         from aiokafka import AIOKafkaConsumer
         from aiokafka.errors import KafkaError
     except ModuleNotFoundError as error:
         raise UserError("Kafka needs aiokafka: pip install aiokafka") from error
-    parts = urlsplit(address)
     consumer = AIOKafkaConsumer(
         parts.path.strip("/") or "sprung.estimates",
         bootstrap_servers=parts.netloc,

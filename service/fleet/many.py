@@ -15,7 +15,7 @@ from sprung.service.diagnosing import run
 from sprung.service.diagnosis_task import DiagnosisRequest
 from sprung.service.durable import sync_file
 from sprung.service.errors import UserError
-from sprung.service.fleet.backfill import KINDS, FoundFile, list_files, local_copy, told_of
+from sprung.service.fleet.backfill import FoundFile, list_recordings, local_copy, told_of
 from sprung.service.fleet.tasks import Tasks, WorkLost
 from sprung.service.settings import Settings
 
@@ -52,9 +52,7 @@ def diagnose_many(
     Each recording with the number of all, in the order of their names, as soon as it and those before it are done.
     Raises UserError for a place, a system file or a folder that cannot be used.
     """
-    found = list_files(place)
-    if not found:
-        raise UserError(f"{place}: no recordings ({' '.join(KINDS)})")
+    found = list_recordings(place)
     system = load_system(settings.system or MANCHESTER)  # told once, not once a recording
     if out.exists() and not out.is_dir():
         raise UserError(f"{out}: is no folder")

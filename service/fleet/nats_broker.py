@@ -12,6 +12,7 @@ from sprung.service.fleet.broker import AGAIN_SECONDS, TOGETHER, BrokerMessage
 from sprung.service.fleet.sending import Answer
 from sprung.service.fleet.spool import SpoolEntry
 
+FIRST_ANSWER_SECONDS = 15.0
 SUBJECT = "sprung.estimates"
 STREAM = "SPRUNG"
 DURABLE = "sprung-fold"
@@ -129,10 +130,13 @@ async def _connected(servers: str) -> Any:
     async def quiet(_error: Exception) -> None:
         """Reconnecting says it."""
 
-    try:
-        return await nats.connect(servers, max_reconnect_attempts=-1, error_cb=quiet, connect_timeout=5)
+    connecting = nats.connect(servers, max_reconnect_attempts=-1, error_cb=quiet, connect_timeout=5)
+    try:  # later it connects again however long it takes; now an address may be wrong
+        return await asyncio.wait_for(connecting, FIRST_ANSWER_SECONDS)
     except (Error, OSError) as error:
         raise UserError(f"{servers}: no NATS server answers ({type(error).__name__})") from error
+    except ValueError as error:
+        raise UserError(f"{servers}: give an address as in nats://HOST:4222 ({error})") from error
 
 
 async def _ensure_stream(stream: Any) -> None:

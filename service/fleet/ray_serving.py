@@ -23,7 +23,7 @@ from sprung.service.engine import load_engine
 from sprung.service.errors import Busy, UserError
 from sprung.service.fleet.ingest import Ingest, Taken, read_messages
 from sprung.service.fleet.message import Message, SentWindows, WindowEstimate
-from sprung.service.fleet.tasks import OBJECT_STORE_BYTES
+from sprung.service.fleet.tasks import start_ray
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings, settings_with
 from sprung.service.store import open_store
@@ -204,13 +204,7 @@ def start(
     if address:
         ray.init(address=address)
     else:
-        ray.init(
-            num_cpus=cores,
-            object_store_memory=OBJECT_STORE_BYTES,
-            include_dashboard=False,
-            log_to_driver=False,
-            configure_logging=False,
-        )
+        start_ray(cores)
     serve.start(http_options={"host": host, "port": port})
     serve.run(application(settings, sizes), name=APPLICATION, route_prefix="/")
 

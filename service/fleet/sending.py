@@ -152,10 +152,15 @@ class Sending:
         while self._spool.waiting[0] and not deadline.is_set():
             deadline.wait(0.05)
         timer.cancel()
+        self.stop()
+        return self._spool.waiting[0] == 0
+
+    def stop(self) -> None:
+        """Send nothing more: before the spool is closed.  Waits for an attempt that is under way."""
         self._stopping.set()
         self.wake()
-        self._thread.join()
-        return self._spool.waiting[0] == 0
+        if self._thread.is_alive():
+            self._thread.join()
 
     def _run(self) -> None:
         pause = self._first_pause

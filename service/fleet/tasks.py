@@ -6,6 +6,7 @@ a worker dies, what is moved to disk when memory is short.
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -73,13 +74,7 @@ class RayTasks:
             if self._started and address:
                 ray.init(address=address, log_to_driver=False)
             elif self._started:
-                ray.init(
-                    num_cpus=workers or os.cpu_count(),
-                    object_store_memory=OBJECT_STORE_BYTES,
-                    include_dashboard=False,
-                    log_to_driver=False,
-                    configure_logging=False,
-                )
+                start_ray(workers or os.cpu_count())
         except (ConnectionError, ValueError, RuntimeError) as error:
             raise UserError(f"Ray: {str(error).splitlines()[0]}") from error
         self.name = f"Ray, {ray.cluster_resources().get('CPU', 0):.0f} cores"
@@ -107,6 +102,20 @@ class RayTasks:
         """Stop a Ray that was started here."""
         if self._started:
             self._ray.shutdown()
+
+
+def start_ray(cores: int | None) -> None:
+    """A Ray of this process on this machine, that says nothing of itself; `cores`: default all."""
+    import ray
+
+    logging.getLogger("ray").setLevel(logging.ERROR)
+    ray.init(
+        num_cpus=cores,
+        object_store_memory=OBJECT_STORE_BYTES,
+        include_dashboard=False,
+        log_to_driver=False,
+        configure_logging=False,
+    )
 
 
 def ray_installed() -> bool:

@@ -11,6 +11,7 @@ import pytest
 from sprung.model.system import System
 from sprung.replay.writing import write_recording
 from sprung.service.cli import main
+from sprung.service.fleet import nats_broker
 
 SECONDS = 4
 
@@ -42,3 +43,35 @@ def test_a_backfill_without_ray_reads_stores_and_goes_on(
     (place / "broken.mcap").write_bytes(b"no recording")
     assert main(command) == 1
     assert "broken.mcap" in json.loads(capsys.readouterr().out.splitlines()[-1])["summary"]["problems"][0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ("fleet backfill {0}/nowhere --on ray", "nowhere: no such folder"),  # Ray is not started for it
+        ("fleet diagnose {0}/nowhere --on ray --out {0}/out", "nowhere: no such folder"),
+        ("fleet backfill {0} --since 2026-03-01T00:00:00Z --until 2026-02-01T00:00:00Z", "is not after --since"),
+        ("fleet backfill {0} --since yesterday", "--since yesterday: give an RFC 3339 time"),
+        ("fleet backfill {0} --on moon", "--on moon: known are here, ray, auto"),
+        ("fleet diagnose {0} --on here --out {0}/a.mcap", "a.mcap: is no folder"),
+        ("fleet consume http://127.0.0.1", "give nats://HOST:PORT or kafka://HOST:PORT/TOPIC"),
+        ("fleet consume nats://127.0.0.1:1", "no NATS server answers"),
+        ("fleet consume kafka:///topic", "give an address as in kafka://HOST:9092/TOPIC"),
+        ("edge --can nothing --server http://127.0.0.1:1", "give INTERFACE:CHANNEL"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    arguments: str,
+    told: str,
+    place: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path / "data"))
+    monkeypatch.setattr(nats_broker, "FIRST_ANSWER_SECONDS", 0.3)
+    assert main(arguments.format(place).split()) == 2
+    captured = capsys.readouterr()
+    assert told in captured.err
+    assert "Traceback" not in captured.err
+    assert len(captured.err.splitlines()) == 1 and captured.out == ""

@@ -14,7 +14,7 @@ from sprung.replay.writing import write_recording
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet import backfill as module
-from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_files, local_copy
+from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings, local_copy
 from sprung.service.fleet.tasks import HereTasks
 from sprung.service.settings import Settings
 from sprung.service.store import Store, history
@@ -64,7 +64,7 @@ def s3(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
 
 def test_an_address_of_files_is_listed_and_read(system: System, tmp_path: Path) -> None:
     place = made(system, tmp_path / "recordings")
-    found = list_files(place.as_uri())
+    found = list_recordings(place.as_uri())
     assert [Path(file.path).name for file in found] == ["0.mcap", "1.mcap"]
     with local_copy(found[0]) as path:
         assert path.read_bytes() == (place / "north" / "0.mcap").read_bytes()
@@ -74,7 +74,7 @@ def test_an_address_of_files_is_listed_and_read(system: System, tmp_path: Path) 
 @pytest.mark.parametrize("place", ["nowhere://bucket/folder", "file:///no/such/folder"])
 def test_an_address_that_cannot_be_listed_is_one_line(place: str) -> None:
     with pytest.raises(UserError, match=place) as caught:
-        list_files(place)
+        list_recordings(place)
     assert "\n" not in str(caught.value)
 
 
