@@ -103,7 +103,8 @@ def filled(folder: Path, vehicles: int, seed: int) -> int:
                     "o" * len(core.engine.system.file.elements),
                     now_ns(),
                 )
-                status.save_status(connection, vehicle, core.pipeline.model_id, 1, stands, Counter(used=1000), now_ns())
+                new = status.NewStatus(vehicle, core.pipeline.model_id, 1, stands, Counter(used=1000))
+                status.save_statuses(connection, [new], now_ns())
         core.pipeline.process(VEHICLE, _windows(core.engine.system, end, rng))
         _add_month(core, end, rng)
     finally:
