@@ -87,7 +87,7 @@ def add_windows(
         for one in found
         for record in one.records
     ]
-    ensure_months(connection, (row["start_ns"] for row in rows))
+    ensure_months(connection, (record.start for one in found for record in one.records))
     insert_new(connection, windows, rows)
 
 
