@@ -19,7 +19,7 @@ OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class TrackerChange:
     """A vehicle whose tracker is another one now."""
 
     vehicle: str
@@ -30,7 +30,7 @@ class Change:
 
 def keep_changes(
     connection: Connection,
-    changes: Sequence[Change],
+    changes: Sequence[TrackerChange],
     now: int,
     on_alarms: OnAlarms | None,
     recording_id: str | None = None,
@@ -54,7 +54,7 @@ def keep_changes(
         keep_statuses(connection, changes, now)
 
 
-def keep_statuses(connection: Connection, changes: Sequence[Change], now: int) -> None:
+def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now: int) -> None:
     """Lines of the fleet's list, with the windows that are new."""
     statuses = []
     for one in changes:

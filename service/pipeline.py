@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
-from sprung.service.changes import Change, OnAlarms, keep_changes, keep_statuses, new_status
+from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
@@ -194,7 +194,7 @@ class Pipeline:
         followed = [self._follow(one, now) for one in asked]
         tracked = time.perf_counter()
         changes = [
-            Change(one.vehicle, after.with_stored(r.start for r in records), records, ran)
+            TrackerChange(one.vehicle, after.with_stored(r.start for r in records), records, ran)
             for one, (records, after, ran) in zip(asked, followed, strict=True)
             if records
         ]
@@ -299,7 +299,7 @@ class Pipeline:
         at = self._current(connection, [vehicle])[vehicle]
         after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
         on_alarms = self._on_alarms if self._shown else None
-        keep_changes(connection, [Change(vehicle, after)], now, on_alarms)
+        keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
         return Batch(vehicle, [], [], 0, after.state, at.served)
 
     def tell(self, batch: Batch) -> None:
@@ -315,7 +315,7 @@ class Pipeline:
             with self.store.write() as connection:
                 fleet.hold_vehicle(connection, vehicle)
                 at = self._current(connection, [vehicle])[vehicle]
-                keep_statuses(connection, [Change(vehicle, at)], self._clock())
+                keep_statuses(connection, [TrackerChange(vehicle, at)], self._clock())
         return len(missing)
 
     def show(self, connection: Connection, vehicle: str) -> None:
