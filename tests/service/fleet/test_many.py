@@ -74,14 +74,14 @@ def test_each_is_told_before_the_next_is_begun(place: Path, diagnosed: list[str]
 
 
 def test_work_that_is_lost_is_a_problem_of_its_recording(place: Path, tmp_path: Path) -> None:
-    class Losing(HereTasks):
+    class LosingAll(HereTasks):
         def submit(self, work: object, *arguments: object) -> object:
             return "pending"
 
         def result(self, pending: object) -> object:
             raise WorkLost("its process ended")
 
-    found = [one for one, _ in diagnose_many(Settings(), str(place), tmp_path / "out", Losing(), 2)]
+    found = [one for one, _ in diagnose_many(Settings(), str(place), tmp_path / "out", LosingAll(), 2)]
     assert [one.problem for one in found] == ["its process ended"] * 3
 
 
