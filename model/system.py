@@ -15,7 +15,7 @@ import numpy as np
 
 from sprung.model.address import Address
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
-from sprung.model.laws.in_place import Follower, Whole, all_in_place
+from sprung.model.laws.in_place import Follower, Whole, all_in_place, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics, assemble
@@ -403,6 +403,7 @@ def checked(system: System, source: str) -> System:
     """Refuse a system that the model cannot treat yet, and one whose sensors miss a whole mode: its parameters could
     not be told from any record."""
     refused = [*placed_laws(system.file, system.catalogue)[1], *unsupported(system.file)]
+    refused = refused or misplaced(system.file, system.mechanics, system.laws)
     if refused:
         raise SystemFileError(f"{source}: {'; '.join(refused)}", tuple(f"{source}: {line}" for line in refused))
     if not system.parameters or not system.bodies:

@@ -49,6 +49,18 @@ def put_in_place(file: SystemFile, mechanics: Mechanics, placed: PlacedLaw) -> M
     return law.modify(mechanics, body, placed.values, variant)
 
 
+def misplaced(file: SystemFile, mechanics: Mechanics, laws: Sequence[PlacedLaw]) -> list[str]:
+    """What is wrong with laws of bodies and of the structure where they are, one line each."""
+    found = []
+    for placed in laws:
+        if isinstance(placed.law, BodyLaw | StructureLaw):
+            try:
+                put_in_place(file, mechanics, placed)
+            except LawError as error:
+                found.append(str(error))
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class Whole:
     """The mechanics with all linear laws."""

@@ -7,6 +7,7 @@ import pytest
 
 from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identifier import UnusableWindow
+from sprung.model.schema import SystemFileError
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System, parse_system
 from tests.strut import road
@@ -88,6 +89,11 @@ def test_a_law_that_is_left_out_is_a_misfit_and_one_that_moved_is_followed() -> 
     weight = np.array([1 / e.covariance[at, at] for e in found])
     mean = float(np.average([e.log_ratio[at] for e in found], weights=weight))
     assert mean == pytest.approx(np.log(7.2 / 8), abs=4 / np.sqrt(weight.sum()) + 0.003)
+
+
+def test_a_variant_that_a_law_does_not_have_is_told_when_the_file_is_read() -> None:
+    with pytest.raises(SystemFileError, match="frame: flexible_mode has no variant 'yaw'; it has bending"):
+        half_car(LAWS["flexible_mode"].replace("bending", "yaw"))
 
 
 def test_what_no_window_can_hold_is_refused_by_name() -> None:
