@@ -16,7 +16,7 @@ PYTEST ?=
 JOBS ?= auto
 
 .DELETE_ON_ERROR:
-.PHONY: lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
+.PHONY: pictures lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
 
 help:
 	@echo "make demo       install, replay a piece of a working day, leave the service running"
@@ -120,6 +120,10 @@ bandit: install-dev
 docs: install-dev
 	$(BIN)/python docs/reference.py
 	$(BIN)/mkdocs build --quiet --strict --site-dir site
+
+# the pictures of docs/pages.md; needs Debian's chromium
+pictures: install-dev
+	SPRUNG_SHOTS=docs/img/pages $(BIN)/python -m pytest -m slow tests/deploy/test_browser.py
 
 bench: install
 	$(BIN)/sprung bench $(NAME)

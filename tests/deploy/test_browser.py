@@ -340,7 +340,7 @@ def kept(page: Any, name: str) -> None:
 
 
 def test_a_morning_on_screen(served: tuple[str, Core], browser: Any, system: System) -> None:
-    """From learning to alarm to acknowledged to relearned, on made windows; test_morning.py has the demo."""
+    """From learning to alarm to acknowledged to repaired and relearned, by hand, on made windows."""
     address, core = served
     page = browser.new_page(viewport={"width": 1400, "height": 900})
 
@@ -354,19 +354,24 @@ def test_a_morning_on_screen(served: tuple[str, Core], browser: Any, system: Sys
 
     ride(0, 20)
     assert "learning" in page.inner_text("main").lower()
+    kept(page, "morning-1-learning")
     ride(20, 60)
     ride(80, 60, 0.3)
     assert "out of specification" in page.inner_text("h1")
+    kept(page, "morning-2-alarm")
     page.get_by_role("button", name="Acknowledge").first.click()
     page.wait_for_timeout(400)
     page.locator("dialog[open] button.first").click()
     page.wait_for_timeout(1500)
     page.reload()
     assert "Acknowledged by local" in page.inner_text("#summary")
+    kept(page, "morning-3-acknowledged")
     page.get_by_role("button", name="Mark maintenance").click()
     page.fill("dialog[open] textarea", "dampers exchanged on track 4")
+    kept(page, "morning-4-maintenance")
     page.locator("dialog[open] button.first").click()
     page.wait_for_timeout(1500)
     ride(140, 90, 0.3)
     assert "dampers exchanged" in page.inner_text("main") and "out of specification" not in page.inner_text("h1")
+    kept(page, "morning-5-relearned")
     page.close()
