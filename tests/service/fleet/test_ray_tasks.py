@@ -5,22 +5,16 @@ from __future__ import annotations
 import pytest
 
 from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
-
-
-def _sum(one: int, other: int) -> int:
-    return one + other
-
-
-def _wrong(text: str) -> None:
-    raise ValueError(f"no {text}")
+from sprung.service.times import from_iso, to_iso
 
 
 def _check(tasks: Tasks) -> None:
-    first = tasks.submit(_sum, 1, 2)
-    assert tasks.result(tasks.submit(_sum, first, 4)) == 7
+    """Work of a module that every worker can import."""
+    first = tasks.submit(from_iso, "2026-03-01T00:00:00Z")
+    assert tasks.result(tasks.submit(to_iso, first)) == "2026-03-01T00:00:00.000Z"
     with pytest.raises(ValueError) as caught:
-        tasks.result(tasks.submit(_wrong, "good"))
-    assert str(caught.value) == "no good"
+        tasks.result(tasks.submit(from_iso, "good"))
+    assert str(caught.value) == "Invalid isoformat string: 'good'"
 
 
 def test_work_is_done_here() -> None:
