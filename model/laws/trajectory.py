@@ -73,7 +73,8 @@ def recall(
     p = tuple(_column(value) for value in p)
     element = SpringDamper(_column(element.stiffness), _column(element.damping))
     shape = np.broadcast_shapes(np.shape(deflection)[:-1], *[np.shape(v) for v in (*p, *element)])
-    p, element = tuple(_number(value) for value in p), SpringDamper(*(_number(value) for value in element))
+    if law.memory == 1:  # decays of several states need the shape of their values
+        p, element = tuple(_number(value) for value in p), SpringDamper(*(_number(value) for value in element))
     d = np.moveaxis(np.broadcast_to(deflection, (*shape, len(time))), -1, 0)
     v = np.moveaxis(np.broadcast_to(rate, (*shape, len(time))), -1, 0)
     d_half = 0.5 * (d[1:] + d[:-1]) + h / 8 * (v[:-1] - v[1:])
