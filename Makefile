@@ -123,7 +123,7 @@ docs: install-dev
 
 # the pictures of docs/pages.md; needs Debian's chromium
 pictures: install-dev
-	SPRUNG_SHOTS=docs/img/pages $(BIN)/python -m pytest -m slow tests/deploy/test_browser.py
+	SPRUNG_SHOTS=docs/img/pages $(BIN)/python -m pytest -m slow tests/deploy/test_browser.py tests/deploy/test_morning.py
 
 bench: install
 	$(BIN)/sprung bench $(NAME)

@@ -26,14 +26,16 @@ def demo_command() -> list[str]:
     return [sys.executable, *words[1:]]
 
 
-def made_demo(folder: Path) -> Path:
-    """The recording, which `make demo` may have left."""
+def made_demo(folder: Path, *options: str, faults: bool = True) -> Path:
+    """The recording, which `make demo` may have left; or another one by further options of the generator."""
     words = demo_command()
     left = ROOT / ".demo" / words[words.index("--day") + 1] / f"{VEHICLE}.blf"
-    if left.is_file():
+    if left.is_file() and faults and not options:
         return left
     words[words.index("--out") + 1] = str(folder)
-    subprocess.run(words, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    if not faults:
+        words = [word for before, word in zip(["", *words], words, strict=False) if "--fault" not in (before, word)]
+    subprocess.run([*words, *options], cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
     return folder / left.name
 
 

@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--day", type=float, metavar="SECONDS", help="one recording of a working day instead of a set")
     parser.add_argument("--fault", action="append", default=[], help="of the day: TARGET,AT,REMAINS,OVER")
     parser.add_argument("--clock", type=float, default=5e-3, help="of the day: largest offset of a node's clock, s")
+    parser.add_argument("--later", type=float, default=0.0, metavar="SECONDS", help="of the day: begins so much later")
     given = parser.parse_args()
     vehicle = read_vehicle(given.system)
     if given.day:
@@ -42,7 +43,7 @@ def main() -> None:
         faults = tuple(_fault(parser, text) for text in given.fault)
         given.out.mkdir(parents=True, exist_ok=True)
         service = Service(clock=given.clock, faults=faults)
-        print(write_day(vehicle, service, given.day, given.seed, given.out / f"day.{kind}"))
+        print(write_day(vehicle, service, given.day, given.seed, given.out / f"day.{kind}", given.later))
         return
     kinds = given.kinds.split(",") if given.kinds else None
     formats = tuple(given.formats.split(",")) if given.formats else FORMATS

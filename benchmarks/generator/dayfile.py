@@ -46,12 +46,12 @@ def running_values(timetable: Timetable, time: Array) -> dict[str, Array]:
     return {name: values + RUNNING[name] * rng.normal(size=len(time)) for name, values in at.items()}
 
 
-def write_day(vehicle: Vehicle, service: Service, seconds: float, seed: int, path: Path) -> Path:
-    """Writes the recording and `NAME.truth.json`; returns the truth's path."""
+def write_day(vehicle: Vehicle, service: Service, seconds: float, seed: int, path: Path, later: float = 0.0) -> Path:
+    """Writes the recording, which begins `later` s after START, and `NAME.truth.json`; returns the truth's path."""
     timetable = draw_timetable(vehicle, service, seconds, seed)
     values = np.concatenate(list(run_day(vehicle, timetable)))
     slow = running_values(timetable, np.arange(0, len(values), SLOW) / SAMPLED)
-    {"blf": _write_blf, "mcap": _write_mcap}[path.suffix[1:]](path, vehicle, values, slow)
+    {"blf": _write_blf, "mcap": _write_mcap}[path.suffix[1:]](path, vehicle, values, slow, START + round(later * 1e9))
     truth = path.with_suffix(".truth.json")
     truth.write_text(json.dumps(truth_of(vehicle, timetable), indent=1), encoding="utf-8")
     return truth
@@ -77,7 +77,7 @@ def truth_of(vehicle: Vehicle, timetable: Timetable) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _write_mcap(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Array]) -> None:
+def _write_mcap(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Array], begin: int) -> None:
     """One JSON channel per node and quantity, and one for how the vehicle runs."""
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -91,7 +91,7 @@ def _write_mcap(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Arr
             known = writer.register_schema(title, "jsonschema", json.dumps(schema).encode())
             channels[topic] = writer.register_channel(topic, "json", known)
         for row, sample in enumerate(values.tolist()):
-            time = START + row * PERIOD
+            time = begin + row * PERIOD
             for topic, fields in topics.items():
                 if topic == TOPIC and row % SLOW:
                     continue
@@ -117,7 +117,7 @@ PER_CONTAINER = 2700  # objects, as usual: about 128 kB
 SPREAD = 100_000  # ns between the frames of one sample
 
 
-def _write_blf(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Array]) -> None:
+def _write_blf(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Array], begin: int) -> None:
     """Frames of the bundled database, written in columns: a million of them take a second."""
     database = cantools.database.Database()
     database.add_dbc_file(str(DATABASE))
@@ -130,7 +130,7 @@ def _write_blf(path: Path, vehicle: Vehicle, values: Array, slow: dict[str, Arra
     pieces.append(_frames(database, MESSAGE, named, time))
     every = np.concatenate(pieces)
     every = every[np.argsort(every["time"], kind="stable")]
-    _pack_blf(path, every)
+    _pack_blf(path, every, begin)
 
 
 def _frames(database: Any, message: str, columns: dict[str, Array], time: np.ndarray) -> np.ndarray:
@@ -146,7 +146,7 @@ def _frames(database: Any, message: str, columns: dict[str, Array], time: np.nda
     return out
 
 
-def _pack_blf(path: Path, objects: np.ndarray) -> None:
+def _pack_blf(path: Path, objects: np.ndarray, start: int) -> None:
     """The file: a header, then containers of compressed objects."""
     containers = []
     for first in range(0, len(objects), PER_CONTAINER):
@@ -156,7 +156,7 @@ def _pack_blf(path: Path, objects: np.ndarray) -> None:
         head = struct.pack("<4sHHLL", b"LOBJ", 16, 1, 16 + len(body), BLF_CONTAINER)
         containers.append(head + body + bytes(len(body) % 4))
     inflated = objects.nbytes + 32 * len(containers)
-    begin, end = (_system_time(START + int(objects["time"][at])) for at in (0, -1))
+    begin, end = (_system_time(start + int(objects["time"][at])) for at in (0, -1))
     header = struct.pack(
         "<4sLBBBBBBBBQQLL8H8H", b"LOGG", 144, 5, 0, 0, 0, 2, 6, 8, 1,
         144 + sum(map(len, containers)), inflated + 144, len(objects), 0, *begin, *end,

@@ -23,10 +23,13 @@ from sprung.service.pages.routes import HEALTH
 from sprung.service.pages.states import hints
 from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
+from sprung.service.store.status import FleetRow
+from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.views import ParameterView, VehicleView, alarm_dict, suspected
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50  # alarms, marks, reports
+REPLAYED_NS = 24 * 3600 * NANOSECONDS  # windows that come later than this are of a ride that is played again
 
 
 @router.get("/pages/vehicles/{id}")
@@ -64,6 +67,7 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
             **values,
             health=HEALTH,
             silent=silent,
+            marked_at=_marked_at(row),
             hints=hints(row, view, values["active"], values["reasons"], silent, sensors),
             side=side_view(system, parameters, sensors),
             plan=plan_view(system, parameters),
@@ -72,6 +76,13 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
             data=page_data(system, view, values["alarms"], values["marks"]),
         )
     )
+
+
+def _marked_at(row: FleetRow) -> str:
+    """When a mark is proposed to be; empty: now.  Where a ride of another day is replayed, after its newest window."""
+    if row.last_window_ns is None or row.received_ns - row.last_window_ns < REPLAYED_NS:
+        return ""
+    return to_iso(row.last_window_ns + NANOSECONDS)[:19]
 
 
 def parameter_mark(p: ParameterView) -> Mark:

@@ -62,7 +62,8 @@ const acts = (() => {
     const body = {};
     for (const [name, value] of new FormData(form)) {
       if (name === "which" || name === "parameters" || name === "confirm") continue;
-      body[name] = value;
+      if (name !== "time") body[name] = value;
+      else if (value) body.time = `${value}Z`;
     }
     const which = form.elements.which?.value;
     if (which === "some") body.parameters = [...form.elements.parameters.selectedOptions].map((o) => o.value);
