@@ -14,6 +14,7 @@ from prometheus_client import Histogram
 
 from sprung import __version__
 from sprung.model.signals import Tally
+from sprung.service.alarm_signals import AlarmSignals
 from sprung.service.batching import Batcher
 from sprung.service.board import Board
 from sprung.service.compute import Compute
@@ -62,6 +63,7 @@ class Core:
     jobs: Jobs
     diagnoses: Diagnoses
     diagnosis_jobs: DiagnosisJobs
+    alarm_signals: AlarmSignals
     housekeeping: Housekeeping
     hub: Hub
     condition: Condition
@@ -140,7 +142,8 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     }
     jobs = Jobs(store, kinds, settings.job_queue)
     diagnoses = Diagnoses(settings, store, rings, jobs)
-    listeners += [rides.on_batch, diagnoses.on_batch, hub.on_batch]
+    alarm_signals = AlarmSignals(settings, store, rings)
+    listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
     batcher = Batcher(engine, compute, settings.compute_queue, metrics.observe)
     core = Core(
@@ -155,6 +158,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         jobs,
         diagnoses,
         diagnosis_jobs,
+        alarm_signals,
         housekeeping,
         hub,
         Condition(settings, store),

@@ -100,6 +100,9 @@ class Settings(BaseSettings):
     smtp_user: str | None = None
     smtp_password: str | None = None
 
+    alarm_signals_vehicle: int = Field(default=20, ge=0)  # alarms of one vehicle whose minute of raw signals is kept
+    alarm_signals_bytes: int = Field(default=1_000_000_000, gt=0)  # that those of all vehicles may take
+
     misfit_seconds: float = Field(default=30.0, gt=0)  # windows not fitting for so long start a diagnosis
     misfit_pause_seconds: float = Field(default=3600.0, gt=0)  # before the same vehicle is diagnosed again
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,18 +57,39 @@ def whole_windows(engine: Engine, excerpt: Excerpt | None) -> Iterator[tuple[int
 
 def compare(engine: Engine, start: int, values: FloatArray) -> Compared:
     """Identify one window (T, C) and simulate its sensors; for the thread of the numerics."""
+    return compare_all(engine, [(start, values)])[0]
+
+
+def compare_all(engine: Engine, windows: Sequence[tuple[int, FloatArray]]) -> list[Compared]:
+    """Identify windows, starts and values (T, C), at once and simulate their sensors; as `compare`."""
+    if not windows:
+        return []
     import torch  # as the engine does: it takes a second
 
     from sprung.model.simulate.linear import LinearSimulator
 
-    estimates, _ = engine.identify(values[None], states=True)
-    estimate = estimates[0]
-    assert estimate.states is not None
+    values = np.stack([held for _, held in windows])  # shape (B, T, C)
+    estimates, _ = engine.identify(values, states=True)
     inputs = len(engine.system.inputs)
-    if estimate.outputs is not None:
-        return Compared(start, engine.system.sample_rate, values[:, inputs:], estimate.outputs, estimate)
-    simulator = LinearSimulator(engine.system)
-    drives = torch.as_tensor(simulator.knots(values[None, :, :inputs]))[0]
-    discrete = simulator.discretise(simulator.element_values(torch.as_tensor(estimate.log_ratio)[None]))
-    outputs = torch.as_tensor(estimate.states) @ discrete.C[0].T + drives @ discrete.D[0].T
-    return Compared(start, engine.system.sample_rate, values[:, inputs:], outputs.numpy(), estimate)
+    outputs = [estimate.outputs for estimate in estimates]
+    linear = [i for i, found in enumerate(outputs) if found is None]
+    if linear:
+        simulator = LinearSimulator(engine.system)
+        drives = torch.as_tensor(simulator.knots(values[linear, :, :inputs]))
+        ratios = np.stack([estimates[i].log_ratio for i in linear])
+        discrete = simulator.discretise(simulator.element_values(torch.as_tensor(ratios)))
+        states = torch.as_tensor(np.stack([_states(estimates[i]) for i in linear]))
+        found = states @ discrete.C.transpose(1, 2) + drives @ discrete.D.transpose(1, 2)
+        for i, simulated in zip(linear, found.numpy(), strict=True):
+            outputs[i] = simulated
+    rate = engine.system.sample_rate
+    return [
+        Compared(start, rate, held[:, inputs:], simulated, estimate)
+        for (start, held), simulated, estimate in zip(windows, outputs, estimates, strict=True)
+        if simulated is not None
+    ]
+
+
+def _states(estimate: Estimate) -> FloatArray:
+    assert estimate.states is not None
+    return estimate.states

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -285,6 +286,7 @@ def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
             "vehicle": alarm.vehicle,
             "acknowledged": optional_iso(alarm.acknowledged),
             "acknowledged_by": alarm.acknowledged_by,
+            "bundle": f"/vehicles/{quote(alarm.vehicle or '', safe=':')}/bundle?alarm={alarm.id}",
         }
     return found
 

@@ -130,6 +130,7 @@ EXAMPLES: dict[tuple[str, str], Any] = {
                 "report": None,
                 "acknowledged": None,
                 "acknowledged_by": None,
+                "bundle": "/vehicles/car-17/bundle?alarm=7",
             }
         ],
     },

@@ -2,7 +2,15 @@
 
 from __future__ import annotations
 
+from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+ASKED = "sprung.head"  # in the scope of a request whose answer's body nobody will see
+
+
+def headers_only(request: Request) -> bool:
+    """Whether the body that a route makes would be thrown away: what takes seconds to make is then left out."""
+    return bool(request.scope.get(ASKED))
 
 
 class HeadAsGet:
@@ -16,7 +24,7 @@ class HeadAsGet:
             await self.app(scope, receive, send)
             return
 
-        async def headers_only(message: Message) -> None:
+        async def without_body(message: Message) -> None:
             if message["type"] == "http.response.start":
                 await send(message)
                 await send({"type": "http.response.body", "body": b"", "more_body": False})
@@ -24,4 +32,4 @@ class HeadAsGet:
         async def gone() -> Message:
             return {"type": "http.disconnect"}
 
-        await self.app(dict(scope) | {"method": "GET"}, gone, headers_only)
+        await self.app(dict(scope) | {"method": "GET", ASKED: True}, gone, without_body)

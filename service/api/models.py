@@ -167,6 +167,7 @@ class AlarmAnswer(BaseModel):
     report: str | None = Field(default=None, description="mismatch report that belongs to it")
     acknowledged: str | None = None
     acknowledged_by: str | None = None
+    bundle: str | None = Field(default=None, description="the signals around it, as one MCAP file")
 
 
 class WindowCounts(BaseModel):

@@ -4,31 +4,37 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Sequence
-from typing import Any
+from functools import partial
+from typing import Annotated, Any
 
 import numpy as np
-from fastapi import APIRouter
+from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
+from sprung.service import alarm_signals
+from sprung.service.alarm_signals import Stretch
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
+from sprung.service.api.head import headers_only
 from sprung.service.api.queries import FOREVER, Id
 from sprung.service.compute import Priority
 from sprung.service.core import Core
 from sprung.service.engines import ServedModel
+from sprung.service.errors import NotFound
 from sprung.service.export.bundle import BUNDLE_MEDIA, Bundle, bundle
-from sprung.service.simulated import Compared, compare, newest_window, whole_windows
-from sprung.service.store import fleet, history, marks
-from sprung.service.store.fleet import WantedAlarms
+from sprung.service.simulated import Compared, compare, compare_all, newest_window, whole_windows
+from sprung.service.store import fleet, history, marks, work
+from sprung.service.store.fleet import AlarmRow, WantedAlarms
 from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.views import finite
 
 router = APIRouter(tags=["vehicles"])
 DIGITS = 5
-BUNDLE_SECONDS = 3600  # of estimates beside the signals
+BUNDLE_SECONDS = 1800  # of estimates around an alarm, half before and half after it
 BUNDLE_POINTS = 5000
+AT_ONCE = 10  # windows simulated before others have their turn
 
 
 @router.get(
@@ -48,34 +54,123 @@ async def window(core: CoreOf, id_: Id) -> Response:
     response_class=Response,
     responses={200: {"content": {BUNDLE_MEDIA: {"schema": {"type": "string", "format": "binary"}}}}},
 )
-async def vehicle_bundle(core: CoreOf, id_: Id) -> Response:
-    """One MCAP file with JSON schemas: the last minute of raw signals, simulation and residuals, the last hour of
-    estimates, alarms and marks as `foxglove.Log`."""
+async def vehicle_bundle(
+    core: CoreOf,
+    request: Request,
+    id_: Id,
+    alarm: Annotated[
+        int | None, Query(ge=1, le=2**31 - 1, description="one of the vehicle's; else the newest active one")
+    ] = None,
+) -> Response:
+    """One MCAP file with JSON schemas: raw signals, simulation and residuals of the minute in which an alarm was
+    raised, estimates around it, alarms and marks as `foxglove.Log`.
 
-    served = await read(core, lambda connection: _served(core, connection, id_))
+    An event says which stretch the file holds, and why where the alarm's onset is not in it.  Without `alarm` and
+    without signals of an active alarm it is the newest minute.
+    """
 
-    def query(connection: Connection) -> Bundle:
-        key = (id_, served.model_id)
-        newest = history.series(connection, *key, 0, FOREVER, 0, 1)
-        since = int(newest.time[-1]) - BUNDLE_SECONDS * NANOSECONDS if len(newest.time) else 0
-        return Bundle(
+    def query(connection: Connection) -> tuple[ServedModel, Bundle]:
+        served = _served(core, connection, id_)
+        chosen = _alarm(connection, id_, alarm)
+        stretches = [*alarm_signals.kept(connection, id_), *_in_memory(core, id_)]
+        stretch, told = choose(connection, id_, chosen, stretches, newest=alarm is None)
+        return served, Bundle(
             vehicle=id_,
-            series=history.series(connection, *key, since, FOREVER, 1, BUNDLE_POINTS),
+            series=_estimates(core, connection, id_, served, stretch, chosen),
             alarms=fleet.list_alarms(connection, WantedAlarms(id_), 1000),
             marks=marks.list_marks(connection, id_, 1000),
+            stretch=stretch,
+            told=told,
         )
 
-    found = await read(core, query)
-    excerpt = core.diagnoses.excerpt(id_)
+    if headers_only(request):
+        await read(core, lambda connection: (_served(core, connection, id_), _alarm(connection, id_, alarm)))
+        return Response(media_type=BUNDLE_MEDIA, headers=_file_headers(id_, alarm))
+    served, found = await read(core, query)
+    system, excerpt = served.engine.system, None
+    if found.stretch is not None:
+        excerpt = await run_in_threadpool(core.alarm_signals.load, found.stretch, id_, system)
     windows = list(whole_windows(served.engine, excerpt))
+    compared: list[Compared] = []
+    for first in range(0, len(windows), AT_ONCE):  # in parts: windows that come live have their turn between them
+        part = windows[first : first + AT_ONCE]
+        work = core.compute.submit(partial(compare_all, served.engine, part), Priority.REQUEST)
+        compared += await asyncio.wrap_future(work)
+    body = await run_in_threadpool(bundle, served.engine, found, excerpt, compared)
+    return Response(body, media_type=BUNDLE_MEDIA, headers=_file_headers(id_, alarm))
 
-    def compared() -> Sequence[Compared]:
-        return [compare(served.engine, *held) for held in windows]
 
-    work = core.compute.submit(compared, Priority.BATCH)
-    body = await run_in_threadpool(bundle, served.engine, found, excerpt, await asyncio.wrap_future(work))
-    headers = {"Content-Disposition": f'attachment; filename="{id_.replace(":", "_")}.mcap"'}
-    return Response(body, media_type=BUNDLE_MEDIA, headers=headers)
+def _file_headers(vehicle: str, alarm: int | None) -> dict[str, str]:
+    name = vehicle.replace(":", "_") + ("" if alarm is None else f"-alarm-{alarm}")
+    return {"Content-Disposition": f'attachment; filename="{name}.mcap"'}
+
+
+def _alarm(connection: Connection, vehicle: str, number: int | None) -> AlarmRow | None:
+    """The alarm that is asked for, else the newest active one; 404 where the vehicle has no such alarm."""
+    if number is None:
+        return next(iter(fleet.list_alarms(connection, WantedAlarms(vehicle, active=True), 1)), None)
+    found = fleet.list_alarms(connection, WantedAlarms(vehicle, number=number), 1)
+    if not found:
+        raise NotFound(f"vehicle {vehicle} has no alarm {number}")
+    return found[0]
+
+
+def _in_memory(core: Core, vehicle: str) -> list[Stretch]:
+    excerpt = core.diagnoses.excerpt(vehicle)
+    return [] if excerpt is None else [alarm_signals.held(excerpt)]
+
+
+def choose(
+    connection: Connection, vehicle: str, alarm: AlarmRow | None, stretches: Sequence[Stretch], newest: bool
+) -> tuple[Stretch | None, str]:
+    """Which samples a bundle holds, and a sentence that says so.
+
+    newest: whether the newest samples serve where those of the alarm are not kept.
+    """
+    last = next((one for one in stretches if one.recording is None), None)
+    if alarm is None:
+        return last, _of(last, "the newest samples of the vehicle") if last else "no recent samples are held"
+    stretch = alarm_signals.best(stretches, alarm.onset, alarm.opened)
+    what = f"alarm {alarm.id} ({alarm.parameter or 'windows no longer fit the model'})"
+    if stretch is not None and stretch.covers(alarm.onset):
+        return stretch, _of(stretch, f"the onset of {what} at {to_iso(alarm.onset)}")
+    if stretch is not None:
+        told = f"the raising of {what} at {to_iso(alarm.opened)}"
+        gone = f"its onset at {to_iso(alarm.onset)} lies before: samples are held for a minute only"
+        return stretch, f"{_of(stretch, told)}; {gone}"
+    told = f"no raw signals of {what} are kept: it was found in a recording, or they were given up for room or age"
+    source = work.recording_at(connection, vehicle, alarm.onset)
+    if source is not None:
+        there = "whose file is still here" if source.file is not None else "whose file is gone"
+        told += f"; its onset at {to_iso(alarm.onset)} is in the recording {source.name} ({source.id}), {there}"
+    if newest and last is not None:
+        return last, f"{told}; {_of(last, 'the newest samples instead')}"
+    return None, told
+
+
+def _of(stretch: Stretch, what: str) -> str:
+    return f"signals from {to_iso(stretch.start)} to {to_iso(stretch.end)}: {what}"
+
+
+def _estimates(
+    core: Core,
+    connection: Connection,
+    vehicle: str,
+    served: ServedModel,
+    stretch: Stretch | None,
+    alarm: AlarmRow | None,
+) -> history.Series:
+    """Estimates around an alarm, else up to the newest: single windows where they are still stored."""
+    key = (vehicle, served.model_id)
+    around = round(BUNDLE_SECONDS / 2 * NANOSECONDS)
+    times = [] if alarm is None else [alarm.onset, alarm.opened]
+    times += [] if stretch is None else [stretch.start, stretch.end]
+    if not times:
+        times = history.series(connection, *key, 0, FOREVER, 0, 1).time.tolist() or [0]
+    since, until = max(0, min(times) - around), max(times) + around
+    step = history.fitting_resolution(connection, *key, since, until, BUNDLE_POINTS)
+    older = history.older_windows(core.archive, vehicle, served.engine.digest)
+    return history.series(connection, *key, since, until, step, BUNDLE_POINTS, older)
 
 
 def _served(core: Core, connection: Connection, vehicle: str) -> ServedModel:

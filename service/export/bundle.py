@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sprung.service.alarm_signals import Stretch
 from sprung.service.engine import Engine
 from sprung.service.export.messages import COMPARED, ESTIMATE, FIT, SIGNAL, McapSink
 from sprung.service.export.tables import estimate, values_of
@@ -30,6 +31,8 @@ class Bundle:
     series: Series
     alarms: Sequence[AlarmRow]
     marks: Sequence[MarkRow]
+    stretch: Stretch | None  # whose samples the file holds
+    told: str  # which they are, and why
 
 
 def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> bytes:
@@ -46,11 +49,25 @@ def bundle(engine: Engine, found: Bundle, excerpt: Excerpt | None, windows: Sequ
             topic = f"/estimate/{parameter.element}/{parameter.quantity}"
             for i in np.flatnonzero(np.isfinite(value)).tolist():
                 file.write(topic, ESTIMATE, int(found.series.time[i]), estimate(value[i], std[i], parameter.nominal))
+        _told(file, found, excerpt, windows)
         for alarm in found.alarms:
             _alarm(file, alarm)
         for mark in found.marks:
             file.event(mark.time_ns, INFO, mark.kind, f"{mark.text} ({mark.author})")
     return sink.getvalue()
+
+
+def _told(file: McapSink, found: Bundle, excerpt: Excerpt | None, windows: Sequence[Compared]) -> None:
+    """An event that says what the file holds and what it lacks."""
+    text, level = found.told, INFO
+    if excerpt is None:
+        level = WARNING
+        if found.stretch is not None:
+            text += "; they could not be read, or other channels were measured then: this file has none of them"
+    elif not windows:
+        text += "; none of their windows is whole, or nothing drives the model: there is no simulation to compare"
+    last = found.series.time[-1] if len(found.series.time) else 0
+    file.event(int(last) if found.stretch is None else found.stretch.end, level, "bundle", text)
 
 
 def _signals(file: McapSink, engine: Engine, excerpt: Excerpt) -> None:

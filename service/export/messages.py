@@ -48,6 +48,9 @@ EVENT = Schema(  # foxglove.Log, so that viewers list it: level 2 info, 3 warnin
 )
 
 
+_ENCODER = json.JSONEncoder(allow_nan=False)  # made once: `json.dumps` with options makes one a message
+
+
 class McapSink:
     """Writes messages; one topic has one schema."""
 
@@ -75,7 +78,7 @@ class McapSink:
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[schema.name])
         self._sequence += 1
-        data = json.dumps(message, allow_nan=False).encode()
+        data = _ENCODER.encode(message).encode()
         self._writer.add_message(self._channels[topic], time, data, time, self._sequence)
 
     def event(self, time: int, level: int, name: str, text: str) -> None:

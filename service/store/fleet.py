@@ -237,6 +237,7 @@ class WantedAlarms:
     severity: str | None = None
     kind: str | None = None
     since: int | None = None  # opened at or after, ns
+    number: int | None = None  # its id
 
 
 def list_alarms(
@@ -252,7 +253,12 @@ def list_alarms(
         .order_by(table.c.opened_ns.desc(), table.c.id.desc())
         .limit(limit)
     )
-    for column, value in (("vehicle_id", wanted.vehicle), ("severity", wanted.severity), ("kind", wanted.kind)):
+    for column, value in (
+        ("vehicle_id", wanted.vehicle),
+        ("severity", wanted.severity),
+        ("kind", wanted.kind),
+        ("id", wanted.number),
+    ):
         if value is not None:
             query = query.where(table.c[column] == value)
     if wanted.active:

@@ -18,7 +18,7 @@ from sqlalchemy import Connection, delete, func, select, text, update
 
 from sprung.service.store import partitions
 from sprung.service.store.schema import circumstances, jobs, recordings, rollups, windows
-from sprung.service.store.work import UNFINISHED
+from sprung.service.store.work import ALARM_SOURCE, UNFINISHED
 
 CLOCK_WAS_SET_NS = 1_577_836_800_000_000_000  # 2020: before it, a clock was not set, and says nothing about age
 Keep = Callable[..., Any]  # of a connection and the conditions of windows
@@ -164,6 +164,24 @@ def _surplus_uploads(connection: Connection, limit: int) -> list[str]:
             break
         kept -= row.size_bytes or 0
         surplus.append(row.id)
+    return _release(connection, surplus)
+
+
+def surplus_alarm_signals(connection: Connection, vehicle: str, count: int, limit: int) -> list[str]:
+    """Give up the oldest signals of alarms: of a vehicle those beyond `count`, of all what is beyond `limit` bytes.
+
+    Names of files that the caller deletes.
+    """
+    found = _finished(connection, recordings.c.source == ALARM_SOURCE)
+    own = set(connection.execute(select(recordings.c.id).where(recordings.c.vehicle_id == vehicle)).scalars())
+    surplus = [row.id for row in found if row.id in own][:-count]
+    kept = sum(row.size_bytes or 0 for row in found if row.id not in surplus)
+    for row in found:
+        if kept <= limit:
+            break
+        if row.id not in surplus:
+            kept -= row.size_bytes or 0
+            surplus.append(row.id)
     return _release(connection, surplus)
 
 

@@ -9,8 +9,9 @@ from typing import Any
 
 from sqlalchemy import Connection, Table, func, insert, select, update
 
-from sprung.service.store.schema import jobs, recordings, reports
+from sprung.service.store.schema import jobs, recordings, reports, windows
 
+ALARM_SOURCE = "alarm"  # of recordings: the signals that were kept when an alarm was raised
 UNFINISHED = ("queued", "running")
 DIGITS = 32  # of the SHA-256 of an upload in its file's name
 
@@ -141,6 +142,22 @@ def unfinished_jobs(connection: Connection) -> Sequence[JobRow]:
     return [JobRow(*row) for row in connection.execute(query)]
 
 
+def alarm_recordings(connection: Connection, vehicle: str) -> list[RecordingRow]:
+    """Signals of a vehicle's alarms whose files are kept, newest first."""
+    query = select(recordings).where(
+        recordings.c.vehicle_id == vehicle, recordings.c.source == ALARM_SOURCE, recordings.c.file.is_not(None)
+    )
+    return [RecordingRow(*row) for row in connection.execute(query.order_by(recordings.c.created_ns.desc()))]
+
+
+def recording_at(connection: Connection, vehicle: str, time: int) -> RecordingRow | None:
+    """The recording that the newest window of a vehicle which began before a time came from, if it came from one."""
+    table = windows
+    query = select(table.c.recording_id).where(table.c.vehicle_id == vehicle, table.c.start_ns <= time)
+    found = connection.execute(query.order_by(table.c.start_ns.desc()).limit(1)).scalar()
+    return None if found is None else get_recording(connection, found)
+
+
 def stored_files(connection: Connection) -> set[str]:
     """Names inside the upload folder that recordings refer to."""
     return set(connection.execute(select(recordings.c.file).where(recordings.c.file.is_not(None))).scalars())
@@ -149,7 +166,7 @@ def stored_files(connection: Connection) -> set[str]:
 def stored_bytes(connection: Connection) -> int:
     """Bytes of the uploads and excerpts that are kept."""
     query = select(func.coalesce(func.sum(recordings.c.size_bytes), 0)).where(
-        recordings.c.file.is_not(None), recordings.c.source.in_(("upload", "excerpt"))
+        recordings.c.file.is_not(None), recordings.c.source.in_(("upload", "excerpt", ALARM_SOURCE))
     )
     return int(connection.execute(query).scalar_one())
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jsonschema
@@ -14,9 +16,15 @@ from mcap.reader import make_reader
 from sqlalchemy import select
 
 from sprung.model.system import System, parse_system
-from sprung.service.core import Core
+from sprung.service.api import signals
+from sprung.service.api.app import create_app
+from sprung.service.core import Core, build_core
+from sprung.service.engine import Engine
 from sprung.service.pages.drawing import Mark, plan_view, side_view
+from sprung.service.settings import Settings
+from sprung.service.store import retention
 from sprung.service.store.schema import audit, metadata
+from sprung.service.times import from_iso
 from tests.service_fakes import make_window
 
 
@@ -126,6 +134,67 @@ def test_the_bundle_is_read_by_mcap_itself(client: TestClient, broken: str, syst
     assert topics["/estimate/secondary_2l/damping"] > 50
     assert topics["/events"] >= 3
     assert {"/fit", "/signals/wheel_11l.displacement"} <= set(topics)
+
+
+def logged(content: bytes) -> list[str]:
+    """What the events of a bundle about itself say."""
+    found = make_reader(io.BytesIO(content)).iter_messages(topics=["/events"])
+    bodies = [json.loads(message.data) for _, _, message in found]
+    return [body["message"] for body in bodies if body["name"] == "bundle"]
+
+
+@pytest.fixture
+def brief(engine: Engine, data_dir: Path, system: System) -> Iterator[tuple[TestClient, Core]]:
+    """A service that holds ten seconds of samples, and a vehicle with an alarm that was raised longer ago."""
+    core = build_core(Settings(data_dir=data_dir, ring_seconds=10.0), engine)
+    with TestClient(create_app(core), raise_server_exceptions=False) as client:
+        core.pipeline.process("a", [make_window(system, i) for i in range(80)])
+        for first in range(80, 140, 2):  # as they come live
+            core.pipeline.process("a", [make_window(system, first + i, 0.3) for i in range(2)])
+        yield client, core
+
+
+def test_an_alarms_bundle_holds_its_signals_when_it_is_long_over(
+    brief: tuple[TestClient, Core], system: System
+) -> None:
+    client, core = brief
+    first = client.get("/vehicles/a/alarms").json()["alarms"][-1]
+    assert first["bundle"] == f"/vehicles/a/bundle?alarm={first['id']}"
+    answer = client.get(first["bundle"])
+    assert "alarm-" in answer.headers["content-disposition"]
+    times = [m.log_time for _, _, m in make_reader(io.BytesIO(answer.content)).iter_messages(["/signals/car_1l"])]
+    onset, raised = (from_iso(first[name]) for name in ("onset", "raised"))
+    assert times[0] <= onset <= raised <= times[-1] < make_window(system, 130).start
+    assert ["the onset of alarm" in text for text in logged(answer.content)] == [True]
+    rows = [row for row in client.get("/recordings").json()["recordings"] if row["source"] == "alarm"]
+    files = list(core.settings.uploads.iterdir())
+    assert len(rows) == len(files) == 1, "alarms of one cause share their signals"
+    files[0].unlink()
+    assert ["could not be read" in text for text in logged(client.get(first["bundle"]).content)] == [True]
+    assert client.get("/vehicles/a/bundle?alarm=999").status_code == 404
+    assert client.get("/vehicles/a/bundle?alarm=0").status_code == 422
+
+
+def test_signals_of_alarms_are_bounded_and_go_with_the_vehicle(brief: tuple[TestClient, Core]) -> None:
+    client, core = brief
+    with core.store.write() as connection:
+        assert retention.surplus_alarm_signals(connection, "a", 1, 1_000_000_000) == []
+    files = list(core.settings.uploads.iterdir())
+    assert len(files) == 1
+    with core.store.read() as connection:
+        assert retention.surplus_alarm_signals(connection, "b", 1, 1) == [files[0].name], "more than all may take"
+        connection.rollback()
+    assert client.delete("/vehicles/a?confirm=a").status_code == 204
+    assert list(core.settings.uploads.iterdir()) == []
+
+
+def test_a_bundle_is_not_made_for_its_head(client: TestClient, broken: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "bundle", None)
+    monkeypatch.setattr(signals, "compare_all", None)
+    answer = client.head("/vehicles/a/bundle")
+    assert answer.status_code == 200 and answer.headers["content-disposition"].endswith('"a.mcap"')
+    assert client.head("/vehicles/nobody/bundle").status_code == 404
+    assert client.head("/vehicles/a/bundle?alarm=999").status_code == 404
 
 
 @pytest.mark.parametrize("kind", ["csv", "mcap"])
