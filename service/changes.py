@@ -11,6 +11,7 @@ from sqlalchemy import Connection
 from sprung.service.processed import HeldVehicle
 from sprung.service.store import fleet, history, status
 from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.standing import UNINFORMATIVE
 from sprung.service.store.status import NewStatus
 from sprung.service.store.windows import VehicleWindows, WindowRecord, add_windows
 from sprung.service.views import vehicle_view
@@ -61,12 +62,12 @@ def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now:
         unfitting = [
             record
             for record in one.records
-            if record.outcome != "uninformative" and record.solved is not None and not record.solved.adequate
+            if record.outcome != UNINFORMATIVE and record.solved is not None and not record.solved.adequate
         ]
         counts = Counter(record.outcome for record in one.records)
         counts["unfitting"] = len(unfitting)
-        last = next((record for record in reversed(one.records) if record.solved is not None), None)
-        statuses.append(new_status(one.vehicle, one.after, last, counts))
+        told = (r for r in reversed(one.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
+        statuses.append(new_status(one.vehicle, one.after, next(told, None), counts))
         reasons = [(record.outcome, record.reason, record.start) for record in one.records if record.reason]
         reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
         status.add_reasons(connection, one.vehicle, one.after.served.model_id, reasons)

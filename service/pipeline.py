@@ -22,6 +22,7 @@ from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, Mod
 from sprung.service.store import Store, fleet, status
 from sprung.service.store.circumstances import Ran
 from sprung.service.store.partitions import prepare
+from sprung.service.store.standing import counted
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.views import body_loads, running
@@ -237,11 +238,14 @@ class Pipeline:
             if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
                 posterior = Posterior(*tracker.posterior(followed.state))
             loads = body_loads(at.served.engine, followed.state) if fed else {}
-            ran.append(Ran(window.start, running(system, window, loads)))
+            outcome, reason = outcome_of(window, estimate)
+            stood = counted(outcome, at.served.model_id) if posterior is not None else {}
+            ran.append(Ran(window.start, running(system, window, loads) | stood))
             records.append(
                 WindowRecord(
                     window.start,
-                    *outcome_of(window, estimate),
+                    outcome,
+                    reason,
                     window.repaired_samples,
                     fed,
                     None if estimate is None else Solved.of(estimate),

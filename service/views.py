@@ -18,6 +18,7 @@ from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.tracker import Alarm, TrackerState
 from sprung.service.engine import Engine
 from sprung.service.store.fleet import AlarmRow
+from sprung.service.store.standing import UNINFORMATIVE
 from sprung.service.store.status import Status
 from sprung.service.store.windows import WindowRecord
 from sprung.service.times import optional_iso, to_iso
@@ -100,7 +101,8 @@ class VehicleView:
     def status(self, elements: Sequence[str]) -> Status:
         """The vehicle's line in the list of the fleet; `elements` in the order of the drawing."""
         counts, largest = self.active_by_severity(), self.largest
-        solved = None if self.last is None else self.last.solved
+        told = self.last is not None and self.last.outcome != UNINFORMATIVE  # else the fit before it stands
+        solved = self.last.solved if told and self.last is not None else None
         letters = {name: "." for name in elements}
         for p in self.parameters:
             letters[p.element] = max(letters.get(p.element, "."), _letter(p), key=LETTERS.index)

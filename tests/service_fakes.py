@@ -18,6 +18,7 @@ from sprung.service.worker import Emit
 
 START = 1_790_000_000_000_000_000  # ns
 HOP = 500_000_000  # ns
+STANDING = 9.0  # the level of windows that tell nothing
 
 
 @dataclass
@@ -50,15 +51,17 @@ class FakeIdentifier:
         count, sensors = len(self.system.parameters), len(self.system.sensors)
         mean = np.nan_to_num(window.mean(axis=0))
         log_ratio = np.array([mean[i % len(mean)] for i in range(count)])
+        standing = bool((mean == STANDING).all())
         absent = np.isnan(window[:, -sensors:]).any(axis=0)
         return Estimate(
             log_ratio=log_ratio,
             covariance=self.std**2 * np.eye(count),
             identifiable=np.ones(count, dtype=bool),
-            nrmse=0.03,
+            nrmse=0.49 if standing else 0.03,
             per_sensor=np.where(absent, np.nan, 0.03),
             chi_square=self.chi_square,
             adequate=self.chi_square < 2,
+            informative=not standing,
             converged=True,
             iterations=2,
             states=np.zeros((len(window), 2 * len(self.system.mechanics.dofs))) if states else None,

@@ -47,6 +47,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/vehicles/{id}/{part}"): Need("read", by_fleet=True),
     ("GET", "/vehicles/{id}/models/{version}"): Need("read", by_fleet=True),
     ("GET", "/pages/vehicles/{id}"): Need("read", by_fleet=True),
+    ("GET", "/pages/vehicles/{id}/standing"): Need("read", by_fleet=True),
     ("POST", "/vehicles/{id}/{deed}"): Need("operate", by_fleet=True),
     ("PATCH", "/vehicles/{id}"): Need("operate", by_fleet=True),
     ("DELETE", "/vehicles/{id}"): Need("admin", by_fleet=True),

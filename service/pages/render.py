@@ -32,6 +32,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters |= {"quantity": quantity, "percent": percent, "code": code, "moment": moment, "spoken": spoken}
+    environment.filters["state"] = state
     environment.globals |= {"asset": asset, "signed_in": signed_in.get}
     return environment
 
@@ -66,6 +67,11 @@ def quantity(value: float, unit: str) -> str:
             if abs(value) >= factor:
                 return f"{value / factor:.4g} {prefix}{unit}"
     return f"{value:.4g} {unit}"
+
+
+def state(name: str) -> str:
+    """A state of a parameter or a sensor in one word of people: `good`, never `ok` here and `good` there."""
+    return {"ok": "good", "absent": "no signal"}.get(name, name.replace("_", " "))
 
 
 def percent(share: float | None, digits: int = 1) -> str:

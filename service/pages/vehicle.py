@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter
-from fastapi.responses import HTMLResponse
+from fastapi import APIRouter, Query
+from fastapi.responses import HTMLResponse, Response
 from sqlalchemy import Connection
 
 from sprung.model.system import System
-from sprung.service.api.access import CoreOf, known_vehicle, read
+from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.actions import mark_dict
 from sprung.service.api.fleet import load_view, silent_before
+from sprung.service.api.history import MAX_POINTS, served_by
 from sprung.service.api.lists import report_dict
+from sprung.service.api.queries import FOREVER, Since, Until, time_of
 from sprung.service.api.vehicle_model import models_answer
 from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.pages.drawing import Mark, plan_view, side_view
@@ -23,6 +25,7 @@ from sprung.service.pages.routes import HEALTH
 from sprung.service.pages.states import hints
 from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
+from sprung.service.store.standing import UNINFORMATIVE, standing_points
 from sprung.service.store.status import FleetRow
 from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.views import ParameterView, VehicleView, alarm_dict, suspected
@@ -68,6 +71,7 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
             health=HEALTH,
             silent=silent,
             marked_at=_marked_at(row),
+            standing=view.last is not None and view.last.outcome == UNINFORMATIVE,
             hints=hints(row, view, values["active"], values["reasons"], silent, sensors),
             side=side_view(system, parameters, sensors),
             plan=plan_view(system, parameters),
@@ -83,6 +87,26 @@ def _marked_at(row: FleetRow) -> str:
     if row.last_window_ns is None or row.received_ns - row.last_window_ns < REPLAYED_NS:
         return ""
     return to_iso(row.last_window_ns + NANOSECONDS)[:19]
+
+
+@router.get("/pages/vehicles/{id}/standing")
+async def standing(
+    core: CoreOf,
+    id: str,
+    resolution: Annotated[float, Query(ge=0, le=1e9)] = 0.0,
+    since: Since = None,
+    until: Until = None,
+    model: Annotated[int | None, Query(ge=0, le=2**31 - 1)] = None,
+) -> Response:
+    """Times of the history's points, ms, in which no window told anything: there the page draws no line."""
+    start, end = time_of("since", since, 0), time_of("until", until, FOREVER)
+
+    def query(connection: Connection) -> list[int]:
+        known_vehicle(fleet.vehicle_exists(connection, id), id)
+        served = served_by(core, connection, id, model)
+        return standing_points(connection, id, served.model_id, start, end, resolution, MAX_POINTS)
+
+    return json_response({"time": [point // 1_000_000 for point in await read(core, query)]})
 
 
 def parameter_mark(p: ParameterView) -> Mark:

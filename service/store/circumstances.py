@@ -11,6 +11,7 @@ from sqlalchemy import Connection, select, tuple_
 from sprung.service.store.engine import upsert
 from sprung.service.store.history import LEVELS, NICE
 from sprung.service.store.schema import circumstances
+from sprung.service.store.standing import STANDING
 from sprung.service.store.windows import IN_LIMIT
 from sprung.service.times import NANOSECONDS
 
@@ -78,7 +79,7 @@ def circumstances_between(connection: Connection, vehicle: str, since: int, unti
     merged: dict[int, Means] = {}
     for bucket, means in connection.execute(query):
         _merge(merged.setdefault(bucket // width * width, {}), means)
-    names = dict.fromkeys(name for means in merged.values() for name in means)
+    names = dict.fromkeys(name for means in merged.values() for name in means if not name.startswith(STANDING))
     values: dict[str, list[float | None]] = {
         name: [means[name][1] if name in means else None for means in merged.values()] for name in names
     }

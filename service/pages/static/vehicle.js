@@ -106,10 +106,28 @@
     return [dates ? { ...across, values: DATES } : across, { stroke: style("--soft"), grid, ticks: grid, size: 70 }];
   };
 
-  function draw(names, answer) {
+  const hold = (answer) => Math.max(answer.resolution, data.hop); // s that a point stands for
+
+  function shade(u, still, seconds) {
+    const { ctx } = u;
+    const right = u.bbox.left + u.bbox.width;
+    ctx.save();
+    ctx.fillStyle = style("--line");
+    still.forEach((t) => {
+      const [from, to] = [t, t + seconds].map((x) => Math.min(Math.max(u.valToPos(x, "x", true), u.bbox.left), right));
+      ctx.fillRect(from, u.bbox.top, to - from, u.bbox.height);
+    });
+    ctx.restore();
+  }
+
+  // stood: times in ms of points without a window that told anything; the tracker's belief is no measurement there
+  function draw(names, answer, stood) {
     plots.forEach((plot) => plot.destroy());
     const shown = names.map((name) => ({ name, ...scaled(name, answer.parameters[name]) }));
-    const rows = shown.flatMap((s) => [s.mean, s.high, s.low]);
+    const measured = (row) => row.map((v, i) => (stood.has(answer.time[i]) ? null : v));
+    const rows = shown.flatMap((s) => [s.mean, s.high, s.low].map(measured));
+    const still = answer.time.filter((t) => stood.has(t)).map((t) => t / 1e3);
+    at("stood").hidden = !still.length;
     const time = answer.time.map((t) => t / 1e3);
     const columns = withGaps(time, answer.resolution, [...rows, answer.windows]);
     const width = at("plot").clientWidth;
@@ -125,6 +143,7 @@
       bands.push({ series: [3 * i + 2, 3 * i + 3], fill: i ? "transparent" : style("--band") });
     });
     const hooks = {
+      drawClear: [(u) => shade(u, still, hold(answer))],
       draw: [(u) => lines(u, [{ y: shown[0].baseline, dash: [6, 4] }, { y: shown[0].nominal, dash: [2, 3] }])],
       setSelect: [(u) => {
         if (u.select.width < 5) return;
@@ -208,7 +227,12 @@
     if (answer.status === 422 && at("under")) { at("shown").textContent = "this model has no such parameter"; return; }
     if (!answer.ok) { at("shown").textContent = "the history could not be read"; return; }
     const found = await answer.json();
-    draw(names, found);
+    asked.set("resolution", found.resolution);
+    if (query.has("model")) asked.set("model", query.get("model"));
+    const told = await fetch(`/pages${base}/standing?${asked}`);
+    const stood = new Set(told.ok ? (await told.json()).time : []);
+    if (number !== request) return;
+    draw(names, found, stood);
     if (ran.ok && found.time.length) {
       const ends = range || [found.time[0] / 1e3, found.time.at(-1) / 1e3 + data.hop];
       drawRan(await ran.json(), ...ends);
