@@ -18,7 +18,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from sprung.service.api.problems import ApiProblem, problem_response
+from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, need_of, place_of
 from sprung.service.logs import request_id
 from sprung.service.oidc import Provider, Unreachable, looks_like_jwt
@@ -121,8 +121,9 @@ class Guard:
             self._check_browser(scope, headers, need, by_cookie)
             self._check_scope(actor, need, path)
         except ApiProblem as problem:
-            response = problem_response(problem, path)
-            if problem.status == 401 and _wants_page(headers) and scope["method"] == "GET":
+            page = wants_page(scope["method"], headers)
+            response = problem_page(problem) if page else problem_response(problem, path)
+            if problem.status == 401 and page:
                 response.status_code = 303
                 response.headers["location"] = f"/signin?to={quote(path)}"
             await response(scope, receive, with_headers)
@@ -295,10 +296,6 @@ def _known(method: str) -> str:
 
 def _address(scope: Scope) -> str:
     return scope["client"][0] if scope.get("client") else ""
-
-
-def _wants_page(headers: Headers) -> bool:
-    return "text/html" in headers.get("accept", "")
 
 
 def _unauthorized(detail: str) -> ApiProblem:

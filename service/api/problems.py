@@ -11,7 +11,7 @@ from typing import Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import Response
+from fastapi.responses import HTMLResponse, Response
 from pydantic import ValidationError
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlchemyError
 from sqlalchemy.exc import TimeoutError as PoolTimeout
@@ -20,6 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import Match, Route
 
 from sprung.service.errors import Busy, NoSpace, NotFound, UserError
+from sprung.service.pages.render import render
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
@@ -62,6 +63,22 @@ def problem_response(problem: ApiProblem, instance: str) -> Response:
     return Response(json.dumps(body), problem.status, headers, MEDIA_TYPE)
 
 
+def wants_page(method: str, headers: Mapping[str, str]) -> bool:
+    """Whether a person's browser asks for something to look at; programs, and `fetch` without more, take anything."""
+    accepted = headers.get("accept", "")
+    return method in ("GET", "HEAD") and "text/html" in accepted and "application/json" not in accepted
+
+
+def problem_page(problem: ApiProblem) -> Response:
+    """The same answer for people: what is wrong, and a way back."""
+    title = HTTPStatus(problem.status).phrase
+    return HTMLResponse(
+        render("problem.html", title=title, status=problem.status, detail=problem.detail),
+        problem.status,
+        {"X-Content-Type-Options": "nosniff"} | problem.headers,
+    )
+
+
 def from_validation(error: ValidationError, prefix: str = "") -> ApiProblem:
     """422 that names the fields which are wrong; the values themselves are not repeated."""
     found = error.errors(include_url=False, include_input=False, include_context=False)
@@ -98,6 +115,8 @@ def install(app: FastAPI) -> None:
         problem = _as_problem(error)
         if problem.status == 405:
             problem.headers["Allow"] = ", ".join(_methods(app, request))
+        if wants_page(request.method, request.headers):
+            return problem_page(problem)
         return problem_response(problem, request.url.path)
 
     for kind in (*EXPECTED, Exception):

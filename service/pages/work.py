@@ -13,22 +13,39 @@ from sprung.service.api.access import CoreOf, read
 from sprung.service.api.lists import delivery_dict, report_dict
 from sprung.service.api.recordings import job_dict
 from sprung.service.pages.render import render
+from sprung.service.pages.routes import linker
 from sprung.service.store import fleet, lists
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.views import alarm_dict
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 30
-SHOWN_ALARMS = 200
+PAGE_ALARMS = 50
 
 
 @router.get("/pages/alarms")
-async def alarms_page(core: CoreOf, active: bool = True) -> HTMLResponse:
+async def alarms_page(
+    core: CoreOf, active: bool = True, page: Annotated[int, Query(ge=1, le=100_000)] = 1
+) -> HTMLResponse:
     """Alarms of the fleet, newest first."""
     wanted = WantedAlarms(active=active)
-    rows = await read(core, lambda connection: fleet.list_alarms(connection, wanted, SHOWN_ALARMS + 1))
-    shown = [alarm_dict(row) for row in rows[:SHOWN_ALARMS]]
-    return HTMLResponse(render("alarms.html", alarms=shown, active=active, more=len(rows) > SHOWN_ALARMS))
+
+    def query(connection: Connection) -> tuple[list[fleet.AlarmRow], int]:
+        rows = fleet.list_alarms(connection, wanted, PAGE_ALARMS, offset=(page - 1) * PAGE_ALARMS)
+        return rows, fleet.count_alarms(connection, wanted)
+
+    rows, total = await read(core, query)
+    return HTMLResponse(
+        render(
+            "alarms.html",
+            alarms=[alarm_dict(row) for row in rows],
+            active=active,
+            total=total,
+            page=page,
+            pages=-(-total // PAGE_ALARMS),
+            link=linker("/pages/alarms", {"active": "" if active else "false", "page": page}),
+        )
+    )
 
 
 @router.get("/pages/work")

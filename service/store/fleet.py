@@ -241,18 +241,29 @@ class WantedAlarms:
 
 
 def list_alarms(
-    connection: Connection, wanted: WantedAlarms, limit: int, after: tuple[int, int] | None = None
+    connection: Connection, wanted: WantedAlarms, limit: int, after: tuple[int, int] | None = None, offset: int = 0
 ) -> list[AlarmRow]:
     """Alarms of every model, newest first; `after` holds (opened, id) of the last one of the page before."""
     table = alarms
     names = ("kind", "parameter", "onset_ns", "opened_ns", "closed_ns", "severity", "change", "std", "peak")
     more = ("report_id", "id", "vehicle_id", "acknowledged_ns", "acknowledged_by")
-    query = (
-        select(*(table.c[name] for name in (*names, *more)))
-        .where(table.c.model_id.not_in(staging_models()))
-        .order_by(table.c.opened_ns.desc(), table.c.id.desc())
-        .limit(limit)
-    )
+    query = _asked_for(select(*(table.c[name] for name in (*names, *more))), wanted)
+    query = query.order_by(table.c.opened_ns.desc(), table.c.id.desc()).limit(limit).offset(offset)
+    if after is not None:
+        opened, identity = after
+        same = and_(table.c.opened_ns == opened, table.c.id < identity)
+        query = query.where(or_(table.c.opened_ns < opened, same))
+    return [AlarmRow(row[0], row[1] or None, *row[2:]) for row in connection.execute(query)]
+
+
+def count_alarms(connection: Connection, wanted: WantedAlarms) -> int:
+    """How many alarms `list_alarms` has on all its pages together."""
+    return int(connection.execute(_asked_for(select(func.count()).select_from(alarms), wanted)).scalar_one())
+
+
+def _asked_for(query: Select[Any], wanted: WantedAlarms) -> Select[Any]:
+    table = alarms
+    query = query.where(table.c.model_id.not_in(staging_models()))
     for column, value in (
         ("vehicle_id", wanted.vehicle),
         ("severity", wanted.severity),
@@ -268,11 +279,7 @@ def list_alarms(
         query = query.where(~never if wanted.acknowledged else never)
     if wanted.since is not None:
         query = query.where(table.c.opened_ns >= wanted.since)
-    if after is not None:
-        opened, identity = after
-        same = and_(table.c.opened_ns == opened, table.c.id < identity)
-        query = query.where(or_(table.c.opened_ns < opened, same))
-    return [AlarmRow(row[0], row[1] or None, *row[2:]) for row in connection.execute(query)]
+    return query
 
 
 def acknowledge(connection: Connection, alarm_id: int, actor: str, now: int) -> str | None:
