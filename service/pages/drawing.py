@@ -211,16 +211,17 @@ def _element(name: str, short: str, across: float, head: float, base: float, par
         f"V{cup:.1f}H{x + 8:.1f}V{top + 12:.1f}M{x - 6:.1f},{top + 20:.1f}H{x + 6:.1f}M{x:.1f},{top + 20:.1f}"
         f'V{head:.1f}"/></g>'
         f'<text class="name" x="{across:.1f}" y="{head + 13:.1f}">{escape(short)}</text>'
-        + _said(spring, across - 16, base - (17 if damper.text else 5))
+        + _said(spring, across - 16, base - (17 if damper.text else 5), "upper" if damper.text else "")
         + _said(damper, across + 16, base - 5)
         + "</a>"
     )
 
 
-def _said(mark: Mark, across: float, at: float) -> str:
+def _said(mark: Mark, across: float, at: float, place: str = "") -> str:
     if not mark.text:
         return ""
-    return f'<text class="said {mark.state}" x="{across:.1f}" y="{at:.1f}">{escape(mark.text)}</text>'
+    text = escape(mark.text).replace("%", '<tspan class="unit">%</tspan>')
+    return f'<text class="{f"said {place}".strip()} {mark.state}" x="{across:.1f}" y="{at:.1f}">{text}</text>'
 
 
 def _sensor(name: str, short: str, across: float, top: float, sensors: Mapping[str, Mark]) -> str:

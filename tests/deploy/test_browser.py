@@ -27,7 +27,7 @@ from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.worker import Emit
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
-from tests.service_fakes import REPORT, START, make_window
+from tests.service_fakes import REPORT, STANDING, START, make_window
 
 CHROMIUM = shutil.which("chromium")
 PAGES = {"fleet": "/", "vehicle": "/pages/vehicles/car-17", "work": "/pages/work", "signin": "/signin"}
@@ -107,8 +107,100 @@ def test_pages_stay_at_home_fit_their_screen_and_say_no_error(
     assert answer.status == 200
     assert outside == [] and errors == []
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert cut_off(page) == []
     if folder := os.environ.get("SPRUNG_SHOTS"):
         page.screenshot(path=Path(folder) / f"{name}-{width}-{scheme}.png")
+    context.close()
+
+
+def cut_off(page: Any) -> list[str]:
+    """Cards and tables that hold more than they show, so that one has to scroll inside them."""
+    shown = "[...document.querySelectorAll('.card, table')].filter(e => e.offsetParent)"
+    wider = f"{shown}.filter(e => e.scrollWidth > e.clientWidth + 1)"
+    return list(
+        page.evaluate(f"{wider}.map(e => `${{e.id || e.className}}: ${{e.scrollWidth}} in ${{e.clientWidth}}`)")
+    )
+
+
+@pytest.mark.parametrize("width", [1400, 380])
+@pytest.mark.parametrize("label", ["W" * 60, "a name of many short words " * 4])
+def test_a_long_name_hides_nothing_of_the_fleet(served: tuple[str, Core], browser: Any, label: str, width: int) -> None:
+    address, core = served
+    core.operations.rename("test", "car-18", label)
+    page = browser.new_page(viewport={"width": width, "height": 900})
+    for name in ("fleet", "alarms"):
+        page.goto(address + PAGES[name])
+        assert cut_off(page) == []
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.goto(address)
+    badge = page.locator("tr", has_text=label.strip()).locator(".badge").bounding_box()
+    assert badge["x"] >= 0 and badge["x"] + badge["width"] <= width
+    kept(page, f"longname-{width}-{len(label)}")
+    core.operations.rename("test", "car-18", None)
+    page.close()
+
+
+def test_the_drawing_is_whole_and_readable_on_a_phone(address: str, browser: Any) -> None:
+    page = browser.new_page(viewport={"width": 380, "height": 900})
+    page.goto(address + PAGES["vehicle"])
+    boxes = "[...document.querySelectorAll('#drawing svg text:not(.caption)')].map(e => e.getBoundingClientRect())"
+    labels = page.evaluate(f"{boxes}.map(b => [b.left, b.right, b.top, b.height])")
+    assert len(labels) > 30
+    for left, right, _, height in labels:
+        assert left >= 0 and right <= 380 and height >= 8
+    for kind in (".name", ".sensorname", ".said"):
+        found = page.evaluate(
+            f"{boxes.replace('text:not(.caption)', kind)}.map(b => [b.left, b.right, b.top, b.bottom])"
+        )
+        across = [(a, b) for a in found for b in found if a is not b and abs(a[2] - b[2]) < 1]
+        assert across and all(a[1] <= b[0] or b[1] <= a[0] for a, b in across), kind
+    kept(page, "phone-drawing")
+    page.close()
+
+
+def test_where_a_vehicle_stood_no_line_is_drawn(served: tuple[str, Core], browser: Any, system: System) -> None:
+    address, core = served
+    levels = [*[0.0] * 90, *[STANDING] * 60, *[0.02] * 60]
+    core.pipeline.process("car-21", [make_window(system, i, level) for i, level in enumerate(levels)])
+    page = browser.new_page(viewport={"width": 1400, "height": 900})
+    page.goto(address + PAGES["vehicle"])
+    page.wait_for_function("document.querySelector('#shown').textContent.includes('points')")
+    assert not page.locator("#stood").is_visible()
+    page.goto(f"{address}/pages/vehicles/car-21")
+    page.wait_for_function("document.querySelector('#shown').textContent.includes('points')")
+    assert "standing" in page.inner_text("#stood")
+    pixels = """() => { const c = document.querySelector('#plot canvas'), x = c.getContext('2d');
+        const o = document.querySelector('#plot .u-over').getBoundingClientRect(), b = c.getBoundingClientRect();
+        const ratio = c.width / b.width, at = (share) => [...x.getImageData(
+            ratio * (o.left - b.left + share * o.width), ratio * (o.top - b.top), 1, ratio * o.height).data];
+        const wanted = getComputedStyle(document.documentElement).getPropertyValue('--blue').trim();
+        const rgb = [1, 3, 5].map((i) => parseInt(wanted.slice(i, i + 2), 16));
+        const drawn = (share) => { const d = at(share); let n = 0;
+            for (let i = 0; i < d.length; i += 4) n += rgb.every((v, k) => Math.abs(v - d[i + k]) < 40); return n; };
+        return [0.3, 0.57, 0.85].map(drawn); }"""
+    before, stood, after = page.evaluate(pixels)
+    assert before > 0 and after > 0 and stood == 0
+    kept(page, "standing")
+    page.close()
+    core.operations.remove("test", "car-21")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_the_description_of_the_api_is_dark_where_all_is(address: str, browser: Any, scheme: str) -> None:
+    context = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme=scheme)
+    page = context.new_page()
+    outside: list[str] = []
+    page.on("request", lambda asked: None if asked.url.startswith((address, "data:")) else outside.append(asked.url))
+    page.goto(address + "/docs")
+    page.locator(".opblock").first.wait_for()
+    brightness = "(e => getComputedStyle(e).%s.match(/[\\d.]+/g).slice(0, 3).reduce((a, b) => a + +b, 0) / 3)"
+    for place in (".swagger", ".swagger .swagger-ui"):
+        ground = page.evaluate(f"{brightness % 'backgroundColor'}(document.querySelector('{place}'))")
+        if scheme == "dark":
+            assert ground < 60, place
+    ink = page.evaluate(f"{brightness % 'color'}(document.querySelector('.opblock-summary-description'))")
+    assert (ink > 130) == (scheme == "dark") and outside == []
+    kept(page, f"docs-{scheme}")
     context.close()
 
 
