@@ -24,6 +24,7 @@ from sprung.service.engine import Engine
 from sprung.service.report import write_report
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import Ran, add_circumstances
+from sprung.service.store.schema import fleet_status
 from sprung.service.worker import Emit
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
@@ -127,6 +128,8 @@ def cut_off(page: Any) -> list[str]:
 def test_a_long_name_hides_nothing_of_the_fleet(served: tuple[str, Core], browser: Any, label: str, width: int) -> None:
     address, core = served
     core.operations.rename("test", "car-18", label)
+    with core.store.write() as connection:  # nothing has come for long: the longest that a row can say
+        connection.execute(fleet_status.update().values(received_ns=START))
     page = browser.new_page(viewport={"width": width, "height": 900})
     for name in ("fleet", "alarms"):
         page.goto(address + PAGES[name])
@@ -135,6 +138,7 @@ def test_a_long_name_hides_nothing_of_the_fleet(served: tuple[str, Core], browse
     page.goto(address)
     badge = page.locator("tr", has_text=label.strip()).locator(".badge").bounding_box()
     assert badge["x"] >= 0 and badge["x"] + badge["width"] <= width
+    assert "silent since 2026-" in page.inner_text("table")
     kept(page, f"longname-{width}-{len(label)}")
     core.operations.rename("test", "car-18", None)
     page.close()
