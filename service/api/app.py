@@ -69,6 +69,7 @@ def create_app(
         version=__version__,
         description=DESCRIPTION,
         lifespan=lifespan,
+        openapi_url=None,  # `docs` answers it, with the checks of every other route
         docs_url=None,  # both load scripts from other hosts; `docs` draws a page of its own
         redoc_url=None,
     )

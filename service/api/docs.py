@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import HTMLResponse
+from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
-from sprung.service.pages.render import render
+from sprung.service.pages.render import STATIC, render
 
 router = APIRouter(include_in_schema=False)
 
@@ -17,6 +17,18 @@ async def docs(request: Request) -> HTMLResponse:
     """Every operation with its parameters, bodies and answers."""
     schema = request.app.openapi()
     return HTMLResponse(render("docs.html", info=schema["info"], operations=operations(schema)))
+
+
+@router.get("/openapi.json")
+async def openapi(request: Request) -> JSONResponse:
+    """The description of the API."""
+    return JSONResponse(request.app.openapi())
+
+
+@router.get("/favicon.ico")
+async def icon() -> FileResponse:
+    """What browsers ask for by themselves: the pages' icon."""
+    return FileResponse(STATIC / "icon.svg", media_type="image/svg+xml")
 
 
 def operations(schema: dict[str, Any]) -> list[dict[str, Any]]:

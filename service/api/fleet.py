@@ -41,7 +41,9 @@ async def vehicles(
     wanted = Wanted(q, health, silent_before(core) if silent else None, acknowledged, retired, actor.fleet)
 
     def query(connection: Connection) -> dict[str, Any]:
-        begin = after if after is None or sort != "id" or ":" in after else f":{after}"
+        begin = after
+        if after is not None and sort == "id" and after.startswith(actor.fleet or ""):
+            begin = f":{after}" if fleet.vehicle_exists(connection, after) else after  # an id does as well
         rows = with_cursor(lambda: status.fleet_page(connection, wanted, sort, limit, after=begin))
         return {
             "vehicles": [line(core, row) for row in rows],
@@ -128,4 +130,4 @@ def load_view(core: Core, connection: Connection, vehicle_id: str, served: Serve
 def _next(sort: Sort, rows: list[FleetRow], limit: int) -> str | None:
     if len(rows) < limit:
         return None
-    return rows[-1].id if sort == "id" else status.cursor(sort, rows[-1])
+    return status.cursor(sort, rows[-1])

@@ -34,6 +34,7 @@ AUTO_POINTS = 2000  # where no resolution is asked for
 BAND = 1.96  # standard deviations
 DIGITS = 7  # significant ones in `columns`: far below any standard deviation
 
+FILE_SCHEMA = {"type": "string", "format": "binary"}
 Format = Literal["json", "columns", "csv", "parquet", "mcap"]
 
 
@@ -41,7 +42,7 @@ Format = Literal["json", "columns", "csv", "parquet", "mcap"]
     "/vehicles/{id}/history",
     summary="Parameters over time",
     response_model=models.History | models.Histories | models.ColumnsAnswer,
-    responses={200: {"content": {media: {} for media in MEDIA_TYPES.values()}}},
+    responses={200: {"content": {media: {"schema": FILE_SCHEMA} for media in MEDIA_TYPES.values()}}},
 )
 async def history(
     core: CoreOf,
@@ -65,6 +66,8 @@ async def history(
     One `parameter` gives one history, several give `histories`.
     """
     start, end = time_of("since", since, 0), time_of("until", until, FOREVER)
+    if end <= start:
+        raise wrong_query("until", "is not later than `since`, so there is nothing between them")
     width = resolution_of(resolution)
 
     def query(connection: Connection) -> tuple[Engine, list[str], float, Series, VehicleView]:

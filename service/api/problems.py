@@ -17,7 +17,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError, SQLAlch
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
-from starlette.routing import Match, Route
+from starlette.routing import BaseRoute, Match, Route
 
 from sprung.service.errors import Busy, NoSpace, NotFound, UserError
 from sprung.service.pages.render import render
@@ -125,12 +125,18 @@ def install(app: FastAPI) -> None:
 
 def _methods(app: FastAPI, request: Request) -> list[str]:
     """The methods of all routes at a path: each route by itself tells only its own."""
-    found = {
-        method
-        for route in app.routes
-        if isinstance(route, Route) and route.matches(dict(request.scope))[0] is not Match.NONE
-        for method in route.methods or ()
-    }
+    found: set[str] = set()
+
+    def walk(routes: Sequence[BaseRoute]) -> None:
+        for route in routes:
+            inside = getattr(route, "original_router", None)  # routers stay whole inside the application
+            if inside is not None:
+                walk(inside.routes)
+            elif isinstance(route, Route) and route.matches(dict(request.scope))[0] is not Match.NONE:
+                found.update(route.methods or ())
+
+    walk(app.routes)
+    found = found or {"GET"}  # no route at all: a file of /static
     return sorted(found | ({"HEAD"} if "GET" in found else set()))
 
 
@@ -141,10 +147,7 @@ def _as_problem(error: Exception) -> ApiProblem:
         case HTTPException():
             return ApiProblem(error.status_code, str(error.detail), headers=error.headers)
         case RequestValidationError():
-            errors = [
-                {"field": ".".join(str(part) for part in e["loc"] if part != "body"), "detail": str(e["msg"])}
-                for e in error.errors()[:SHOWN_ERRORS]
-            ]
+            errors = [_fault(e) for e in error.errors()[:SHOWN_ERRORS]]
             return ApiProblem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
         case Busy():
             return ApiProblem(503, str(error), headers={"Retry-After": str(error.retry_after)})
@@ -160,6 +163,15 @@ def _as_problem(error: Exception) -> ApiProblem:
         case _:
             log.error("unexpected error", exc_info=error)
             return ApiProblem(500, "an unexpected error; the service's log has the details")
+
+
+def _fault(error: Mapping[str, Any]) -> dict[str, str]:
+    """A field and what is wrong with it; `body` where it is no field's fault."""
+    if error["type"] == "json_invalid":
+        place = f"is no JSON: {error.get('ctx', {}).get('error', error['msg'])}, character {error['loc'][-1]}"
+        return {"field": "body", "detail": place}
+    field = ".".join(str(part) for part in error["loc"] if part != "body")
+    return {"field": field or "body", "detail": str(error["msg"])}
 
 
 def _resource_problem(error: BaseException) -> ApiProblem | None:

@@ -29,6 +29,9 @@ async def only_known_parameters(request: Request) -> None:
     route = request.scope.get("route")
     if not isinstance(route, APIRoute) or not request.query_params:
         return
+    for name, value in request.query_params.multi_items():
+        if any(ord(sign) < 32 for sign in value):
+            raise wrong_query(name[:100], "holds a control character")
     known = {field.alias for field in route.dependant.query_params}
     wrong = [name for name in request.query_params if name not in known]
     if wrong:

@@ -29,6 +29,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/signin/oidc/callback"): Need(PUBLIC),
     ("POST", "/signout"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),
     ("GET", "/static/{path}"): Need(PUBLIC),
+    ("GET", "/favicon.ico"): Need(PUBLIC),
     ("GET", "/docs"): Need("read", by_fleet=True),
     ("GET", "/openapi.json"): Need("read", by_fleet=True),
     ("POST", "/identify"): Need("ingest", by_fleet=True),

@@ -94,8 +94,8 @@ async def vehicle_bundle(
     compared: list[Compared] = []
     for first in range(0, len(windows), AT_ONCE):  # in parts: windows that come live have their turn between them
         part = windows[first : first + AT_ONCE]
-        work = core.compute.submit(partial(compare_all, served.engine, part), Priority.REQUEST)
-        compared += await asyncio.wrap_future(work)
+        some = core.compute.submit(partial(compare_all, served.engine, part), Priority.REQUEST)
+        compared.extend(await asyncio.wrap_future(some))
     body = await run_in_threadpool(bundle, served.engine, found, excerpt, compared)
     return Response(body, media_type=BUNDLE_MEDIA, headers=_file_headers(id_, alarm))
 

@@ -326,9 +326,13 @@ def _key(sort: Sort) -> ColumnElement[Any] | None:
 
 def _beyond(sort: Sort, after: str) -> ColumnElement[bool]:
     """Rows behind a cursor.  Raises ValueError for what is none."""
-    value, _, identity = after.partition(":")
+    value, colon, identity = after.partition(":")
     column, own = _key(sort), fleet_status.c.vehicle_id
+    if not colon or not identity:
+        raise ValueError(after)
     if column is None:
+        if value:
+            raise ValueError(after)
         return own > identity
     number = float(value) if sort == "drift" else int(value)
     return or_(column < number, and_(column == number, own > identity))

@@ -1,0 +1,64 @@
+"""What is wrong is said: methods, query parameters, cursors, times and bodies."""
+
+from __future__ import annotations
+
+import pytest
+from fastapi.testclient import TestClient
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "allowed"),
+    [
+        ("PUT", "/vehicles/day", "DELETE, GET, HEAD, PATCH"),
+        ("PUT", "/vehicles", "GET, HEAD"),
+        ("GET", "/vehicles/a/notes", "POST"),
+        ("POST", "/openapi.json", "GET, HEAD"),
+        ("POST", "/static/icon.svg", "GET, HEAD"),
+    ],
+)
+def test_a_wrong_method_is_told_the_right_ones(client: TestClient, method: str, path: str, allowed: str) -> None:
+    answer = client.request(method, path)
+    assert answer.status_code == 405 and answer.headers["allow"] == allowed
+
+
+@pytest.mark.parametrize(
+    ("path", "field"),
+    [
+        ("/openapi.json?x=1", "x"),
+        ("/vehicles?after=garbage", "after"),
+        ("/vehicles?after=", "after"),
+        ("/vehicles?after=%00", "after"),
+        ("/vehicles?sort=drift&after=garbage", "after"),
+        ("/vehicles?q=%00", "q"),
+        ("/vehicles/a/history?parameter=primary_11l.stiffness&since=20&until=10", "until"),
+        ("/vehicles/a/history?format=csv&since=20&until=20", "until"),
+    ],
+)
+def test_a_wrong_query_is_refused(client: TestClient, path: str, field: str) -> None:
+    answer = client.get(path)
+    assert answer.status_code == 422 and [error["field"] for error in answer.json()["errors"]] == [field]
+
+
+@pytest.mark.parametrize(("body", "said"), [(b'{"text":', "is no JSON"), (b"[]", "object"), (b"3", "object")])
+def test_a_body_that_is_none_is_told_as_the_body(client: TestClient, body: bytes, said: str) -> None:
+    answer = client.post("/vehicles/a/notes", content=body, headers={"Content-Type": "application/json"})
+    assert answer.status_code == 422
+    (error,) = answer.json()["errors"]
+    assert error["field"] == "body" and said in error["detail"] and answer.json()["detail"].startswith("body: ")
+
+
+def test_a_page_goes_on_from_a_cursor_and_from_an_id(client: TestClient, broken: str) -> None:
+    following = client.get("/vehicles?limit=1").json()["next"]
+    assert client.get("/vehicles", params={"after": following}).json()["vehicles"] == []
+    assert client.get("/vehicles?after=a").json()["vehicles"] == []
+
+
+def test_browsers_find_an_icon(client: TestClient) -> None:
+    answer = client.get("/favicon.ico")
+    assert answer.status_code == 200 and answer.headers["content-type"].startswith("image/svg+xml")
+    assert client.get("/static/icon.svg?v=1").status_code == 200  # files keep a version in their address
+
+
+def test_files_of_the_history_are_described(client: TestClient) -> None:
+    found = client.get("/openapi.json").json()["paths"]["/vehicles/{id}/history"]["get"]["responses"]["200"]["content"]
+    assert all(content["schema"] for content in found.values()) and len(found) >= 4
