@@ -5,8 +5,6 @@ There the tracker goes on with what it believed, so that posteriors alone look a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 from sqlalchemy import Connection, and_, case, func, select
 
 from sprung.service.store.history import LEVELS
@@ -17,7 +15,7 @@ UNINFORMATIVE = "uninformative"
 STANDING = "standing:"  # with a model's number behind it: how windows that told nothing are counted a minute and hour
 
 
-def counted(outcome: str, model_id: int) -> Mapping[str, float]:
+def counted(outcome: str, model_id: int) -> dict[str, float]:
     """What a window adds to its minute and hour in `circumstances`; nothing where it told something."""
     return {f"{STANDING}{model_id}": 1.0} if outcome == UNINFORMATIVE else {}
 
