@@ -95,7 +95,8 @@ async def vehicle_bundle(
     for first in range(0, len(windows), AT_ONCE):  # in parts: windows that come live have their turn between them
         part = windows[first : first + AT_ONCE]
         some = core.compute.submit(partial(compare_all, served.engine, part), Priority.REQUEST)
-        compared.extend(await asyncio.wrap_future(some))
+        simulated = await asyncio.wrap_future(some)
+        compared += simulated
     body = await run_in_threadpool(bundle, served.engine, found, excerpt, compared)
     return Response(body, media_type=BUNDLE_MEDIA, headers=_file_headers(id_, alarm))
 
