@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 from fastapi.testclient import TestClient
 
+from sprung.service.api import models
+
 
 @pytest.mark.parametrize(
     ("method", "path", "allowed"),
@@ -62,3 +64,19 @@ def test_browsers_find_an_icon(client: TestClient) -> None:
 def test_files_of_the_history_are_described(client: TestClient) -> None:
     found = client.get("/openapi.json").json()["paths"]["/vehicles/{id}/history"]["get"]["responses"]["200"]["content"]
     assert all(content["schema"] for content in found.values()) and len(found) >= 4
+
+
+def test_answers_that_clients_are_made_from_have_examples(client: TestClient) -> None:
+    paths = client.get("/openapi.json").json()["paths"]
+    wanted = [
+        ("/ingest/estimates", "post", "200", models.IngestAnswer),
+        ("/fleet/knowledge", "get", "200", models.KnowledgeAnswer),
+        ("/vehicles/{id}/models", "get", "200", models.VehicleModels),
+        ("/reports/{id}", "get", "200", None),
+        ("/tokens", "post", "201", None),
+    ]
+    for path, method, status, model in wanted:
+        example = paths[path][method]["responses"][status]["content"]["application/json"]["example"]
+        assert example, path
+        if model is not None:
+            assert model.model_validate(example).model_dump().keys() == example.keys(), path
