@@ -213,9 +213,11 @@ def quoted(
 ) -> str:
     """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
 
-    before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that.
+    before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that, and so
+    do numbers of stages that this run did not vary.
     """
-    numbers = {
+    stages = {line["stage"] for line in lines}
+    numbers = {name: found for name, found in (before or {}).items() if name.split(".")[0] not in stages} | {
         f"{line['stage']}.{line['number']}": {
             "varied": [line["value"], *line["range"]],
             "recordings": line["recordings"],

@@ -109,3 +109,11 @@ def test_what_is_known_of_more_recordings_stays_while_the_number_is_what_it_was(
     for before, kept in (({"verdict.clear": known}, 8), ({"verdict.clear": other}, 1), ({}, 1)):
         found = json.loads(quoted(lines, done, "quick", before))
         assert found["numbers"]["verdict.clear"]["recordings"] == kept
+
+
+def test_what_is_known_of_stages_that_were_not_varied_stays() -> None:
+    done = [{"recording": "made", "varied": {"verdict.clear": varied("verdict", "clear")}}]
+    lines = [figure(stage, field, done) for stage, field in RULES.constants() if stage == "verdict"]
+    known = {"varied": [1.0, 0.5, 2.0], "recordings": 8, "changes": []}
+    found = json.loads(quoted(lines, done, "quick", {"fit.prior": known, "verdict.gone": known}))
+    assert list(found["numbers"]) == ["fit.prior", "verdict.clear"]
