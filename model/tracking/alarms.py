@@ -119,10 +119,13 @@ class Attribution:
         if "*" in name:
             members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
             still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
-            learning = np.isnan(drift.whole[members]).all()  # all baselines begin anew: nothing is left to compare with
-            if learning or not (still or state.changes.active[members].any()):
+            if np.isnan(drift.whole[members]).all():  # all baselines begin anew: nothing is left to compare with
                 return _closed(alarm, now)
-            return self._followed(alarm, *_common(replace(drift, change=drift.whole), members))
+            change, std = _common(replace(drift, change=drift.whole), members)
+            moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._least_together
+            if not (still or moved):  # one that has changed by itself does not keep the alarm of all open
+                return _closed(alarm, now)
+            return self._followed(alarm, change, std)
         i = self.names.index(name)
         if state.changes.active[i] == 0:
             return _closed(alarm, now)
@@ -225,7 +228,12 @@ class Attribution:
             return False
         middle, std = _common(drift, known)
         with_it = np.array([self._moves_along(i, drift, known) for i in known])
-        return bool(with_it.mean() >= MOST_OF and abs(middle) > max(self.settings.change / 4, 4 * std))
+        return bool(with_it.mean() >= MOST_OF and abs(middle) > max(self._least_together, 4 * std))
+
+    @property
+    def _least_together(self) -> float:
+        """Change that all elements of a kind must show for an alarm of theirs: a middle is surer than one element."""
+        return self.settings.change / 4
 
     def _moves_along(self, i: int, drift: Drift, members: IntArray) -> bool:
         middle, std = _common(drift, members)

@@ -91,6 +91,16 @@ def test_oil_that_leaves_all_dampers_at_once_is_one_message():
     assert state.active[0].change == pytest.approx(-0.12, abs=0.02)
 
 
+def test_a_damper_that_stays_worn_does_not_keep_the_alarm_of_all_open():
+    rng = np.random.default_rng(14)
+    lost, worn = np.zeros(24), np.zeros(24)
+    lost[DAMPERS], worn[13] = np.log(0.88), np.log(0.75)
+    state = day(rng, tracker().initial_state(), 160, lambda k: lost * np.clip((k - 100) / 10, 0, 1), lambda k: None)
+    assert [alarm.parameter for alarm in state.active] == ["*.damping"]
+    state = day(rng, state, 160, lambda k: worn + lost * np.clip((230 - k) / 10, 0, 1), lambda k: None, first=160)
+    assert [alarm.parameter for alarm in state.active] == [NAMES[13]]
+
+
 def test_a_kind_alone_is_named_by_what_its_names_share():
     rng = np.random.default_rng(5)
     lost = np.zeros(24)
