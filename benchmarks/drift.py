@@ -24,7 +24,7 @@ from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System, load_system
-from sprung.model.tracking import changes, misfit, scatter
+from sprung.model.tracking import changes, inflation, misfit
 from sprung.model.tracking.settings import SECONDS_PER_MONTH
 from sprung.model.tracking.tracker import Tracker, TrackerSettings
 from sprung.service.errors import UserError
@@ -93,7 +93,7 @@ class Fleet:
 
     def __init__(self, vehicles: int, parameters: int, settings: TrackerSettings) -> None:
         self.settings = settings
-        self.scatter = scatter.start((vehicles, parameters))
+        self.inflation = inflation.start((vehicles, parameters))
         self.changes = changes.start((vehicles, parameters))
         self.windows = 0
 
@@ -101,12 +101,14 @@ class Fleet:
         """Next window: values (vehicles, P), and the covariance (P, P) of each."""
         variance = np.broadcast_to(np.diag(covariance), value.shape)
         everything = np.ones(value.shape, dtype=bool)
-        self.scatter = scatter.update(self.scatter, value, variance, everything, time=self.windows, window=PER_WINDOW)
+        self.inflation = inflation.update(
+            self.inflation, value, variance, everything, time=self.windows, window=PER_WINDOW
+        )
         share = 1.0 if self.windows == 0 else 1.0 / PER_WINDOW
         self.changes = changes.update(
             self.changes,
             value,
-            variance * self.scatter.inflation / share,
+            variance * self.inflation.factor / share,
             everything,
             seconds=share * self.settings.window,
             time=self.windows,
@@ -176,7 +178,7 @@ def false_alarms(covariances: FloatArray, months: float, rng: np.random.Generato
         opened = (state.active != 0) & (quiet == 0)
         alarms += int(np.count_nonzero(opened))
         quiet = state.active
-        contradictions += int(np.count_nonzero(fleet.scatter.square.max(axis=1) >= misfit.CONTRADICTION))
+        contradictions += int(np.count_nonzero(fleet.inflation.square.max(axis=1) >= misfit.CONTRADICTION))
         now = np.maximum(state.up, state.down)
         for i, level in enumerate(NOISE_LEVELS * evidence):
             crossings[i] += np.count_nonzero((now >= level) & (highest < level))

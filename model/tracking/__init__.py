@@ -1,1 +1,1 @@
-"""The pieces of the tracker: filter, scatter, changes, misfit, and the value that holds them."""
+"""The pieces of the tracker: filter, variance inflation, changes, misfit, and the value that holds them."""

@@ -1,4 +1,4 @@
-"""What one window does to what is known of a vehicle: filter, scatter, change tests, weather and deviations in turn.
+"""What one window does to what is known of a vehicle: filter, variance inflation, change tests, weather, deviations.
 
 The tracker decides whether a window may speak; this is what it then says.  docs/tracking.md derives the steps.
 """
@@ -16,7 +16,7 @@ from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking import scatter, surprise
+from sprung.model.tracking import inflation, innovation
 from sprung.model.tracking import weather as weathers
 from sprung.model.tracking.alarms import Drift
 from sprung.model.tracking.cargo import Cargo
@@ -49,8 +49,8 @@ class _Filtered:
     """What the filter makes of a window."""
 
     belief: kalman.Belief
-    measured: scatter.Scatter
-    watch: surprise.Surprise
+    measured: inflation.VarianceInflation
+    watch: innovation.InnovationCusum
     fresh: FloatArray  # variance of what is new in it, (P,)
     plausible: FloatArray  # its values, no further from what was believed than OUTLYING, (P,)
     bounded: bool
@@ -78,7 +78,7 @@ class Fusion:
         centre: int,
         conditions: Conditions | None,
     ) -> tuple[TrackerState, Jump | None]:
-        """Filter, scatter and change tests after a usable window; a deviation that is found to have jumped."""
+        """Filter, variance inflation and change tests after a usable window, and a deviation that has jumped."""
         settings, model = self.settings, self.model
         elapsed = np.inf if state.last is None else (time_ns - state.last) * 1e-9
         share, belief = min(1.0, elapsed / settings.window), state.belief
@@ -87,7 +87,7 @@ class Fusion:
         found = estimate.deviating if model.size else None
         belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
         belief, calibration, found, jump, agrees = self._weighed(state.calibration, belief, found, time_ns, share)
-        if estimate.faults and not agrees:  # mended by what is not believed yet: its values are of neither
+        if estimate.faults and not agrees:  # corrected by what is not believed yet: its values are of neither
             undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
             return replace(undecided, belief=belief, calibration=calibration), None
         if jump is not None and self.armed(state):
@@ -102,8 +102,8 @@ class Fusion:
             used=state.used + 1,
             outliers=state.outliers + int(filtered.bounded),
             belief=filtered.belief,
-            scatter=filtered.measured,
-            surprise=filtered.watch,
+            inflation=filtered.measured,
+            innovation=filtered.watch,
             changes=tested,
             calibration=self._learned(state, tested, calibration, window.cross, filtered.belief),
             weather=weather,
@@ -140,28 +140,28 @@ class Fusion:
         settings, mask, value = self.settings, window.mask, window.value
         variance = np.where(mask, window.covariance.diagonal(), 1.0)
         open_ = self._open(calibration, belief, window.cross)
-        measured = scatter.update(
-            state.scatter, value, variance + open_, mask, time=window.time_ns, window=nanoseconds(settings.window)
+        measured = inflation.update(
+            state.inflation, value, variance + open_, mask, time=window.time_ns, window=nanoseconds(settings.window)
         )
-        wide = np.sqrt(measured.inflation)
+        wide = np.sqrt(measured.factor)
         covariance = window.covariance * np.outer(wide, wide)
-        fresh = (variance + open_) * measured.inflation / window.share
+        fresh = (variance + open_) * measured.factor / window.share
 
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
-        reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.inflation)
+        reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.factor)
         plausible = np.clip(value, belief.level - reach, belief.level + reach)
-        watch, jumped = surprise.update(
-            state.surprise, value - belief.level, belief.level_variance + fresh, mask & known
+        watch, jumped = innovation.update(
+            state.innovation, value - belief.level, belief.level_variance + fresh, mask & known
         )
         if jumped.any():
             belief = kalman.reopen(belief, jumped, settings.process)
             if self.model.size:
                 belief = dev.unsure(belief, self.model)
         cross = window.cross if self.model.size else None
-        belief, innovation = kalman.correct(
+        belief, step = kalman.correct(
             belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross
         )
-        return _Filtered(belief, measured, watch, fresh, plausible, innovation.bounded)
+        return _Filtered(belief, measured, watch, fresh, plausible, step.bounded)
 
     def _tested(
         self,

@@ -16,9 +16,9 @@ from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
 from sprung.model.tracking.deviations import DeviationRecord
 from sprung.model.tracking.filter import Belief
+from sprung.model.tracking.inflation import VarianceInflation
+from sprung.model.tracking.innovation import InnovationCusum
 from sprung.model.tracking.misfit import MisfitFloor
-from sprung.model.tracking.scatter import Scatter
-from sprung.model.tracking.surprise import Surprise
 from sprung.model.tracking.weather import Weather
 
 FORMAT = 3
@@ -78,8 +78,8 @@ class TrackerState:
     idle: int  # windows without excitation: nothing was learned from them, for or against
     outliers: int  # windows fused with bounded influence
     belief: Belief
-    scatter: Scatter
-    surprise: Surprise
+    inflation: VarianceInflation
+    innovation: InnovationCusum
     changes: Changes
     fit: MisfitFloor
     calibration: DeviationRecord
@@ -111,8 +111,8 @@ class TrackerState:
             "idle": self.idle,
             "outliers": self.outliers,
             "belief": _pack_all({"mean": self.belief.mean, "covariance": self.belief.covariance[upper]}),
-            "scatter": _pack_all(asdict(self.scatter)),
-            "surprise": _pack_all(asdict(self.surprise)),
+            "scatter": _pack_all(asdict(self.inflation)),  # keys are those of format 1
+            "surprise": _pack_all(asdict(self.innovation)),
             "changes": _pack_all(asdict(self.changes)),
             "fit": asdict(self.fit),
             "calibration": _pack_all(asdict(self.calibration)),
@@ -140,8 +140,8 @@ class TrackerState:
                 idle=data.get("idle", 0),
                 outliers=data["outliers"],
                 belief=_belief(data),
-                scatter=_scatter(data),
-                surprise=Surprise(**_unpack_all(data["surprise"])),
+                inflation=_inflation(data),
+                innovation=InnovationCusum(**_unpack_all(data["surprise"])),
                 changes=Changes(**_unpack_all(data["changes"])),
                 fit=MisfitFloor(**data["fit"]),
                 calibration=_calibration(data),
@@ -195,12 +195,12 @@ def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
     return DeviationRecord(**arrays | {name: arrays[name].reshape(shape) for name in ("cross", "base_cross")})
 
 
-def _scatter(data: Mapping[str, Any]) -> Scatter:
+def _inflation(data: Mapping[str, Any]) -> VarianceInflation:
     """Format 1 timed its pairs for the vehicle as a whole."""
     arrays = _unpack_all(data["scatter"])
     if data["format"] == 1:
         arrays["anchored"] = np.full(arrays["anchor"].shape, data["anchored"] or 0, dtype=np.int64)
-    return Scatter(**arrays)
+    return VarianceInflation(**arrays)
 
 
 def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:

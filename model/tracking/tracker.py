@@ -15,7 +15,7 @@ from sprung.model.identification.deviations import Deviation, named
 from sprung.model.signals import Conditions, Estimate, FloatArray, MeasurementFault
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
-from sprung.model.tracking import coverage, misfit, scatter, surprise
+from sprung.model.tracking import coverage, inflation, innovation, misfit
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
@@ -80,8 +80,8 @@ class Tracker:
             idle=0,
             outliers=0,
             belief=kalman.prior(size, self.settings.prior, self.settings.process, self.model.prior),
-            scatter=scatter.start((size,)),
-            surprise=surprise.start(size),
+            inflation=inflation.start((size,)),
+            innovation=innovation.start(size),
             changes=change_test.start((size,)),
             fit=misfit.MisfitFloor(),
             calibration=dev.start(size, self.model),
@@ -131,7 +131,7 @@ class Tracker:
                 state.fit,
                 self._fusion.chi_square(new, estimate),
                 adequate=estimate.adequate,
-                inflation=float(new.scatter.inflation.max()),
+                inflation=float(new.inflation.factor.max()),
                 time=centre,
             )
             new = replace(new, fit=fit)
@@ -177,7 +177,7 @@ class Tracker:
             state,
             time=state.time + shift,
             last=None if state.last is None else state.last + shift,
-            scatter=replace(state.scatter, anchored=state.scatter.anchored + shift),
+            inflation=replace(state.inflation, anchored=state.inflation.anchored + shift),
             changes=replace(changes, up_since=changes.up_since + shift, down_since=changes.down_since + shift),
             fit=replace(
                 fit,

@@ -252,7 +252,7 @@ def test_windows_that_scatter_more_than_they_say_widen_the_posterior() -> None:
         state = tracker.update_many(tracker.initial_state(), stream)
         mean, std = tracker.posterior(state)
         scores.append(mean / std)
-        assert np.sqrt(state.scatter.inflation.mean()) == pytest.approx(1.4, rel=0.1)
+        assert np.sqrt(state.inflation.factor.mean()) == pytest.approx(1.4, rel=0.1)
         assert all(alarm.kind == "misfit" for alarm in state.alarms)
     assert np.sqrt(np.mean(np.square(scores))) < 1.15
 

@@ -6,7 +6,7 @@ import pytest
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.system import load_system
-from sprung.model.tracking import scatter
+from sprung.model.tracking import inflation
 from sprung.model.tracking.misfit import FLOOR_WINDOWS
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, constant, correlated, estimate, make_tracker, windows
@@ -104,14 +104,14 @@ def test_relearning_one_parameter_leaves_the_noise_floor_as_it_is():
 
 
 def test_a_parameter_seen_every_other_minute_is_not_compared_across_it():
-    running = scatter.start((2,))
+    running = inflation.start((2,))
     everything, one = np.ones(2, dtype=bool), np.array([True, False])
     variance = np.full(2, 1e-4)
-    running = scatter.update(running, np.zeros(2), variance, everything, time=0, window=10)
+    running = inflation.update(running, np.zeros(2), variance, everything, time=0, window=10)
     for k in range(1, 12):
-        running = scatter.update(running, np.zeros(2), variance, one, time=10 * k, window=10)
+        running = inflation.update(running, np.zeros(2), variance, one, time=10 * k, window=10)
     before = running.square[0]
-    running = scatter.update(running, np.full(2, 0.5), variance, everything, time=120, window=10)
+    running = inflation.update(running, np.full(2, 0.5), variance, everything, time=120, window=10)
     assert running.square[0] > before + 0.1  # a true contradiction of neighbours
     assert running.square[1] == 1.0  # two minutes apart: a drift, for all one knows
 
@@ -127,4 +127,4 @@ def test_a_state_of_the_first_format_is_taken_over():
     again = TrackerState.from_dict(old)
     assert again.used == state.used
     assert np.array_equal(again.belief.mean, state.belief.mean)
-    assert np.all(again.scatter.anchored == state.last)
+    assert np.all(again.inflation.anchored == state.last)

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag, expm
 from sprung.benchmarks.drift import CorrelatedErrors, Fleet, step_delays
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking import misfit, scatter, surprise
+from sprung.model.tracking import inflation, innovation, misfit
 from sprung.model.tracking.settings import SECONDS_PER_MONTH, ProcessNoise, design
 from sprung.model.tracking.tracker import Tracker, TrackerSettings
 from sprung.model.tracking.weather import WeatherModel
@@ -139,29 +139,29 @@ def test_steps_are_alarmed_in_time_by_windows_as_the_vehicle_gives_them() -> Non
         assert others == 0
 
 
-def test_scatter_is_measured_through_a_drift() -> None:
+def test_variance_inflation_is_measured_through_a_drift() -> None:
     rng = np.random.default_rng(5)
-    running = scatter.start((200, 1))
+    running = inflation.start((200, 1))
     everything = np.ones((200, 1), dtype=bool)
     for k in range(300):
         value = 0.001 * k + 1.5 * 0.02 * rng.normal(size=(200, 1))
-        running = scatter.update(running, value, np.full((200, 1), 0.02**2), everything, time=k, window=1)
+        running = inflation.update(running, value, np.full((200, 1), 0.02**2), everything, time=k, window=1)
     assert running.square.mean() == pytest.approx(1.5**2, rel=0.1)
 
 
-def test_surprise_fires_for_a_lasting_offset_and_hardly_ever_without() -> None:
+def test_the_innovation_cusum_fires_for_a_lasting_offset_and_hardly_ever_without() -> None:
     rng = np.random.default_rng(6)
     size = 500
     everything, unit = np.ones(size, dtype=bool), np.ones(size)
-    quiet = surprise.start(size)
+    quiet = innovation.start(size)
     fired = 0
     for _ in range(400):
-        quiet, reopened = surprise.update(quiet, rng.normal(size=size), unit, everything)
+        quiet, reopened = innovation.update(quiet, rng.normal(size=size), unit, everything)
         fired += np.count_nonzero(reopened)
     assert fired <= 3
-    lost, seen = surprise.start(size), np.zeros(size, dtype=bool)
+    lost, seen = innovation.start(size), np.zeros(size, dtype=bool)
     for _ in range(20):
-        lost, reopened = surprise.update(lost, 2.0 + rng.normal(size=size), unit, everything)
+        lost, reopened = innovation.update(lost, 2.0 + rng.normal(size=size), unit, everything)
         seen |= reopened > 0
     assert seen.mean() > 0.95
 

@@ -64,21 +64,21 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Nois
         factor = Whitener.of(forward, noise).factor[1:]
         precision = factor.conj().transpose(0, 2, 1) @ factor
         alone = np.real(np.einsum("fss->fs", precision))  # 1 / variance given the other sensors
-        surprise = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
+        normalised = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
         share = alone * variance * noise.sensors**2  # of the own noise in the variance given the others
-        ratio = [_level(surprise[:, i], share[:, i]) for i in range(len(noise.sensors))]
+        ratio = [_level(normalised[:, i], share[:, i]) for i in range(len(noise.sensors))]
         noise = replace(noise, sensors=np.maximum(noise.sensors * np.sqrt(ratio), noise.least))
     return noise
 
 
-def _level(surprise: FloatArray, share: FloatArray) -> float:
+def _level(normalised: FloatArray, share: FloatArray) -> float:
     """Ratio of a sensor's noise power to the supposed one, from the bins (F,) where its own noise counts."""
     own = share > _OWN
     if np.sum(own) < 2 * _BLOCKS:
         return 1.0
-    surprise, share = surprise[own], share[own]
-    edges = np.linspace(0, len(surprise), _BLOCKS + 1).astype(int)
-    blocks = np.array([surprise[a:b].mean() for a, b in pairwise(edges)])
+    normalised, share = normalised[own], share[own]
+    edges = np.linspace(0, len(normalised), _BLOCKS + 1).astype(int)
+    blocks = np.array([normalised[a:b].mean() for a, b in pairwise(edges)])
     return max(1 + (_robust(blocks, np.diff(edges)) - 1) / float(np.median(share)), 0.05)
 
 

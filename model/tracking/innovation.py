@@ -1,4 +1,4 @@
-"""Has the filter lost a parameter?  Page's test on its innovations; when it fires, that level is reopened.
+"""Innovation CUSUM: has the filter lost a parameter?  Page's test (1954); when it fires, that level is reopened.
 
 This is no alarm: it costs certainty for a few seconds and nothing else, so that it may fire more often.  It is what
 lets the process noise be small: drifts are in the process, jumps are here.
@@ -18,31 +18,31 @@ MOST = 4.0  # one score counts at most as this: four windows at least
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surprise:
-    """Statistics for predictions that are too low and too high, shape (P,)."""
+class InnovationCusum:
+    """Page's statistics for predictions that are too low and too high, shape (P,)."""
 
     up: FloatArray
     down: FloatArray
 
 
-def start(size: int) -> Surprise:
-    return Surprise(np.zeros(size), np.zeros(size))
+def start(size: int) -> InnovationCusum:
+    return InnovationCusum(np.zeros(size), np.zeros(size))
 
 
 def update(
-    surprise: Surprise,
+    cusum: InnovationCusum,
     residual: FloatArray,  # value - prediction, shape (P,)
     variance: FloatArray,  # of the residual, overlap included, shape (P,)
     mask: BoolArray,
-) -> tuple[Surprise, FloatArray]:
+) -> tuple[InnovationCusum, FloatArray]:
     """After one window: statistics, and the variance (P,) to reopen levels with; 0 where the filter follows."""
     score = np.where(mask, residual / np.sqrt(variance), 0.0)
     score = np.clip(score, -MOST, MOST)
     idle = np.where(mask, REFERENCE, 0.0)
-    up = np.maximum(0.0, surprise.up + score - idle)
-    down = np.maximum(0.0, surprise.down - score - idle)
+    up = np.maximum(0.0, cusum.up + score - idle)
+    down = np.maximum(0.0, cusum.down - score - idle)
     lost = np.maximum(up, down) >= THRESHOLD
     return (
-        Surprise(np.where(lost, 0.0, up), np.where(lost, 0.0, down)),
+        InnovationCusum(np.where(lost, 0.0, up), np.where(lost, 0.0, down)),
         np.where(lost, np.maximum(residual**2, 4.0 * variance), 0.0),
     )

@@ -1,4 +1,4 @@
-"""How much more a vehicle's windows scatter than their covariances say.
+"""Variance inflation: how much more a vehicle's windows scatter than their covariances say (overdispersion).
 
 Judged from differences of windows that do not overlap, because neither a drift nor a wrong filter enters these: over
 one second a parameter stands still.  Pairs are timed component by component: one that is seen every other minute is
@@ -19,7 +19,7 @@ CLIP = 9.0  # a squared score counts at most as this: one outlier moves the mean
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Scatter:
+class VarianceInflation:
     """Running mean of squared scores, and the last window that a pair started from."""
 
     anchor: FloatArray  # log-ratios, shape (..., P); NaN: none yet
@@ -28,32 +28,32 @@ class Scatter:
     square: FloatArray  # running mean, 1 when covariances are right, shape (..., P)
 
     @property
-    def inflation(self) -> FloatArray:
+    def factor(self) -> FloatArray:
         """Factor on the windows' variances; never below 1, since luck is not precision."""
         return np.maximum(1.0, self.square)
 
 
-def start(shape: tuple[int, ...]) -> Scatter:
-    return Scatter(np.full(shape, np.nan), np.zeros(shape, dtype=np.int64), np.ones(shape), np.ones(shape))
+def start(shape: tuple[int, ...]) -> VarianceInflation:
+    return VarianceInflation(np.full(shape, np.nan), np.zeros(shape, dtype=np.int64), np.ones(shape), np.ones(shape))
 
 
 def update(
-    scatter: Scatter, value: FloatArray, variance: FloatArray, mask: BoolArray, *, time: int, window: int
-) -> Scatter:
+    inflation: VarianceInflation, value: FloatArray, variance: FloatArray, mask: BoolArray, *, time: int, window: int
+) -> VarianceInflation:
     """After the window of `window` ns that starts at `time`.
 
     Components outside `mask`, and those whose anchor it still overlaps, keep their anchor.
     """
-    apart = time - scatter.anchored
-    known = np.isfinite(scatter.anchor)
+    apart = time - inflation.anchored
+    known = np.isfinite(inflation.anchor)
     mask = mask & (~known | (apart >= window))
     paired = mask & known & (apart <= STALE * window)
-    total = np.where(mask, variance, 1.0) + scatter.anchor_variance
-    score = np.where(paired, (value - scatter.anchor) ** 2 / total, 1.0)
+    total = np.where(mask, variance, 1.0) + inflation.anchor_variance
+    score = np.where(paired, (value - inflation.anchor) ** 2 / total, 1.0)
     step = np.where(paired, 1.0 / MEMORY, 0.0)
-    return Scatter(
-        np.where(mask, value, scatter.anchor),
-        np.where(mask, time, scatter.anchored),
-        np.where(mask, variance, scatter.anchor_variance),
-        scatter.square + step * (np.minimum(score, CLIP) - scatter.square),
+    return VarianceInflation(
+        np.where(mask, value, inflation.anchor),
+        np.where(mask, time, inflation.anchored),
+        np.where(mask, variance, inflation.anchor_variance),
+        inflation.square + step * (np.minimum(score, CLIP) - inflation.square),
     )
