@@ -319,6 +319,17 @@ class SupportLaw(Parametrised):
         displacement, rate = polyval(turn, np.column_stack([weights, 2j * np.pi * n * frequency * weights]))
         return displacement.real, rate.real
 
+    def displacements(
+        self, time: FloatArray, frequency: float, phases: FloatArray, highest: float = np.inf
+    ) -> FloatArray:
+        """Displacement of `movement` per unit of depth, of one frequency at several phases (m,) at once, (m, T)."""
+        n = np.arange(1, len(self.harmonics) + 1)
+        weights = np.where(n * frequency < highest, self.harmonics, 0.0)
+        powers = np.multiply.accumulate(np.tile(np.exp(2j * np.pi * frequency * time), (len(n), 1)), axis=0)
+        shifted = weights * np.exp(-2j * np.pi * np.outer(phases, n))
+        found: FloatArray = shifted.real @ powers.real - shifted.imag @ powers.imag
+        return found
+
 
 def _as_large_as_found(step: float, amplitude: float) -> float:
     return max(abs(amplitude), 1e-9)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sprung.model.laws.reversals import Stretches
 from sprung.model.signals import FloatArray
@@ -56,9 +57,5 @@ def maxwell_path(deflection: FloatArray, time_constant: float, step: float) -> F
     """Deflection of the spring of a spring and damper in series, m, (T,): s' = d' - s / time_constant."""
     keep = math.exp(-step / time_constant)
     gain = time_constant / step * (1 - keep)
-    path = np.empty(len(deflection))
-    s, path[0] = 0.0, 0.0
-    for i, way in enumerate(np.diff(deflection).tolist(), 1):
-        s = keep * s + gain * way
-        path[i] = s
-    return path
+    found: FloatArray = lfilter([gain], [1.0, -keep], np.diff(deflection, prepend=deflection[:1]))
+    return found

@@ -60,18 +60,21 @@ def bouc_wen_memory(deflection: FloatArray, beta: float, exponent: float, gamma:
     ahead, behind = _Side(beta * (1 + gamma), exponent), _Side(beta * (gamma - 1), exponent)
     runs = Stretches.of(deflection)
     position = np.array(_ways(ahead, behind, runs.lengths))[runs.stretch] + runs.way
-    return runs.path(np.where(position > 0, ahead.along(position), -behind.along(-position)))
+    onward, z = position > 0, np.empty_like(position)
+    z[onward] = ahead.along(position[onward])
+    z[~onward] = -behind.along(-position[~onward])
+    return runs.path(z)
 
 
 def _ways(ahead: _Side, behind: _Side, lengths: FloatArray) -> list[float]:
     """The way X at which every monotone stretch begins: minus the z at which the one before ended."""
     ways = []
-    u = 0.0
+    u, a, b = 0.0, ahead.unit, behind.unit
     for length in lengths.tolist():
-        start = ahead.way(u) if u > 0 else -behind.way(-u)
+        start = a * ahead.way(u / a) if u > 0 else -b * behind.way(-u / b)
         ways.append(start)
         end = start + length
-        u = -ahead.back(end) if end > 0 else behind.back(-end)
+        u = -a * ahead.back(end / a) if end > 0 else b * behind.back(-end / b)
     return ways
 
 
@@ -79,21 +82,15 @@ class _Side:
     """The way X(u) = integral du / (1 - a u^n) for u >= 0 and its inverse: of one float, and of arrays.
 
     In units of |a|^(-1/n) it is one of two functions of n: towards saturation for a > 0, growing for a < 0.
+    `way` and `back` take and return numbers in those units.
     """
 
     def __init__(self, a: float, exponent: float) -> None:
         self.unit = max(abs(a), 1e-12) ** (-1 / exponent)
-        self._way, self._back, self._along = _functions(exponent, a > 0)
-
-    def way(self, u: float) -> float:
-        found: float = self.unit * self._way(u / self.unit)
-        return found
-
-    def back(self, x: float) -> float:
-        found: float = self.unit * self._back(x / self.unit)
-        return found
+        self.way, self.back, self._along = _functions(exponent, a > 0)
 
     def along(self, x: FloatArray) -> FloatArray:
+        """u after ways x."""
         found: FloatArray = self.unit * self._along(np.maximum(x, 0) / self.unit)
         return found
 

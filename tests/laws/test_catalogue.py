@@ -246,6 +246,8 @@ def test_a_dip_has_its_depth_and_its_rate_is_the_slope():
     moved, rate = law.movement(t, (1e-3, 4.0, 0.2))
     assert t[np.argmin(moved)] == pytest.approx(0.05, abs=1e-3)
     np.testing.assert_allclose(rate[1:-1], np.gradient(moved, t)[1:-1], atol=2e-5)
+    both = 1e-3 * law.displacements(t, 4.0, np.array([0.7, 0.2]), highest=13.0)
+    np.testing.assert_allclose(both[1], law.movement(t, (1e-3, 4.0, 0.2), highest=13.0)[0], atol=1e-12)
 
 
 def test_phi_functions_are_accurate_where_series_and_recursion_meet():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -31,16 +32,63 @@ class Change:
 
 @dataclass(frozen=True)
 class Linearised:
-    """Residual and sensitivities at a point, whitened."""
+    """Residual at a point, and its sensitivities once somebody asks for them: a step that fails needs none."""
 
-    residual: FloatArray  # (R,)
-    jacobian: FloatArray  # of the model, columns theta, term parameters (internal scale), state: (R, P + p + 2n)
-    log_det: float  # of the residual's covariance
-    log_det_slope: FloatArray  # by theta and term parameters, (P + p,)
-    spectrum: ComplexArray  # the residual itself, (F, S)
+    problem: Problem
+    point: Point
+    working: Working
     forward: Forward
     forces: LawForces | None
-    motions: Motions
+    shown: ComplexArray  # by the sensors but for the free motion, (F, S)
+    free: ComplexArray  # motion per state at the first sample, (F, S, 2n)
+
+    @cached_property
+    def spectrum(self) -> ComplexArray:
+        """The residual itself, (F, S)."""
+        sensors = self.problem.part.sensors
+        swinging = self.free.reshape(-1, len(self.point.state)) @ self.point.state
+        found: ComplexArray = sensors - self.shown - swinging.reshape(sensors.shape)
+        return found
+
+    @cached_property
+    def residual(self) -> FloatArray:
+        """The residual, whitened, (R,)."""
+        return self.working.whitener(self.spectrum, self.problem.part)
+
+    @property
+    def log_det(self) -> float:
+        """Of the residual's covariance."""
+        return self.working.whitener.log_det
+
+    @cached_property
+    def motions(self) -> Motions:
+        """Of everything, along the residual's own inputs."""
+        return motions_of(self.forward, self.forces, self.point.state)
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Of the model, whitened, columns theta, term parameters (internal scale), state: (R, P + p + 2n)."""
+        return self._sensitivities.packed.jacobian
+
+    @cached_property
+    def gram(self) -> FloatArray:
+        """Of the jacobian's columns."""
+        return np.asarray(self.jacobian.T @ self.jacobian)
+
+    @property
+    def log_det_slope(self) -> FloatArray:
+        """By theta and term parameters, (P + p,)."""
+        return self._sensitivities.log_det
+
+    @cached_property
+    def _sensitivities(self) -> _Sensitivities:
+        problem, point, working = self.problem, self.point, self.working
+        known = _of_theta(problem, self.forward, self.forces, working.whitener, self.motions, point)
+        _add_terms(known, problem, point, working, self.forward, self.forces, self.shown)
+        known.packed.add_free(len(known.log_det), self.free)
+        if self.forces is not None:
+            _add_laws_answers(known, problem, working.whitener, self.forward, self.forces, self.free.shape[2])
+        return known
 
 
 @dataclass
@@ -58,19 +106,7 @@ class _Sensitivities:
 def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
     """Residual and sensitivities at a point."""
     shown, forward, forces = problem.predict(point, working.inputs)
-    whitener = working.whitener
-    free = problem.free_columns(forward)
-    spectrum = problem.part.sensors - shown - free @ point.state
-    motions = motions_of(forward, forces, point.state)
-    known = _of_theta(problem, forward, forces, whitener, motions, point)
-    _add_terms(known, problem, point, working, forward, forces, shown)
-    states = free.shape[2]
-    known.packed.add_free(len(known.log_det), free)
-    if forces is not None:
-        _add_laws_answers(known, problem, whitener, forward, forces, states)
-    residual = whitener(spectrum, problem.part)
-    jacobian = known.packed.jacobian
-    return Linearised(residual, jacobian, whitener.log_det, known.log_det, spectrum, forward, forces, motions)
+    return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward))
 
 
 def _of_theta(

@@ -92,9 +92,9 @@ class Fit:
             grid, plant = forward.part.grid, forward.plant
             spectrum = forces.deflections[:, : forward.elements]
             polynomial = forces.motion @ plant.structure.H[: forward.elements].T
-            powers = np.vander(grid.fine_time / grid.length, len(polynomial), increasing=True)
-            d = d + grid.fine(spectrum) + powers @ polynomial
-            v = v + grid.fine(1j * grid.omega[:, None] * spectrum) + powers @ plant.derivative(polynomial)
+            d = d + grid.fine(spectrum) + grid.fine_monomials @ polynomial
+            rate = grid.fine(1j * grid.omega[:, None] * spectrum)
+            v = v + rate + grid.fine_monomials @ plant.derivative(polynomial)
         return d, v
 
     def force_along(self, term: Term) -> FloatArray:
@@ -243,7 +243,7 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
 def _normal(problem: Problem, lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
     """Matrix of the normal equations with the prior of theta, columns scaled, and the scales."""
     P = len(point.theta)
-    normal = lin.jacobian.T @ lin.jacobian
+    normal = lin.gram.copy()
     normal[np.arange(P), np.arange(P)] += 1 / problem.rules.fit.prior**2
     scale = scale_of(normal, len(point.state))
     return normal * scale * scale[:, None], scale

@@ -104,8 +104,9 @@ class Problem:
         near = np.abs(1 - turn[:, None] * step) < _ON_A_BIN
         scalar = np.where(near, grid.samples, (1 - last) / np.where(near, 1.0, 1 - turn[:, None] * step))
         rows = forward.free_rows_at_start() @ vectors
-        modal = rows[None] * (scalar / np.sqrt(grid.samples))[:, None, :]
-        found: ComplexArray = modal @ np.linalg.inv(vectors)
+        modal = rows.T[:, :, None] * np.linalg.inv(vectors)[:, None, :]  # (2n, S, 2n)
+        columns = (scalar / np.sqrt(grid.samples)) @ modal.reshape(len(modal), -1)  # one product for all bins
+        found: ComplexArray = columns.reshape(len(scalar), *modal.shape[1:])
         return found
 
 

@@ -158,7 +158,7 @@ def _exchanged(
 ) -> ComplexArray:
     plant, part = one.forward.plant, one.forward.part
     band = slice(1, part.grid.band.stop)
-    shown = one.shown
+    shown = one.shown.copy()
     for i, j in supports:
         G, u = plant.sensor_of_support[band], part.support[band]
         shown = shown + (G[:, :, i] - G[:, :, j]) * (u[:, j] - u[:, i])[:, None]
@@ -236,7 +236,7 @@ def _positions(one: ModelResponse, system: System, signals: Signals, rules: Setu
                 continue
             offset, change = sensor_offset(one, system, i, name, axis)
             if abs(offset) >= rules.offset:
-                shown = one.shown
+                shown = one.shown.copy()
                 shown[:, i] += offset * change
                 yield Hypothesis.of(SENSOR_POSITION, SetupPlace(name, Group((i,)), axis), offset, one.left(shown))
 

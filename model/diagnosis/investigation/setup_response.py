@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -27,8 +28,12 @@ NOTHING = Group()
 
 def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:
     """Misfit of every sensor, (S,), of errors (F, S)."""
-    size = np.maximum(np.sum(np.abs(measured) ** 2, axis=0), 1e-300)
-    return np.asarray(np.sum(np.abs(error) ** 2, axis=0) / size)
+    return np.asarray(_power(error) / np.maximum(_power(measured), 1e-300))
+
+
+def _power(spectrum: ComplexArray) -> FloatArray:
+    """Sum of squares of every column, (S,)."""
+    return np.einsum("fs,fs->s", spectrum.real, spectrum.real) + np.einsum("fs,fs->s", spectrum.imag, spectrum.imag)
 
 
 @dataclass(frozen=True)
@@ -62,7 +67,7 @@ class ModelResponse:
             of_raw_force=plant.sensor_of_measured_force[band] * problem.part.force[band][:, None, :],
         )
 
-    @property
+    @cached_property
     def shown(self) -> ComplexArray:
         """(F, S)."""
         found: ComplexArray = self.of_support.sum(axis=2) + self.of_force.sum(axis=2)
@@ -70,7 +75,12 @@ class ModelResponse:
 
     def left(self, shown: ComplexArray) -> float:
         """Misfit of all sensors if this is what they show."""
-        return float(np.sum(relative(self.measured - shown, self.measured)))
+        return float(np.sum(_power(self.measured - shown) / self.size))
+
+    @cached_property
+    def size(self) -> FloatArray:
+        """Power of every sensor, (S,)."""
+        return np.maximum(_power(self.measured), 1e-300)
 
     def turned(self, group: Group) -> ComplexArray:
         """Shown if a group has the other sign."""
@@ -118,7 +128,7 @@ class ModelResponse:
 
     def delay(self, group: Group, latest: float) -> float:
         """The delay of a group that leaves the least misfit, s: the best of all whole samples, then between them."""
-        weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(self.measured) ** 2, axis=0), 1e-300))
+        weight = 1 / np.sqrt(self.size)
         driven, shown, at = self._of(group), self.shown, list(group.sensors)
         own = np.zeros(len(weight), dtype=bool)
         own[at] = True
@@ -144,7 +154,7 @@ class ModelResponse:
 
     def ratio(self, group: Group) -> float:
         """The ratio by which a group is too large, least squares; sensors or supports."""
-        weight = 1 / np.maximum(np.sum(np.abs(self.measured) ** 2, axis=0), 1e-300)
+        weight = 1 / self.size
         at = list(group.sensors)
         if at:
             shown, measured, weight = self.shown[:, at], self.measured[:, at], weight[at]

@@ -69,8 +69,8 @@ class SetupScores:
 
     def _shown(self, system: System, theta: FloatArray) -> ComplexArray:
         forward = Forward(system, self.problem.part, self.problem.sensors, theta)
-        plant = replace(forward.plant, grid=self.grid)
-        return plant.sensors(forward.support[self.every], forward.force[self.every])[1:]
+        plant, part = replace(forward.plant, grid=self.grid), self.problem.part
+        return plant.sensors(part.support[self.every], part.force[self.every])[1:]
 
     def _flat(self, spectrum: ComplexArray) -> FloatArray:
         flat = (spectrum * self.weight).ravel()

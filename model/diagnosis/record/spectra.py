@@ -81,6 +81,11 @@ class Grid:
         """Their transforms, shape (F, DEGREE + 1)."""
         return self.forward(self.monomials)
 
+    @cached_property
+    def fine_monomials(self) -> FloatArray:
+        """(t / length)^k on the oversampled axis, shape (OVERSAMPLING N, DEGREE + 1)."""
+        return np.vander(self.fine_time / self.length, DEGREE + 1, increasing=True)
+
     def forward(self, series: FloatArray) -> ComplexArray:
         """Transform along the first axis: (N, ...) -> (F, ...)."""
         found: ComplexArray = scipy.fft.rfft(series, axis=0, norm="ortho")
@@ -102,6 +107,15 @@ class Grid:
         """Transform of an oversampled series, kept up to the record's Nyquist frequency."""
         full = scipy.fft.rfft(fine_series, axis=0)
         found: ComplexArray = full[: len(self.omega)] / (OVERSAMPLING * np.sqrt(self.samples))
+        return found
+
+    def compared_spectra(self, fine_series: FloatArray) -> ComplexArray:
+        """Compared bins of many oversampled series at once, (m, OVERSAMPLING N) -> (m, compared bins).
+
+        Many transforms of contiguous series take less than half the time of as many single ones.
+        """
+        full = scipy.fft.rfft(fine_series, axis=1)
+        found: ComplexArray = full[:, self.band] / (OVERSAMPLING * np.sqrt(self.samples))
         return found
 
     def pack(self, spectrum: ComplexArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import expm
 
 from sprung.model.diagnosis.record.signals import Part
-from sprung.model.diagnosis.record.spectra import DEGREE, OVERSAMPLING, ComplexArray, detrend_ends
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray, detrend_ends
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.structure import Structure
@@ -264,12 +264,10 @@ class Forward:
         plant, grid = self.plant, self.part.grid
         ports = plant.structure.widened(ports)
         spectrum = self.linear_deflection @ ports.T
-        d = grid.fine(spectrum)
-        v = grid.fine(1j * grid.omega[:, None] * spectrum)
+        d, v = np.split(grid.fine(np.hstack([spectrum, 1j * grid.omega[:, None] * spectrum])), 2, axis=1)
         polynomial = self.polynomial[1] @ ports.T
-        powers = np.vander(grid.fine_time / grid.length, DEGREE + 1, increasing=True)
-        d += powers @ polynomial
-        v += powers @ plant.derivative(polynomial)
+        d += grid.fine_monomials @ polynomial
+        v += grid.fine_monomials @ plant.derivative(polynomial)
         A, rows = plant.structure.state_matrix(), plant.structure.motion_rows(ports)
         free = propagate(A, rows, state, grid.step / OVERSAMPLING, len(d))
         return d + free[:, : len(ports)], v + free[:, len(ports) :]

@@ -112,7 +112,8 @@ class Plant:
     def sensor_of_force(self) -> ComplexArray:
         """Sensor signal per law force along an element, shape (F, S, E)."""
         s = self.structure
-        result = -(self.sensor_of_load @ s.H.T)
+        load = self.sensor_of_load
+        result = (load.reshape(-1, len(s.mass)) @ -s.H.T).reshape(*load.shape[:2], len(s.H))
         if np.any(s.L):
             result = result + np.where(s.sensor_kind[:, None] == FORCE, s.L, 0.0)
         return result

@@ -76,10 +76,10 @@ class HarmonicBalance:
         self.wide = plant.structure.widened(ports)
         self._drive(*motion)
         self.compliance = self._compliance(self.wide)  # (4N / 2 + 1, m, m)
-        self.fine_omega = 2 * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
+        self.jw = 2j * np.pi * np.fft.rfftfreq(len(self.d0), self.grid.step / OVERSAMPLING)
         self.lines = np.array([plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
-        self.powers = np.vander(self.grid.fine_time / self.grid.length, DEGREE + 1, increasing=True)
+        self.powers = self.grid.fine_monomials
 
     def _drive(self, d0: FloatArray, v0: FloatArray) -> None:
         self.d0, self.v0 = d0, v0
@@ -145,12 +145,11 @@ class HarmonicBalance:
     def motion(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflection and rate, 2 x (4N, m)."""
         spectrum, line = self.decompose(force)
-        answer = np.einsum("fab,fb->fa", self.compliance, spectrum)
-        polynomial = np.einsum("kpab,kb->pa", self.line_d, line[:2])
-        count = len(self.d0)
-        d = self.d0 + irfft(answer, count, axis=0) + self.powers @ polynomial
-        v = self.v0 + irfft(1j * self.fine_omega[:, None] * answer, count, axis=0)
-        return d, v + self.powers @ self.plant.derivative(polynomial)
+        answer = np.einsum("fab,fb->af", self.compliance, spectrum)
+        swinging = irfft(np.stack([answer, self.jw * answer]), len(self.d0))  # both at once: contiguous, so quick
+        steady = np.einsum("kpab,kb->pa", self.line_d, line[:2])
+        d, v = swinging.transpose(0, 2, 1)
+        return self.d0 + d + self.powers @ steady, self.v0 + v + self.powers @ self.plant.derivative(steady)
 
 
 def fixed_point(
@@ -160,8 +159,7 @@ def fixed_point(
     shape = start.shape
     x = start.ravel()
     image = step(start).ravel()
-    past_x: list[FloatArray] = []
-    past_r: list[FloatArray] = []
+    history = _History(x.size)
     best, best_size, sizes = image, np.inf, []
     for iteration in range(_ITERATIONS):
         residual = image - x
@@ -175,17 +173,35 @@ def fixed_point(
         sizes.append(best_size)
         if iteration >= _PATIENCE and best_size > _PROGRESS * sizes[-_PATIENCE]:
             break
-        past_x.append(x)
-        past_r.append(residual)
-        past_x, past_r = past_x[-_HISTORY:], past_r[-_HISTORY:]
-        if len(past_r) > 1:
-            dr = np.diff(np.array(past_r), axis=0)
-            dx = np.diff(np.array(past_x), axis=0)
-            gram = dr @ dr.T
-            gram[np.diag_indices_from(gram)] *= 1 + 1e-10
-            weights = np.linalg.lstsq(gram, dr @ residual, rcond=1e-14)[0]
-            x = x + residual - weights @ (dx + dr)
-        else:
-            x = image
+        x = history.mixed(image, residual)
         image = step(x.reshape(shape)).ravel()
     return best.reshape(shape), False
+
+
+class _History:
+    """The last images and residuals of a fixed-point iteration, as differences from one to the next."""
+
+    def __init__(self, size: int) -> None:
+        self.images, self.residuals = np.empty((_HISTORY - 1, size)), np.empty((_HISTORY - 1, size))
+        self.gram = np.zeros((_HISTORY - 1, _HISTORY - 1))  # of the differences of residuals
+        self.count = 0
+        self.last: tuple[FloatArray, FloatArray] | None = None
+
+    def mixed(self, image: FloatArray, residual: FloatArray) -> FloatArray:
+        """The next point: the image less what the differences make of the residual by least squares."""
+        if self.last is not None:
+            at = self.count % len(self.images)  # the oldest makes room
+            self.count += 1
+            np.subtract(image, self.last[0], out=self.images[at])
+            np.subtract(residual, self.last[1], out=self.residuals[at])
+            known = min(self.count, len(self.images))
+            self.gram[at, :known] = self.gram[:known, at] = self.residuals[:known] @ self.residuals[at]
+        self.last = image, residual
+        if not self.count:
+            return image
+        known = min(self.count, len(self.images))
+        gram = self.gram[:known, :known].copy()
+        gram[np.diag_indices_from(gram)] *= 1 + 1e-10
+        weights = np.linalg.lstsq(gram, self.residuals[:known] @ residual, rcond=1e-14)[0]
+        found: FloatArray = image - weights @ self.images[:known]
+        return found

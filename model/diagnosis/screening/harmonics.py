@@ -86,13 +86,12 @@ def _refined(
     """Depth, frequency and phase, and the statistic, by exact columns around a rough find."""
     time = grid.start + grid.time + CLOCK_LEAD
     middle = float(time.mean())  # a frequency turns the phase about the middle
-    trials = [
-        (f, (phase + (f - frequency) * middle + shift / _PHASES) % 1.0)
-        for f in frequency + np.linspace(-1, 1, 9) / (_FINER * grid.length)
-        for shift in np.linspace(-1, 1, 5)
-    ]
-    moved = np.column_stack([law.movement(time, (1.0, *trial), grid.nyquist)[0] for trial in trials])
-    scores, depths = channel.scores(grid.forward(moved)[grid.band].T)
+    shifts = phase + np.linspace(-1, 1, 5) / _PHASES
+    frequencies = frequency + np.linspace(-1, 1, 9) / (_FINER * grid.length)
+    trials = [(f, (shifts + (f - frequency) * middle) % 1.0) for f in frequencies]
+    moved = np.concatenate([law.displacements(time, f, phases, grid.nyquist) for f, phases in trials])
+    scores, depths = channel.scores(scipy.fft.rfft(moved, axis=1, norm="ortho")[:, grid.band])
     scores = np.where(depths > 0, scores, 0.0)
     i = int(np.argmax(scores))
-    return (float(depths[i]), float(trials[i][0]), float(trials[i][1])), float(scores[i])
+    f, phases = trials[i // len(shifts)]
+    return (float(depths[i]), float(f), float(phases[i % len(shifts)])), float(scores[i])

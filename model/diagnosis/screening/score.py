@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtrc
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
@@ -39,7 +39,7 @@ class Candidate:
     @property
     def p_single(self) -> float:
         """Chance of such a score if this alone had been tried."""
-        return float(stats.chi2.sf(self.score, self.freedom))
+        return float(chdtrc(self.freedom, self.score))
 
     @property
     def strength(self) -> float:
@@ -159,14 +159,17 @@ class ScalarResponse:
         weighted = (response * projector.grid.weight[:, None]).conj()
         self.product = np.einsum("fs,fs->f", weighted, projector.complex_residual)
         self.size = np.sum(np.abs(weighted) ** 2, axis=1)
-        self.inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+        # the same for trials as real rows (2 F,): half the work of complex products whose real part is wanted
+        self._product = np.concatenate([self.product.real, self.product.imag])
+        self._size = np.concatenate([self.size, self.size])
+        inside = np.einsum("fs,fsq->fq", weighted, projector.complex_q, optimize=True)
+        self._inside = np.concatenate([inside.real, inside.imag])
 
     def scores(self, h: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Statistics and amplitudes of trials h (trials, F)."""
-        conj = h.conj()
-        product = np.real(conj @ self.product)
-        size = np.abs(h) ** 2 @ self.size
-        inside = np.real(conj @ self.inside)
+        rows = np.concatenate([h.real, h.imag], axis=1)
+        product, inside = rows @ self._product, rows @ self._inside
+        size = rows**2 @ self._size
         left = size - np.sum(inside**2, axis=1)
         visible = left > 1e-7 * size
         left = np.where(visible, left, 1.0)
@@ -174,10 +177,9 @@ class ScalarResponse:
 
     def joint(self, h: ComplexArray) -> tuple[float, FloatArray]:
         """Statistic and amplitudes of several columns h (m, F) together."""
-        conj = h.conj()
-        inside = np.real(conj @ self.inside)
-        gram = np.real((conj * self.size) @ h.T) - inside @ inside.T
-        product = np.real(conj @ self.product)
+        rows = np.concatenate([h.real, h.imag], axis=1)
+        product, inside = rows @ self._product, rows @ self._inside
+        gram = (rows * self._size) @ rows.T - inside @ inside.T
         scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
         values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
         good = values > 1e-6
