@@ -36,14 +36,19 @@ def baseline(
     split: int,
     rules: Rules = RULES,
     memory: FitMemory | None = None,
+    *,
+    roughly: bool = False,
 ) -> tuple[Problem, Fit]:
     """The system of the file, its laws included, on the first `split` samples; noise levels estimated on the way.
 
+    roughly: with the noise of measured forces as their whole misfit suggests, which is where every fit begins.
     Errors: `DiagnosisError` where the numbers of system file and recording fit each other so badly that none comes out.
     """
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
-            problem, fit = _baseline(system, signals, declared, split, rules, memory)
+            problem, fit = _begun(system, signals, declared, split, rules, memory)
+            if not roughly:
+                problem, fit = refreshed(problem, fit)
     except (np.linalg.LinAlgError, FloatingPointError):
         raise DiagnosisError(_DIVERGED) from None
     if not np.isfinite(fit.chi_square):
@@ -51,7 +56,7 @@ def baseline(
     return problem, fit
 
 
-def _baseline(
+def _begun(
     system: System, signals: Signals, declared: Noise, split: int, rules: Rules, memory: FitMemory | None
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
@@ -66,8 +71,7 @@ def _baseline(
         problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise))
     if not system.file.inputs:
         start = replace(start, theta=_from_the_beginning(problem, first, declared, start))
-    fit = optimise(problem, start)
-    return refreshed(problem, fit)
+    return problem, optimise(problem, start)
 
 
 def _from_the_beginning(problem: Problem, signals: Signals, declared: Noise, start: Point) -> FloatArray:

@@ -105,7 +105,7 @@ class _Sensitivities:
 
 def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
     """Residual and sensitivities at a point."""
-    shown, forward, forces = problem.predict(point, working.inputs)
+    shown, forward, forces = problem.predict(point, working.inputs, working.plant)
     return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward))
 
 
@@ -214,10 +214,10 @@ def _difference(
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
     other, other_forward, other_forces = problem.predict(
-        replace(point, terms=terms, warm_start=warm_start_of(forces)), working.inputs
+        replace(point, terms=terms, warm_start=warm_start_of(forces)), working.inputs, forward.plant
     )
-    free = other_forward.free_rows() - forward.free_rows()
-    change = (other - shown + problem.part.grid.forward(free @ point.state)) / step
+    free = (problem.free_columns(other_forward) - problem.free_columns(forward)) @ point.state
+    change = (other - shown + free) / step
     if not problem.process_noise:
         return Change(change)
     log_det = (Whitener.of(other_forward, problem.noise).log_det - working.whitener.log_det) / step

@@ -15,14 +15,12 @@ from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, LawForces
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-_ON_A_BIN = 1e-9  # distance of an undamped mode's e^{l dt} from a bin's
-_DEFECTIVE = 1e9  # condition of the modes from which they are too close to each other
 
 
 @dataclass(frozen=True)
@@ -49,16 +47,19 @@ class Problem:
         """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
         return self.noise.process_noise
 
-    def forward(self, point: Point, inputs: SmoothedInputs | None = None) -> Forward:
-        """The model at a point under the measured inputs, or under smoothed ones."""
+    def forward(self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None) -> Forward:
+        """The model at a point under the measured inputs, or under smoothed ones.
+
+        known: the plant of a model nearby, often the same.
+        """
         part = self.part if inputs is None else inputs.part
-        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start)
+        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known)
 
     def predict(
-        self, point: Point, inputs: SmoothedInputs | None = None
+        self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None
     ) -> tuple[ComplexArray, Forward, LawForces | None]:
         """Shown sensor signals, (F, S), the model, and the forces of its laws."""
-        forward = self.forward(point, inputs)
+        forward = self.forward(point, inputs, known)
         forces = law_forces(forward, point, inputs)
         return self.shown(forward, forces), forward, forces
 
@@ -89,25 +90,8 @@ class Problem:
         return forward.plant.sensors(part.support - smoothed.support, forces / forward.force_faults[0])
 
     def free_columns(self, forward: Forward) -> ComplexArray:
-        """Transforms of the free motion per state at the first sample, (F, S, 2n).
-
-        In modal coordinates sum_k c l^k z^-k = c (1 - l^N) / (1 - l / z); by transform where the modes are too
-        close to each other for that.
-        """
-        plant, grid = forward.plant, self.part.grid
-        values, vectors = np.linalg.eig(plant.structure.state_matrix())
-        if np.linalg.cond(vectors) > _DEFECTIVE:
-            return grid.forward(forward.free_rows())
-        step = np.exp(values * grid.step)
-        turn = np.exp(-1j * grid.omega * grid.step)
-        last = np.exp(values * grid.length)
-        near = np.abs(1 - turn[:, None] * step) < _ON_A_BIN
-        scalar = np.where(near, grid.samples, (1 - last) / np.where(near, 1.0, 1 - turn[:, None] * step))
-        rows = forward.free_rows_at_start() @ vectors
-        modal = rows.T[:, :, None] * np.linalg.inv(vectors)[:, None, :]  # (2n, S, 2n)
-        columns = (scalar / np.sqrt(grid.samples)) @ modal.reshape(len(modal), -1)  # one product for all bins
-        found: ComplexArray = columns.reshape(len(scalar), *modal.shape[1:])
-        return found
+        """Transforms of what the sensors show of the free motion per state at the first sample, (F, S, 2n)."""
+        return forward.plant.free_transforms(forward.free_rows_at_start())
 
 
 def law_forces(

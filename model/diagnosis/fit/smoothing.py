@@ -13,6 +13,7 @@ from sprung.model.diagnosis.fit.problem import Problem, SmoothedInputs
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.signals import FloatArray
@@ -28,6 +29,7 @@ class Working:
 
     whitener: Whitener
     inputs: SmoothedInputs | None = None
+    plant: Plant | None = None  # that inputs were smoothed through
 
 
 def opened(problem: Problem, point: Point, whitener: Whitener | None = None) -> tuple[Point, Working]:
@@ -72,7 +74,7 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
     loop = forward.loop(point.state)
     if loop is None:
         state, inputs = explained(None)
-        return replace(point, state=state), Working(whitener, SmoothedInputs(inputs))
+        return replace(point, state=state), Working(whitener, SmoothedInputs(inputs), forward.plant)
 
     def along(force: FloatArray, loop: HarmonicBalance = loop) -> FloatArray:
         state, inputs = explained(loop.answer(force))
@@ -82,7 +84,8 @@ def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Workin
     start = np.column_stack(point.warm_start) if point.warm_start else along(np.zeros((len(loop.d0), len(loop.terms))))
     force, _ = fixed_point(along, start, _FOLLOWED)
     state, inputs = explained(loop.answer(force))
-    return replace(point, state=state, warm_start=tuple(force.T)), Working(whitener, SmoothedInputs(inputs, force))
+    working = Working(whitener, SmoothedInputs(inputs, force), forward.plant)
+    return replace(point, state=state, warm_start=tuple(force.T)), working
 
 
 def _smoothed(part: Part, whitener: Whitener, spectrum: ComplexArray) -> Part:

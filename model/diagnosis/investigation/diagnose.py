@@ -23,8 +23,8 @@ from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of
 from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
-from sprung.model.diagnosis.investigation.judgement import judged
-from sprung.model.diagnosis.investigation.setup import fitted_samples, without_setup_faults
+from sprung.model.diagnosis.investigation.judgement import judged, unmeasured_share
+from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
@@ -53,12 +53,26 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
     # what a delay, scale or position leaves, estimated as it is, is no physics
     uncertain = any(fault.value is not None for fault in state.setup_faults)
     for number in range(0 if uncertain else state.options.most_findings):
-        count = len(state.found)
+        count, before = len(state.found), state.fit
         state = _next_finding(state, number, tell)
         if len(state.found) == count:
             break
         state = without_idle(state)
+        if _still_strange(state, before):
+            break  # what comes next would be names for what another structure does
     return state
+
+
+def _still_strange(state: Investigation, before: Fit) -> bool:
+    """Whether the last finding leaves most of what was missing, and a model that does not describe the recording."""
+    rules, fit = state.options.rules.verdict, state.fit
+    if state.problem.process_noise:
+        left = float(np.sum(fit.noise.force**2) / np.sum(before.noise.force**2))
+        error = unmeasured_share(fit, fit.noise.force)
+    else:
+        left = fit.chi_square / before.chi_square
+        error = float(np.sqrt(np.mean(misfit(fit))))
+    return left > 1 - rules.carried and error > rules.strange
 
 
 def concluded(state: Investigation, tell: Progress) -> Outcome:

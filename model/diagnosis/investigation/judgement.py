@@ -36,7 +36,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     lost = state.problem.process_noise and after.nrmse > rules.strange
     deciding = errors
     if lost:
-        shares = [_unmeasured(state, fit, level.force) for fit, level in _compared(state, noise)]
+        shares = [unmeasured_share(fit, level.force) for fit, level in _compared(state, noise)]
         deciding = HeldOutErrors(*(np.array([share]) for share in shares))
     if state.setup_faults and not lost:  # they were undone before anything was fitted
         worst = np.sqrt(state.setup_faults[0].before / len(size))
@@ -89,7 +89,7 @@ def _compared(state: Investigation, noise: Noise) -> tuple[tuple[Fit, Noise], ..
     return (state.base, state.base.noise), (state.fit, state.fit.noise), (state.fit, noise)
 
 
-def _unmeasured(state: Investigation, fit: Fit, force: FloatArray) -> float:
+def unmeasured_share(fit: Fit, force: FloatArray) -> float:
     """Forces that nobody measured, as noise of the measured ones, over the inertia forces, rms over rms."""
     structure = fit.forward.plant.structure
     inertia = structure.mass * fit.forward.part.grid.inverse(fit.motions.acceleration)

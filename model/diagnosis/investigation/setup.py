@@ -24,6 +24,7 @@ from sprung.model.diagnosis.investigation.setup_response import ModelResponse, r
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.record.signals import Noise, Signals
+from sprung.model.diagnosis.record.stretch import liveliest
 from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.screening.elements import element_candidates
 from sprung.model.diagnosis.screening.score import Projector
@@ -126,7 +127,7 @@ def _best(
     total = float(np.sum(present))
     accepted: list[_Accepted] = []
     for ranked in _ranked(system, signals, problem, fit, total):
-        for hypothesis in ranked:
+        for hypothesis in _seen_on_a_stretch(ranked, system, signals, declared, problem):
             changed, mended = hypothesis.undo(system, signals)
             try:
                 fitted = fitted_samples(signals, mended, split)
@@ -145,6 +146,32 @@ def _best(
             if not best[0].effect.ordinary:
                 return best
     return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
+
+
+def _seen_on_a_stretch(
+    ranked: list[Hypothesis], system: System, signals: Signals, declared: Noise, problem: Problem
+) -> list[Hypothesis]:
+    """Those of many hypotheses that explain enough of a stretch: what is wrong all the time is wrong there, too.
+
+    Where spectra cannot rank signs and exchanges, most are fitted in vain.
+    """
+    rules, count = problem.rules.setup, problem.part.grid.samples
+    if len(ranked) <= rules.tried + rules.beside or count <= rules.stretch:
+        return ranked
+    first, last = liveliest(signals.sensors[:count], rules.stretch)
+    stretch = signals.part(first, last)
+
+    def left(hypothesis: Hypothesis | None) -> float:
+        changed, mended = (system, stretch) if hypothesis is None else hypothesis.undo(system, stretch)
+        try:
+            return _left(baseline(changed, mended, declared, mended.samples, problem.rules, roughly=True)[1])
+        except (ValueError, FloatingPointError):
+            return np.inf
+
+    most = rules.on_a_stretch * left(None)
+    by_left = [(left(hypothesis), number) for number, hypothesis in enumerate(ranked)]
+    good = sorted(one for one in by_left if one[0] < most)[: rules.tried]
+    return [ranked[number] for number in sorted(number for _, number in good)]
 
 
 def _best_sharpened(accepted: list[_Accepted], declared: Noise, signals: Signals, split: int) -> _Accepted:

@@ -58,6 +58,7 @@ class Forward:
     theta: FloatArray  # (P,)
     terms: tuple[Term, ...] = ()
     start_force: tuple[FloatArray, ...] = ()  # forces of a nearby solution, to start the iteration from
+    known: Plant | None = None  # of a model nearby, taken where its structure is the same
 
     @cached_property
     def plant(self) -> Plant:
@@ -73,7 +74,10 @@ class Forward:
         places = [self.system.elements.index(term.location) for term in linear]
         found = [branch_of(term, e, structure.damping[e]) for term, e in zip(linear, places, strict=True)]
         branches = tuple(branch for branch in found if branch is not None)
-        return Plant(replace(structure, stiffness=stiffness, damping=damping, branches=branches), self.part.grid)
+        structure = replace(structure, stiffness=stiffness, damping=damping, branches=branches)
+        if self.known is not None and self.known.grid == self.part.grid and self.known.structure.same(structure):
+            return self.known
+        return Plant(structure, self.part.grid)
 
     def element_of(self, term: Term) -> SpringDamper:
         """Spring and damper that a law belongs to, at the present parameters."""

@@ -19,6 +19,9 @@ from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE, VELOCITY, rigid_body_modes
 from sprung.model.signals import FloatArray
 
+_ON_A_BIN = 1e-9  # distance of an undamped mode's e^{l dt} from a bin's
+_DEFECTIVE = 1e9  # condition of the modes from which they are too close to each other
+
 
 @dataclass(frozen=True)
 class Plant:
@@ -208,6 +211,31 @@ class Plant:
     def derivative(self, polynomial: FloatArray) -> FloatArray:
         """Time derivative of polynomials over t / length, (DEGREE + 1, ...)."""
         return derivative(polynomial, self.grid.length)
+
+    @cached_property
+    def _free_modes(self) -> tuple[ComplexArray, ComplexArray, ComplexArray] | None:
+        """Modes of the free motion (2n, 2n), transforms of their decays (F, 2n), and the modes' inverse.
+
+        sum_k l^k z^-k = (1 - l^N) / (1 - l / z); None where the modes are too close to each other for that.
+        """
+        grid = self.grid
+        values, vectors = np.linalg.eig(self.structure.state_matrix())
+        if np.linalg.cond(vectors) > _DEFECTIVE:
+            return None
+        left = 1 - np.exp(-1j * grid.omega * grid.step)[:, None] * np.exp(values * grid.step)
+        near = np.abs(left) < _ON_A_BIN
+        decays = np.where(near, grid.samples, (1 - np.exp(values * grid.length)) / np.where(near, 1.0, left))
+        return vectors, decays / np.sqrt(grid.samples), np.linalg.inv(vectors)
+
+    def free_transforms(self, rows: FloatArray) -> ComplexArray:
+        """Transforms of rows e^{A t} over the samples: (m, 2n) -> (F, m, 2n)."""
+        if self._free_modes is None:
+            return self.grid.forward(self.free_motion(rows, self.grid.step, self.grid.samples))
+        vectors, decays, inverse = self._free_modes
+        modal = (rows @ vectors).T[:, :, None] * inverse[:, None, :]  # (2n, m, 2n)
+        columns = decays @ modal.reshape(len(modal), -1)  # one product for all bins
+        found: ComplexArray = columns.reshape(len(decays), *modal.shape[1:])
+        return found
 
     def free_motion(self, rows: FloatArray, step: float, count: int) -> FloatArray:
         """rows e^{A t} at t = 0, step, ...: (m, 2n) -> (count, m, 2n), by doubling."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -65,6 +65,11 @@ class Structure:
             sensor_kind=mechanics.sensor_kind[sensors],
             body_of_dof=mechanics.body_of_dof,
         )
+
+    def same(self, other: Structure) -> bool:
+        """Whether another structure has the same matrices and values."""
+        pairs = ((getattr(self, one.name), getattr(other, one.name)) for one in fields(self) if one.name != "branches")
+        return self.branches == other.branches and all(np.array_equal(mine, theirs) for mine, theirs in pairs)
 
     @property
     def K(self) -> FloatArray:

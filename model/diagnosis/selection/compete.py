@@ -138,14 +138,16 @@ def compete(
 
 def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence, none of which could lead if only it were fitted on: a fit that still falls is no gain."""
+    stuck: list[Fit] = []  # that were fitted on and got no further
     for _ in range(problem.rules.selection.settling):
         best = trials[0].evidence
-        unsettled = [t for t in trials if t.finished and not t.fit.converged]
+        unsettled = [t for t in trials if t.finished and not t.fit.converged and all(t.fit is not one for one in stuck)]
         falling = [t for t in unsettled if t.evidence + t.fit.left / t.fit.grain > best]
         if not falling:
             break
         others = [t for t in trials if all(t is not one for one in falling)]
         again = share(lambda trial: _finished(problem, base, trial), falling, WORKERS)
+        stuck += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
         trials = _graded(problem, base, [*again, *others])
     return trials
 

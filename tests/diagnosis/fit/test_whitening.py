@@ -37,3 +37,16 @@ def test_slope_of_the_determinant_agrees_with_a_finite_difference(weighed):
     change = ((moved.of_inputs - forward.of_inputs) / step)[problem.part.grid.band]
     expected = (Whitener.of(moved, problem.noise).log_det - whitener.log_det) / step
     assert whitener.log_det_slope(change) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_plant_nearby_is_taken_where_the_structure_is_the_same(weighed):
+    problem, forward, _ = weighed
+    same, other = (Point(np.array([0.0, 0.0, step, 0.0]), (), np.zeros(4)) for step in (0.0, 1e-9))
+    assert problem.forward(same, known=forward.plant).plant is forward.plant
+    assert problem.forward(other, known=forward.plant).plant is not forward.plant
+
+
+def test_transforms_of_the_free_motion_are_those_of_its_samples(weighed):
+    problem, forward, _ = weighed
+    sampled = problem.part.grid.forward(forward.free_rows())
+    np.testing.assert_allclose(problem.free_columns(forward), sampled, atol=1e-9 * np.abs(sampled).max())

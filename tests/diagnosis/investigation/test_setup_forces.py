@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from sprung.model.diagnosis.api import diagnose
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.rules import RULES
 from sprung.model.signals import FloatArray
 from sprung.model.system import parse_system
 
@@ -101,6 +102,14 @@ def test_a_wrong_set_up_under_a_measured_force_is_named(
     assert (first.effect, first.location) == (effect, place)
     if value is not None:
         assert first.parameters[0].value == pytest.approx(value, rel=0.01)
+
+
+@pytest.mark.slow
+def test_of_many_hypotheses_those_are_fitted_that_explain_a_stretch() -> None:
+    short = Options(rules=RULES.varied("setup", "stretch", 700))
+    report = diagnose(parse_system(TOWER), ShakerTest(wrong(tower(), "exchanged")), short)
+    (first,) = report.findings
+    assert (report.verdict, first.effect, first.location) == ("sensor_fault", "channels_swapped", "a1|a3")
 
 
 def test_a_right_set_up_under_a_measured_force_is_consistent() -> None:

@@ -1,0 +1,50 @@
+"""Fits that still fall are fitted on before the best of them leads; what got no further is not tried again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.diagnosis.selection import compete
+from sprung.model.diagnosis.selection.compete import Trial
+
+
+@dataclass(frozen=True)
+class FallingFit:
+    """As much of a fit as the order of trials looks at."""
+
+    left: float
+    converged: bool = False
+    grain: float = 1.0
+    reduced: float = 1.0
+    chi_square: float = 1.0
+
+
+def trial(evidence: float, left: float) -> Trial:
+    nothing: Any = None
+    fit: Any = FallingFit(left)
+    return Trial(nothing, fit, evidence, evidence, evidence, 1)
+
+
+@pytest.mark.parametrize(("step", "calls", "leading"), [(0.0, 1, 100.0), (30.0, 3, 150.0)])
+def test_what_could_lead_is_fitted_on_while_it_gets_further(
+    monkeypatch: pytest.MonkeyPatch, step: float, calls: int, leading: float
+) -> None:
+    tried = []
+
+    def fitted_on(problem: Any, base: Any, one: Trial) -> Trial:
+        tried.append(one)
+        fit: Any = FallingFit(one.fit.left)
+        return replace(one, fit=fit, evidence=one.evidence + step)
+
+    monkeypatch.setattr(compete, "_finished", fitted_on)
+    problem: Any = SimpleNamespace(process_noise=True, rules=RULES)
+    base: Any = None
+    settled = replace(trial(100.0, 0.0), fit=replace(trial(100.0, 0.0).fit, converged=True))
+    order = compete._settled(problem, base, [settled, trial(60.0, 50.0)])
+    assert len(tried) == calls
+    assert order[0].evidence == leading
