@@ -233,16 +233,30 @@ def _stribeck(random: np.random.Generator) -> SimulatedRig:
     )
 
 
+def _moved() -> Callable[[float], float]:
+    """How far a deflection has come since the last step: a memory follows the way, not the rate at a step's end."""
+    last: float | None = None
+
+    def since(x: float) -> float:
+        nonlocal last
+        way = 0.0 if last is None else x - last
+        last = x
+        return way
+
+    return since
+
+
 def _presliding(random: np.random.Generator, excess: tuple[float, float]) -> SimulatedRig:
     force, reach, fall = random.uniform(80, 300), random.uniform(2e-4, 1e-3), random.uniform(0.02, 0.05)
     static = force * (1 + random.uniform(*excess))
-    stiffness, z = force / reach, 0.0
+    stiffness, z, moved = force / reach, 0.0, _moved()
 
     def step(x: float, v: float, h: float) -> float:
         nonlocal z
-        limit = (force + (static - force) * math.exp(-((v / fall) ** 2))) / stiffness
-        target = math.copysign(limit, v)
-        z = target + (z - target) * math.exp(-abs(v) * h / limit)
+        way = moved(x)
+        limit = (force + (static - force) * math.exp(-((way / h / fall) ** 2))) / stiffness
+        target = math.copysign(limit, way)
+        z = target + (z - target) * math.exp(-abs(way) / limit)
         return stiffness * z
 
     return SimulatedRig(step, {"yield_force": force, "yield_displacement": reach})
@@ -250,12 +264,17 @@ def _presliding(random: np.random.Generator, excess: tuple[float, float]) -> Sim
 
 def _bouc_wen(random: np.random.Generator) -> SimulatedRig:
     force, reach, n = random.uniform(100, 500), random.uniform(5e-4, 2e-3), random.uniform(1.0, 2.0)
-    z = 0.0  # of the yield displacement
+    z, moved = 0.0, _moved()  # of the yield displacement
+
+    def grows(z: float, way: float) -> float:
+        rounded: float = abs(z) ** (n - 1) * (0.7 * abs(way) * z + 0.3 * way * abs(z))
+        return (way - rounded) / reach
 
     def step(x: float, v: float, h: float) -> float:
         nonlocal z
-        size: float = abs(z) ** (n - 1)
-        z += h / reach * (v - size * (0.7 * abs(v) * z + 0.3 * v * abs(z)))
+        way = moved(x)
+        first = grows(z, way)
+        z += 0.5 * (first + grows(z + first, way))
         return force * z
 
     return SimulatedRig(step, {"yield_force": force, "yield_displacement": reach})

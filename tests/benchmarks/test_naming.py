@@ -54,6 +54,21 @@ def test_a_rig_that_no_catalogue_has_takes_energy_and_gives_none(name: str) -> N
     assert np.trapezoid(loop[last], d[last]) > 0
 
 
+@pytest.mark.slow
+def test_what_a_single_loop_shows_is_not_put_down_to_several_laws() -> None:
+    line = tried("magneto-rheological after Kwok", "sine")
+    assert line["verdict"] == "unknown_physics", line
+
+
+@pytest.mark.parametrize("name", ["lugre", "bouc_wen"])
+def test_a_memory_is_integrated_along_its_way(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig, d, signal = RIGS[name], moved("random", np.random.default_rng(4)), levels(np.random.default_rng(0))
+    coarse = forces(rig, d, 7, signal)
+    monkeypatch.setattr("sprung.benchmarks.naming.FINER", 64)
+    loop = coarse - forces(RIGS["nothing"], d, 7, signal)
+    assert np.std(coarse - forces(rig, d, 7, signal)) < 2e-3 * np.std(loop)
+
+
 def test_the_motions_stay_within_the_travel() -> None:
     for motion in MOTIONS:
         d = moved(motion, np.random.default_rng(2))

@@ -19,7 +19,7 @@ from sprung.model.diagnosis.component.fit import (
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
-from sprung.model.diagnosis.component.piece import SURFACE, Lag
+from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Lag
 from sprung.model.diagnosis.component.search import (
     Progress as Told,
 )
@@ -53,6 +53,11 @@ from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+
+_ONE_LOOP = (
+    "the test repeats one loop, which several laws together imitate whatever made it; "
+    "another amplitude or rate, or random motion, would tell them apart"
+)
 
 
 @dataclass(frozen=True)
@@ -111,12 +116,17 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, tell=tell, given=one.given)
     base, final = found.base, found.final
-    judged = _established(Judged(one, found, base, final, final.floor, turned))
+    judged = Judged(one, found, base, final, final.floor, turned)
+    alone = _only_one_loop(judged)
+    if alone:
+        judged = replace(judged, record=replace(one, notes=(*one.notes, f"{one.element}: {_ONE_LOOP}")))
+    else:
+        judged = _established(judged)
     share = judged.errors.explained(rules)
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
     least = _least(judged.found.steps, one.task.rules)
     carried = bool(judged.found.steps) and share is not None and share >= least
-    if left and not carried:
+    if alone or (left and not carried):
         tell("what is left, as a formula")
         told = _with_formula(judged)
         if told is not None:
@@ -124,6 +134,17 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
         tell("what is left, as an unnamed force")
         judged = replace(_with_surface(_closest(judged)), named=False)
     return judged
+
+
+def _only_one_loop(judged: Judged) -> bool:
+    """Whether a hysteresis beside other laws was seen along one loop alone, which such sums imitate whatever it is.
+
+    The held-out part, the same loop again, refutes none of them.
+    """
+    task, found = judged.final.task, judged.found.steps
+    if len(found) < 2 or task.signals or not any(step.chosen.last.kind is HYSTERESIS for step in found):
+        return False
+    return task.motion.repeats(task.rules)
 
 
 def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:

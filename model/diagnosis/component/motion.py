@@ -24,6 +24,7 @@ ComplexArray = NDArray[np.complexfloating]
 _FINER, _MOST = 4, 100_000  # steps per sample along which memories are followed, and all of them at most
 _ORDER = 6  # of the differences that tell white noise
 _BLOCKS = 40  # of them, the median counts: bursts are no noise
+_CYCLES = 6  # turning points at least of what repeats itself
 _STILL_SAMPLES = 25  # at least, of a standstill
 
 
@@ -66,6 +67,15 @@ class ElementMotion:
     def middle(self) -> float:
         """The position half way between the ends of the travel, m."""
         return 0.5 * float(self.deflection.max() + self.deflection.min())
+
+    def repeats(self, rules: ComponentRules = RULES.component) -> bool:
+        """Whether it is one cycle again and again: of one travel and one duration, as of a sine test."""
+        at = turning_points(self.deflection, rules.turn * float(np.ptp(self.deflection)))
+        if len(at) < _CYCLES:
+            return False
+        travels, durations = np.abs(np.diff(self.deflection[at])), self.time[at[2:]] - self.time[at[:-2]]
+        low, middle, high = np.quantile(np.column_stack([travels[1:], durations]), [0.1, 0.5, 0.9], axis=0)
+        return bool(np.all(high - low < rules.one_cycle * middle))
 
     def with_noise(self, deflection: float, rate: float) -> ElementMotion:
         """With noise of other origin, m and m/s, beside its own."""
@@ -126,6 +136,27 @@ class ElementMotion:
             dense=None,
             stride=1,
         )
+
+
+def turning_points(series: FloatArray, least: float) -> NDArray[np.intp]:
+    """Samples at which a series (T,) turns by more than `least`."""
+    extremes = np.flatnonzero(np.diff(np.sign(np.diff(series))) != 0) + 1
+    found: list[int] = []
+    way = 0
+    for at in extremes.tolist():
+        moved = series[at] - series[found[-1]] if found else 0.0
+        if not found:
+            found.append(at)
+        elif moved * way > 0 or (way == 0 and abs(moved) > least):
+            way = 1 if moved > 0 else -1
+            if len(found) > 1:
+                found[-1] = at  # further on in the same way
+            else:
+                found.append(at)
+        elif way and -moved * way > least:
+            found.append(at)
+            way = -way
+    return np.array(found, dtype=np.intp)
 
 
 def without_gaps(series: FloatArray) -> FloatArray:

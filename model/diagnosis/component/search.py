@@ -23,7 +23,7 @@ from sprung.model.diagnosis.component.fit import (
     refined,
     spread,
 )
-from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Lag, LawPiece, Part
+from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Following, Lag, LawPiece, Part
 from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
@@ -94,7 +94,7 @@ def search(
         if current.fit.at_noise:
             break
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
-        ranked = next_laws(current.fit, pieces, rules)
+        ranked = next_laws(current.fit, _beside(pieces, current.fit.model, len(given.pieces)), rules)
         if number == 0:
             alone = tuple(ranked)
             for trial in ranked:
@@ -108,6 +108,16 @@ def search(
             steps = _renamed(steps, current, len(given.pieces))
     final = refined(fine, current.fit.model)
     return Search(refined(fine, base.model), final, tuple(steps), screened, alone)
+
+
+def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> tuple[LawPiece, ...]:
+    """Laws that a record can tell beside those that were found, which come after the given ones.
+
+    Any loop is a sum of a friction and a hysteresis, so that two of them together imitate what neither is.
+    """
+    if not any(piece.dissipates for piece in model.pieces[given:]):
+        return pieces
+    return tuple(piece for piece in pieces if isinstance(piece, Following) or not piece.dissipates)
 
 
 def _rank(fits: list[ComponentFit], before: ComponentFit, rules: ComponentRules) -> list[Ranked]:
@@ -272,7 +282,7 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     best = chosen
     for index in range(given, len(model.pieces) - 1):
         rest = fitted(chosen.fit.task, model.without(index))
-        for rival in next_laws(rest, pieces, rules)[:2]:
+        for rival in next_laws(rest, _beside(pieces, rest.model, given), rules)[:2]:
             same = _rank([rival.fit, best.fit], rest, rules)
             if same[0].fit is rival.fit and same[0].evidence > same[1].evidence + rules.naming_margin:
                 best = same[0]

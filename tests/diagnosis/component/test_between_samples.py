@@ -60,3 +60,19 @@ def test_a_motion_without_noise_is_made_no_noisier() -> None:
     moved = replace(motion, deflection_noise=1e-4, rate_noise=1e-3).noisier()
     assert np.std(moved.deflection - motion.deflection) == pytest.approx(1e-4)
     assert np.std(moved.rate - motion.rate) == pytest.approx(1e-3, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("motion", "repeats"), [("sine", True), ("two amplitudes", False), ("sweep", False), ("several sines", False)]
+)
+def test_one_cycle_again_and_again_is_told_from_other_motion(motion: str, repeats: bool) -> None:
+    t = np.arange(4000) / 200.0
+    sine = 0.01 * np.sin(2 * np.pi * 1.3 * t)
+    shapes = {
+        "sine": sine,
+        "two amplitudes": np.where(t < 10, 0.6, 1.0) * sine,
+        "sweep": 0.01 * np.sin(2 * np.pi * (0.5 + 0.1 * t) * t),
+        "several sines": shaken(200.0),
+    }
+    noise = 1e-5 * np.random.default_rng(0).standard_normal(len(t))
+    assert element_motion(shapes[motion] + noise, None, 200.0).repeats() is repeats
