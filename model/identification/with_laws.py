@@ -40,7 +40,7 @@ def acting_laws(system: System) -> list[Acting]:
         law = placed.law
         if isinstance(law, SensorLaw) or is_linear(placed):
             continue  # undone in the signals; part of the mechanics
-        if not isinstance(law, ElementLaw) or law.memory > 1 or law.name.startswith("time_varying"):
+        if not isinstance(law, ElementLaw) or law.memory > 1 or law.over_time:
             raise UnusableWindow(
                 f"{placed.location}: windows cannot be identified with {law.name} in place; "
                 "diagnose, simulate and compare can use it"

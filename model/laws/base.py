@@ -208,12 +208,18 @@ class ElementLaw(Parametrised):
     nuisance: bool = False
     screened: bool = True  # sought in systems of bodies; else only where the force of its element is measured
     at: tuple[str, ...] = ()  # elements that it may act at; empty: all
+    over_time: bool = False  # whether its force depends on the time since the recording began
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     knees: tuple[int, ...] = ()  # parameters that are rates at which the slope changes, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise
     parts: tuple[tuple[str, str], ...] = ()  # both of every part, where the force is a sum of such
+
+    @property
+    def of_formula(self) -> bool:
+        """Whether only the text of its force tells what it is."""
+        return not self.listed and bool(self.formula)
 
     def clip(self, p: Sequence[float]) -> FloatArray:
         """Nearest admissible values, shape (P,)."""

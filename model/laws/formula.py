@@ -45,6 +45,7 @@ def formula_law(
         sentence=f"a force {formula}",
         strength=None,
         listed=False,
+        over_time="t" in used,
         memory=int(rate is not None),
         memory_rate=no_memory if rate is None else _rate(rate, parameters),
         formula=formula,

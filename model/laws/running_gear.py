@@ -20,7 +20,9 @@ from sprung.model.signals import FloatArray
 _COUNT = 8  # harmonics of a dip
 
 
-def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: str, where: Where) -> SupportLaw:
+def _dip_law(
+    name: str, title: str, width: float, *, looks_like: str, confused_with: tuple[str, ...], sentence: str, where: Where
+) -> SupportLaw:
     """A Gaussian dip of relative `width` per period, as its first harmonics.
 
     The mean is left out (it is a static deflection), the harmonics are smooth in every parameter, and what they
@@ -39,7 +41,7 @@ def _dip_law(name: str, title: str, width: float, *, looks_like: str, sentence: 
         harmonics=tuple(harmonics.tolist()),
         absent=(0.0, 1.0, 0.0),
         looks_like=looks_like,
-        confused_with=("external_force", "wheel_flat" if name == "rail_joints" else "rail_joints"),
+        confused_with=confused_with,
         sentence=sentence,
         where=where,
         prior_cost=RARE,
@@ -51,6 +53,7 @@ WHEEL_FLAT = _dip_law(
     "wheel flat",
     0.02,
     looks_like="lines at the wheel's revolutions and their harmonics, at one wheel",
+    confused_with=("external_force", "rail_joints"),
     sentence="a flat of {depth}, {frequency} times a second",
     where="support",
 )
@@ -59,6 +62,7 @@ RAIL_JOINTS = _dip_law(
     "rail joints",
     0.06,
     looks_like="lines at speed over rail length, at both wheels of an axle",
+    confused_with=("external_force", "wheel_flat"),
     sentence="dips of {depth} at the rail joints, {frequency} a second",
     where="axle",
 )

@@ -21,7 +21,7 @@ from sprung.model.diagnosis.ambient.windows import (
 )
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
-from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, verdict_of
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, kind_named, verdict_of
 from sprung.model.diagnosis.record.channels import Prepared, TooLittleError
 from sprung.model.diagnosis.report.report import (
     Finding,
@@ -136,7 +136,7 @@ def _report(
     names = prepared.signals.sensor_names
     rules = options.rules.ambient
     findings = _findings(system, prepared, windows, pooled, rules)
-    verdict = verdict_of([f.effect for f in findings], errors, options.rules.verdict)
+    verdict = verdict_of([kind_named(f.effect) for f in findings], errors, options.rules.verdict)
     left = errors.unexplained(options.rules.verdict)
     adequate = float(np.mean([w.adequate for w in windows]))
     strange = verdict == "unknown_physics" and float(np.mean(errors.after**2)) > rules.strange

@@ -38,7 +38,7 @@ from sprung.model.diagnosis.component.words import (
     unknown_finding,
 )
 from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
-from sprung.model.diagnosis.investigation.verdict import NO_FAULTS, SENSOR_FAULTS, HeldOutErrors, verdict_of
+from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, kind_named, verdict_of
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
@@ -232,8 +232,8 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
         findings += _findings(one)
     findings.sort(key=_rank)
     rules = replace(options.rules.verdict, carried=options.rules.component.named)
-    verdict = verdict_of([f.effect for f in findings], errors, rules)
-    explained = errors.explained(rules) if any(f.effect not in NO_FAULTS for f in findings) else None
+    verdict = verdict_of([kind_named(f.effect) for f in findings], errors, rules)
+    explained = errors.explained(rules) if any(not _is_nuisance(f) for f in findings) else None
     left = errors.unexplained(rules)
     names = [j.record.sensor for j in judged]
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
@@ -267,8 +267,12 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
 
 def _rank(finding: Finding) -> tuple[int, float]:
     """Set-up faults first, laws by evidence, nuisances last."""
-    order = 0 if finding.effect in SENSOR_FAULTS else (2 if finding.effect in NO_FAULTS else 1)
+    order = {EffectKind.FAULT: 0, EffectKind.NUISANCE: 2}.get(kind_named(finding.effect), 1)
     return order, finding.delta_bic if finding.delta_bic is not None else 0.0
+
+
+def _is_nuisance(finding: Finding) -> bool:
+    return kind_named(finding.effect) is EffectKind.NUISANCE
 
 
 def _findings(one: Judged) -> list[Finding]:
@@ -339,7 +343,7 @@ def _summary(verdict: str, findings: list[Finding], explained: float | None, lef
         text = "The nominal structure explains the recording down to the noise."
         nuisance = "; ".join(f.sentence for f in findings)
         return f"{text} {nuisance[:1].upper()}{nuisance[1:]}." if nuisance else text
-    text = "; ".join(f.sentence for f in findings if f.effect not in NO_FAULTS)
+    text = "; ".join(f.sentence for f in findings if not _is_nuisance(f))
     if not text:
         text = "No law of the catalogue explains what was measured"
     if explained is not None and explained > 0:
@@ -348,7 +352,7 @@ def _summary(verdict: str, findings: list[Finding], explained: float | None, lef
         text += f"; explains {exact} % of the excess error"
     if left.share > 0:
         text += f"; still unexplained: {left.where}"
-    nuisance = "; ".join(f.sentence for f in findings if f.effect in NO_FAULTS)
+    nuisance = "; ".join(f.sentence for f in findings if _is_nuisance(f))
     return f"{text}{'; ' + nuisance if nuisance else ''}."
 
 

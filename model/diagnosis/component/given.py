@@ -10,7 +10,6 @@ from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.laws import ElementLaw
-from sprung.model.laws.formula import EFFECT
 from sprung.model.laws.gas import PRELOAD
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
@@ -43,7 +42,7 @@ def given_model(system: System, element: str, notes: list[str]) -> tuple[Compone
 
 
 def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
-    if placed.law.name == EFFECT and isinstance(placed.law, ElementLaw):
+    if isinstance(placed.law, ElementLaw) and placed.law.of_formula:
         formula = given_piece(placed.law, placed.values)
         return formula, () if formula is None else formula.shape_of(placed.values)
     for piece in PIECES:
@@ -76,7 +75,7 @@ def identified_laws(
             LawParameter(spec.name, float(value), float(s) if np.isfinite(s) else 0.0, spec.unit)
             for spec, value, s in zip(law.parameters, numbers, sigma, strict=True)
         )
-        texts = (law.formula, law.memory_formula) if law.name == EFFECT else ("", "")
+        texts = (law.formula, law.memory_formula) if law.of_formula else ("", "")
         found.append(IdentifiedLaw(element, law.name, parameters, formula=texts[0], memory=texts[1]))
     deviation = float(np.sqrt(max(full[0, 0], 0.0)))
     if abs(fit.preload) > deviation:

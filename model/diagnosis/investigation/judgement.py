@@ -9,12 +9,11 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
-from sprung.model.diagnosis.investigation.verdict import UNLISTED, HeldOutErrors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, bounded_noise, kind_of, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
@@ -41,14 +40,13 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     if state.setup_faults and not lost:  # they were undone before anything was fitted
         worst = np.sqrt(state.setup_faults[0].before / len(size))
         deciding = replace(errors, before=np.maximum(errors.before, worst))
-    effects = [fault.effect.name for fault in state.setup_faults]
-    effects += [fault.term.law.name for fault in state.input_faults]
-    effects += [SENSOR_STUCK.name] * len(state.prepared.stuck) + [SENSOR_NOISE.name] * len(noisy)
-    effects += [found.trial.term.law.name for found in state.found]
-    verdict = verdict_of(effects, deciding, rules)
+    physics = [kind_of(found.trial.term.law) for found in state.found]
+    kinds = [kind_of(fault.effect) for fault in state.setup_faults]
+    kinds += [kind_of(fault.term.law) for fault in state.input_faults]
+    kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
+    verdict = verdict_of(kinds + physics, deciding, rules)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
-    first = state.found[0].trial.term.law.name if state.found else UNKNOWN
-    carried = verdict != "unknown_physics" or first in UNLISTED
+    carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
         errors=errors,
         verdict=verdict,

@@ -13,21 +13,47 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 from typing import Literal
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS
+from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS, SetupEffect
 from sprung.model.diagnosis.rules import RULES, VerdictRules
-from sprung.model.laws import CATALOGUE
+from sprung.model.laws import CATALOGUE, Law
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.formula import EFFECT
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
-SENSOR_FAULTS = frozenset([law.name for law in CATALOGUE if law.fault] + [effect.name for effect in SETUP_EFFECTS])
-UNLISTED = frozenset({UNKNOWN, EFFECT})  # physics that no law of the catalogue explains
-NO_FAULTS = frozenset({law.name for law in CATALOGUE if law.nuisance})
+
+
+class EffectKind(Enum):
+    """What a finding of an effect speaks for."""
+
+    LISTED = "physics of a law"
+    UNLISTED = "physics that no law explains"
+    FAULT = "a fault of the measurement"
+    NUISANCE = "reported, and no reason for any verdict"
+
+
+def kind_of(effect: Law | SetupEffect) -> EffectKind:
+    """The kind of a law or of a wrong set-up."""
+    if isinstance(effect, SetupEffect) or effect.fault:
+        return EffectKind.FAULT
+    if effect.nuisance:
+        return EffectKind.NUISANCE
+    return EffectKind.LISTED if effect.listed else EffectKind.UNLISTED
+
+
+def kind_named(name: str, catalogue: Sequence[Law] = CATALOGUE) -> EffectKind:
+    """The kind of a reported effect, by the laws that the diagnosis knew and those that it makes as it finds them."""
+    known: dict[str, Law | SetupEffect] = {effect.name: effect for effect in SETUP_EFFECTS}
+    known |= {law.name: law for law in catalogue}
+    if name in known:
+        return kind_of(known[name])
+    made_of_no_law = name in (UNKNOWN, EFFECT)  # a surface, a formula; others follow a measured signal
+    return EffectKind.UNLISTED if made_of_no_law else EffectKind.LISTED
 
 
 @dataclass(frozen=True)
@@ -57,11 +83,11 @@ class HeldOutErrors:
         return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
 
 
-def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRules = RULES.verdict) -> Verdict:
-    """The verdict for findings of the given effects, best first, and the errors that they leave."""
+def verdict_of(kinds: Sequence[EffectKind], errors: HeldOutErrors, rules: VerdictRules = RULES.verdict) -> Verdict:
+    """The verdict for findings of the given kinds, best first, and the errors that they leave."""
     left = bool(np.any(errors.unexplained(rules) > 0))
-    named = [effect for effect in effects if effect not in NO_FAULTS]
-    faults_only = bool(named) and all(effect in SENSOR_FAULTS for effect in named)
+    named = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
+    faults_only = bool(named) and all(kind is EffectKind.FAULT for kind in named)
     if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and (left or not faults_only):
         return "unknown_physics"  # no model of the vehicle, whatever the noise
     if not named:
@@ -69,10 +95,10 @@ def verdict_of(effects: Sequence[str], errors: HeldOutErrors, rules: VerdictRule
     share = errors.explained(rules)
     if left and share is not None and share < rules.carried:
         return "unknown_physics"
-    physics = [effect for effect in named if effect not in SENSOR_FAULTS]
+    physics = [kind for kind in named if kind is not EffectKind.FAULT]
     if not physics:
         return "sensor_fault"
-    return "unknown_physics" if physics[0] in UNLISTED else "missing_physics"
+    return "unknown_physics" if physics[0] is EffectKind.UNLISTED else "missing_physics"
 
 
 def bounded_noise(

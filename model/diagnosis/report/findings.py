@@ -8,7 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.setup import SetupFault
-from sprung.model.diagnosis.investigation.verdict import UNLISTED
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of, with_deviation
 from sprung.model.diagnosis.report.values import formula_of, law_parameters
@@ -33,7 +33,8 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
-    if said.verdict == "unknown_physics" and not any(f.effect in UNLISTED for f in findings):
+    kinds = [kind_named(finding.effect, course.system.catalogue) for finding in findings]
+    if said.verdict == "unknown_physics" and EffectKind.UNLISTED not in kinds:
         findings.insert(len(course.setup_faults), _unknown_finding(outcome))
     return findings
 

@@ -16,7 +16,6 @@ from sprung.model.laws import ElementLaw, Motion
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import StaticLaw
 from sprung.model.laws.expression import MOTION, parse
-from sprung.model.laws.formula import EFFECT
 from sprung.model.laws.spline import SurfaceLaw
 from sprung.model.signals import FloatArray
 
@@ -114,7 +113,7 @@ def _surface(
 def _of_both(term: Term) -> bool:
     """Whether a term is a formula in deflection and rate: a curve over one of them says too little of it."""
     law = term.law
-    if law.name != EFFECT or not isinstance(law, ElementLaw) or law.memory:
+    if not isinstance(law, ElementLaw) or not law.of_formula or law.memory:
         return False
     return {"d", "v"} <= parse(law.formula, {*law.names, *MOTION}).names
 

@@ -88,4 +88,4 @@ def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:
 def formula_of(term: Term) -> tuple[str, str]:
     """Text of the force and of its hidden state's rate, of a law that is known by them alone; empty for others."""
     law = term.law
-    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and not law.listed else ("", "")
+    return (law.formula, law.memory_formula) if isinstance(law, ElementLaw) and law.of_formula else ("", "")

@@ -17,7 +17,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
     SetupPlace,
 )
 from sprung.model.diagnosis.investigation.setup_response import Group
-from sprung.model.diagnosis.investigation.verdict import SENSOR_FAULTS
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.system import load_system
 from tests.diagnosis_cases import quarter_car, simulate
@@ -25,7 +25,7 @@ from tests.diagnosis_cases import quarter_car, simulate
 
 def test_every_kind_is_a_fault_of_the_measurement_with_words_of_its_own() -> None:
     for effect in SETUP_EFFECTS:
-        assert effect.name in SENSOR_FAULTS and not effect.ordinary
+        assert kind_named(effect.name) is EffectKind.FAULT and not effect.ordinary
         told = effect.told(SetupPlace("a|b", detail="lower car"), "7")
         assert told.startswith("a and b: ") and ("7" in told) == (effect.parameter is not None)
     assert ONE_GAIN.ordinary

@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, bounded_noise, verdict_of
+from sprung.model.diagnosis.investigation.verdict import (
+    EffectKind,
+    HeldOutErrors,
+    bounded_noise,
+    kind_named,
+    kind_of,
+    verdict_of,
+)
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.sensor_faults import SENSOR_GAIN
 
 
 def errors(before: float, after: float, floor: float) -> HeldOutErrors:
@@ -28,7 +39,7 @@ def errors(before: float, after: float, floor: float) -> HeldOutErrors:
     ],
 )
 def test_verdicts(effects: list[str], before: float, after: float, floor: float, verdict: str) -> None:
-    assert verdict_of(effects, errors(before, after, floor)) == verdict
+    assert verdict_of([kind_named(effect) for effect in effects], errors(before, after, floor)) == verdict
 
 
 def test_no_all_clear_above_twice_the_floor() -> None:
@@ -56,3 +67,11 @@ def test_a_floor_learnt_from_the_misfit_is_bounded_by_what_was_declared_or_measu
     np.testing.assert_allclose(
         bounded_noise(np.array([300.0, 1.0]), np.array([5.0, 1.2]), np.array([4.0, 1.0])), [7.5, 1.0]
     )
+
+
+def test_a_fault_among_the_laws_of_a_user_is_a_fault() -> None:
+    own = replace(SENSOR_GAIN, name="icing")
+    assert kind_of(own) is EffectKind.FAULT
+    assert kind_named("icing", (*CATALOGUE, own)) is EffectKind.FAULT
+    assert kind_named("formula") is EffectKind.UNLISTED
+    assert verdict_of([kind_of(own)], errors(0.3, 0.03, 0.03)) == "sensor_fault"
