@@ -2,7 +2,8 @@
 
 `--kills N` sends SIGKILL to real processes: to a service that takes windows, recordings and diagnoses, and to commands
 that replay, migrate, forget, back up and restore.  `--cuts N` replays the system calls of a traced service onto a disk
-that loses what was not synced, and looks at what is left at N moments.  `--load MINUTES` sends 100 windows a second.
+that loses what was not synced, and looks at what is left at N moments.  `--load-minutes N` sends the windows of 100
+vehicles (`--vehicles`), one a second each; `--soak-minutes N` sends few, uploads and looks at pages meanwhile.
 With `--folder` what was done is kept: the same call goes on where the last one was ended.
 """
 
@@ -17,15 +18,24 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from sprung.benchmarks.trust_load import load
+from sprung.benchmarks.trust_load import VEHICLES, load
 from sprung.benchmarks.trust_power import power_cuts
 from sprung.benchmarks.trust_ride import RestlessRide
+from sprung.benchmarks.trust_soak import soak
 from sprung.benchmarks.trust_steps import KILLS
 from sprung.benchmarks.trust_zygote import Zygote
 
 
 def run(
-    kills: int = 20, *, cuts: int = 0, load_minutes: float = 0.0, folder: str = "", minutes: float = 0.0, seed: int = 1
+    kills: int = 20,
+    *,
+    cuts: int = 0,
+    load_minutes: float = 0.0,
+    vehicles: int = VEHICLES,
+    soak_minutes: float = 0.0,
+    folder: str = "",
+    minutes: float = 0.0,
+    seed: int = 1,
 ) -> Iterator[dict[str, Any]]:
     """Figures of each part that is asked for.
 
@@ -39,7 +49,9 @@ def run(
         if cuts:
             yield from power_cuts(place / "power", cuts, seed)
         if load_minutes:
-            yield from load(Path(temporary), load_minutes)
+            yield from load(Path(temporary), load_minutes, vehicles)
+        if soak_minutes:
+            yield from soak(Path(temporary), soak_minutes)
 
 
 def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[str, Any]]:

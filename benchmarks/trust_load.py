@@ -27,7 +27,7 @@ WARM_UP = 0.2  # share of the time after which memory counts
 
 
 @dataclass
-class _Sent:
+class Sent:
     """What the clients saw."""
 
     seconds: list[float] = field(default_factory=list)  # from when a window was due to its answer
@@ -39,28 +39,31 @@ class _Sent:
 def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dict[str, Any]]:
     """Figures of one run; every vehicle sends a window of one second each second."""
     parts = window_body(load_system()).split(b'"bench"')
-    sent, memory = _Sent(), list[tuple[float, int]]()
+    sent, memory = Sent(), list[tuple[float, int]]()
     with Served(folder / "load", system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0
         ends = begun + 60 * minutes
         threads = [
             threading.Thread(
-                target=_drive, args=(served.port, parts, range(n, vehicles, CONNECTIONS), begun, ends, sent)
+                target=drive, args=(served.port, parts, range(n, vehicles, CONNECTIONS), begun, ends, sent)
             )
             for n in range(CONNECTIONS)
         ]
         for thread in threads:
             thread.start()
         while any(thread.is_alive() for thread in threads):
-            memory.append((time.monotonic() - begun, _resident(served.process.pid)))
+            memory.append((time.monotonic() - begun, resident(served.process.pid)))
             time.sleep(1.0)
         served.kill()
-    yield from _figures(folder / "load" / "sprung.db", sent, memory, minutes, vehicles)
+    yield from figures(folder / "load" / "sprung.db", sent, memory, minutes, vehicles)
 
 
-def _drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: _Sent) -> None:
-    """Windows of some vehicles, one after the other, each when it is due."""
+def drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: Sent) -> None:
+    """Windows of some vehicles, one after the other, each when it is due.
+
+    parts: of a body, before and after the vehicle's name.
+    """
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     second = 0
     while (due := begun + second) < ends:
@@ -94,7 +97,7 @@ def _post(connection: http.client.HTTPConnection, body: bytes) -> int:
         return 0
 
 
-def _resident(pid: int) -> int:
+def resident(pid: int) -> int:
     """Bytes."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
@@ -102,9 +105,18 @@ def _resident(pid: int) -> int:
         return 0
 
 
-def _figures(
-    store: Path, sent: _Sent, memory: list[tuple[float, int]], minutes: float, vehicles: int
+def figures(
+    store: Path,
+    sent: Sent,
+    memory: list[tuple[float, int]],
+    minutes: float,
+    vehicles: int,
+    warm_up: float = WARM_UP,
 ) -> Iterator[dict[str, Any]]:
+    """What the clients were told, what the store holds, and the service's memory by second.
+
+    warm_up: share of the time after which memory counts.
+    """
     with closing(sqlite3.connect(store)) as opened:
         stored = set(opened.execute("SELECT vehicle_id, start_ns FROM windows").fetchall())
     asked = round(60 * minutes) * vehicles
@@ -120,7 +132,7 @@ def _figures(
         "sent_a_second_late": sent.late,
         "target": f"< {TARGET_SECONDS:g}",
     }
-    warm = [size for second, size in memory if second > WARM_UP * 60 * minutes and size]
+    warm = [size for second, size in memory if second > warm_up * 60 * minutes and size]
     if len(warm) > 10:
         tenth = max(1, len(warm) // 10)
         first, last = np.median(warm[:tenth]), np.median(warm[-tenth:])

@@ -30,8 +30,11 @@ def _grouped(places: tuple[dict[str, str], ...], key: str) -> dict[str, list[tup
     return groups
 
 
-def write_mcap(path: Path, vehicle: Vehicle, values: Array, name: str) -> None:
-    """One JSON channel per node and quantity; publish time is the sample's, log time comes a little later."""
+def write_mcap(path: Path, vehicle: Vehicle, values: Array, name: str, start: int = START) -> None:
+    """One JSON channel per node and quantity; publish time is the sample's, log time comes a little later.
+
+    start: ns since the epoch, of the first sample.
+    """
     topics = _grouped(vehicle.places, "mcap")
     jitter = np.random.default_rng(len(values)).integers(10_000, 400_000, size=(len(values), len(topics)))
     with path.open("wb") as stream:
@@ -45,7 +48,7 @@ def write_mcap(path: Path, vehicle: Vehicle, values: Array, name: str) -> None:
             schema_id = writer.register_schema(title, "jsonschema", json.dumps(schema).encode())
             channels.append((writer.register_channel(topic, "json", schema_id), fields))
         for row, sample in enumerate(values.tolist()):
-            time = START + row * PERIOD
+            time = start + row * PERIOD
             for column, (channel, fields) in enumerate(channels):
                 data = json.dumps({f: float(f"{sample[c]:.7g}") for f, c in fields}).encode()
                 writer.add_message(channel, time + int(jitter[row, column]), data, time)
