@@ -27,7 +27,7 @@ WARM_UP = 0.2  # share of the time after which memory counts
 
 
 @dataclass
-class Sent:
+class LoadSent:
     """What the clients saw."""
 
     seconds: list[float] = field(default_factory=list)  # from when a window was due to its answer
@@ -39,7 +39,7 @@ class Sent:
 def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dict[str, Any]]:
     """Figures of one run; every vehicle sends a window of one second each second."""
     parts = window_body(load_system()).split(b'"bench"')
-    sent, memory = Sent(), list[tuple[float, int]]()
+    sent, memory = LoadSent(), list[tuple[float, int]]()
     with Served(folder / "load", system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0
@@ -59,7 +59,7 @@ def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dic
     yield from figures(folder / "load" / "sprung.db", sent, memory, minutes, vehicles)
 
 
-def drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: Sent) -> None:
+def drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: LoadSent) -> None:
     """Windows of some vehicles, one after the other, each when it is due.
 
     parts: of a body, before and after the vehicle's name.
@@ -107,7 +107,7 @@ def resident(pid: int) -> int:
 
 def figures(
     store: Path,
-    sent: Sent,
+    sent: LoadSent,
     memory: list[tuple[float, int]],
     minutes: float,
     vehicles: int,

@@ -17,7 +17,7 @@ from sprung.benchmarks.generator import read_vehicle
 from sprung.benchmarks.generator.files import write_mcap
 from sprung.benchmarks.serve import window_body
 from sprung.benchmarks.trust_clients import multipart
-from sprung.benchmarks.trust_load import START_SECONDS, Sent, drive, figures, resident
+from sprung.benchmarks.trust_load import START_SECONDS, LoadSent, drive, figures, resident
 from sprung.benchmarks.trust_service import Served
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.signals import FloatArray
@@ -40,7 +40,7 @@ LOOKED_AT = (
 def soak(folder: Path, minutes: float) -> Iterator[dict[str, Any]]:
     """Figures of one run: latencies, losses, and how the memory of the service grew."""
     parts = window_body(load_system()).split(b'"bench"')
-    sent, memory, beside = Sent(), list[tuple[float, int]](), Counter[str]()
+    sent, memory, beside = LoadSent(), list[tuple[float, int]](), Counter[str]()
     with Served(folder / "soak", system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0

@@ -1,118 +1,258 @@
-"""Windows of several clients, identified together.
+"""Windows of several clients, read, identified, tracked and stored together.
 
-The numerics cost per call more than per window.  While one batch is being identified the next one gathers: a single
-client waits for nobody, and many share the cost.
+The numerics cost per call more than per window, and so does a transaction.  While one batch is being worked on the next
+one gathers: a single client waits for nobody, and many share the cost.
 """
 
 from __future__ import annotations
 
+import asyncio
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
-from concurrent.futures import Future
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 import numpy as np
+from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.model.signals import Estimate, FloatArray
+from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.service.compute import Compute, Priority
-from sprung.service.engine import Engine
+from sprung.service.engines import ServedModel
 from sprung.service.errors import Busy
+from sprung.service.pipeline import Pipeline
+from sprung.service.store.windows import WindowRecord
+from sprung.service.together import FoundWindow, track_together
 
 TOGETHER = 32  # windows of one batch: more gain little and let the first one wait longer
+READERS = 2  # threads that look through bodies
 
 
-@dataclass(slots=True)
-class _Asked:
+@dataclass(frozen=True, slots=True)
+class AskedWindow:
+    """A window as a client sent it."""
+
     values: FloatArray  # shape (T, C)
-    engine: Engine
-    states: bool
-    start: int | None  # ns, of a window that will be tracked
-    future: Future[Estimate] = field(default_factory=Future)
+    served: ServedModel  # with which it is identified
+    vehicle: str | None = None
+    states: bool = False  # whether the simulated states are wanted
+    start: int | None = None  # ns, of a window that is to be tracked and stored; None: it is only identified
+
+
+@dataclass(frozen=True, slots=True)
+class AnsweredWindow:
+    """What became of it."""
+
+    asked: AskedWindow
+    estimate: Estimate
+    record: WindowRecord | None = None  # as it is stored
+
+
+@dataclass(slots=True, eq=False)
+class _Request:
+    """One on its way."""
+
+    loop: asyncio.AbstractEventLoop
+    future: asyncio.Future[AnsweredWindow]
     since: float = field(default_factory=time.perf_counter)
+    asked: AskedWindow | None = None
+    answer: AnsweredWindow | BaseException | None = None
+
+    @property
+    def sent(self) -> AskedWindow:
+        """Once it was read."""
+        assert self.asked is not None
+        return self.asked
+
+    @property
+    def estimate(self) -> Estimate:
+        """Once it was identified."""
+        assert isinstance(self.answer, AnsweredWindow)
+        return self.answer.estimate
+
+    def settle(self) -> None:
+        """Tell whoever waits; runs in its event loop."""
+        if self.future.done():  # it does not wait any more
+            return
+        if isinstance(self.answer, AnsweredWindow):
+            self.future.set_result(self.answer)
+        else:
+            self.future.set_exception(self.answer or RuntimeError("a window was forgotten"))
 
 
 class Batcher:
-    """Takes single windows, hands batches to the numerics.  Safe to share between threads."""
+    """Takes single windows, hands batches to the numerics and to the store.  For any event loop."""
 
     def __init__(
-        self, engine: Engine, compute: Compute, limit: int, observe: Callable[[dict[str, float]], None]
+        self, pipeline: Pipeline, compute: Compute, limit: int, observe: Callable[[dict[str, float]], None]
     ) -> None:
         """limit: windows that may wait; observe: told the seconds of each stage, `queue` among them."""
-        self._engine = engine
+        self._pipeline = pipeline
         self._compute = compute
         self._limit = limit
         self._observe = observe
-        self._waiting: deque[_Asked] = deque()
+        self._reading = 0
+        self._waiting: deque[_Request] = deque()
+        self._to_track: deque[_Request] = deque()
         self._lock = threading.Lock()
         self._called = False  # a batch is in the compute's queue and has not begun
+        self._tracking = False  # as well, in the tracking thread's
+        self._readers = ThreadPoolExecutor(READERS, "sprung-read")
+        self._tracker = ThreadPoolExecutor(1, "sprung-track")
 
     @property
     def waiting(self) -> int:
         """Windows that no batch has taken yet."""
         return len(self._waiting)
 
-    def submit(
-        self, values: FloatArray, states: bool = False, start: int | None = None, engine: Engine | None = None
-    ) -> Future[Estimate]:
-        """Queue a window, shape (T, C), without waiting.  Raises Busy when too many wait.
+    async def ask(self, read: Callable[[], AskedWindow]) -> AnsweredWindow:
+        """The answer to a window, stored where that was asked for.
 
-        start: ns, of a window that will be tracked (see `Engine.identify`); engine: of a vehicle that has its own.
+        read: looks through what was sent, in a thread; what it raises is raised here.  Raises Busy when too many wait.
         """
-        asked = _Asked(values, engine or self._engine, states, start)
+        loop = asyncio.get_running_loop()
+        request = _Request(loop, loop.create_future())
         with self._lock:
-            if len(self._waiting) >= self._limit:
-                raise Busy("the numerics are busy; try again in a second")
-            if not self._called:
-                self._compute.submit(self._identify, Priority.REQUEST)
-                self._called = True
-            self._waiting.append(asked)
-        return asked.future
+            if len(self._waiting) + self._reading >= self._limit:
+                raise _busy()
+            self._reading += 1
+        self._readers.submit(self._read, request, read)
+        return await request.future
+
+    def close(self) -> None:
+        """Let the threads end."""
+        self._readers.shutdown()
+        self._tracker.shutdown()
+
+    def _read(self, request: _Request, read: Callable[[], AskedWindow]) -> None:
+        """In one of the readers' threads."""
+        try:
+            request.asked = read()
+        except BaseException as error:
+            request.answer = error
+        with self._lock:
+            self._reading -= 1
+            if request.asked is not None:
+                self._waiting.append(request)
+                if self._called or self._call():
+                    return
+                self._waiting.remove(request)
+                request.answer = _busy()
+        _deliver([request])
+
+    def _call(self) -> bool:
+        """Ask the numerics for a batch; whether they could be asked."""
+        try:
+            self._compute.submit(self._identify, Priority.REQUEST)
+        except Busy:  # their queue is full of others' work
+            return False
+        self._called = True
+        return True
 
     def _identify(self) -> None:
         """One batch; runs in the numerics' thread."""
+        refused: list[_Request] = []
         with self._lock:
             self._called = False
             batch = [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
-            if self._waiting:
-                self._call_again()
+            if self._waiting and not self._call():
+                refused = list(self._waiting)
+                self._waiting.clear()
+        for request in refused:
+            request.answer = _busy()
         now = time.perf_counter()
-        wanted = [asked for asked in batch if asked.future.set_running_or_notify_cancel()]
-        for asked in wanted:
-            self._observe({"queue": now - asked.since})
-        alike: dict[tuple[int, bool, bool], list[_Asked]] = {}
-        for asked in wanted:
-            alike.setdefault((id(asked.engine), asked.states, asked.start is not None), []).append(asked)
+        alike: dict[tuple[int, bool, bool], list[_Request]] = {}
+        for request in batch:
+            if not request.future.cancelled():
+                self._observe({"queue": now - request.since})
+                sent = request.sent
+                alike.setdefault((id(sent.served.engine), sent.states, sent.start is not None), []).append(request)
         for together in alike.values():
-            self._answer(together)
+            self._estimate(together)
+        self._track([request for request in batch if _to_be_tracked(request)])
+        _deliver([*refused, *(request for request in batch if not _to_be_tracked(request))])
 
-    def _call_again(self) -> None:
-        try:
-            self._compute.submit(self._identify, Priority.REQUEST)
-            self._called = True
-        except Busy as busy:  # the queue is full of others' work
-            for asked in self._waiting:
-                if asked.future.set_running_or_notify_cancel():
-                    asked.future.set_exception(busy)
-            self._waiting.clear()
-
-    def _answer(self, batch: list[_Asked]) -> None:
+    def _estimate(self, batch: Sequence[_Request]) -> None:
         """Windows that are asked about in the same way."""
-        states = batch[0].states
+        first = batch[0].sent
+        starts = None if first.states or first.start is None else [request.sent.start or 0 for request in batch]
+        values = np.stack([request.sent.values for request in batch])
         try:
-            estimates, seconds = batch[0].engine.identify(
-                np.stack([asked.values for asked in batch]),
-                states=states,
-                starts=None if states or batch[0].start is None else [asked.start or 0 for asked in batch],
-            )
+            estimates, seconds = first.served.engine.identify(values, states=first.states, starts=starts)
         except BaseException as error:
             if len(batch) == 1:
-                batch[0].future.set_exception(error)
+                batch[0].answer = error
                 return
-            for asked in batch:  # one of them spoils it for the others
-                self._answer([asked])
+            for request in batch:  # one of them spoils it for the others
+                self._estimate([request])
             return
         self._observe(seconds)
-        for asked, estimate in zip(batch, estimates, strict=True):
-            asked.future.set_result(estimate)
+        for request, estimate in zip(batch, estimates, strict=True):
+            request.answer = AnsweredWindow(request.sent, estimate)
+
+    def _track(self, requests: Sequence[_Request]) -> None:
+        """Hand over to the tracking thread."""
+        if not requests:
+            return
+        with self._lock:
+            self._to_track.extend(requests)
+            if not self._tracking:
+                self._tracking = True
+                self._tracker.submit(self._keep)
+
+    def _keep(self) -> None:
+        """All that wait to be tracked, in one transaction; runs in the tracking thread."""
+        with self._lock:
+            self._tracking = False
+            batch = list(self._to_track)
+            self._to_track.clear()
+        self._keep_together(batch)
+        _deliver(batch)
+
+    def _keep_together(self, batch: Sequence[_Request]) -> None:
+        found = [_found(request.sent, request.estimate) for request in batch]
+        try:
+            records = track_together(self._pipeline, found)
+        except BaseException as error:
+            if len(batch) == 1 or isinstance(
+                error, SQLAlchemyError | OSError | TimeoutError
+            ):  # of the store: everyone's
+                for request in batch:
+                    request.answer = error
+                return
+            for request in batch:
+                self._keep_together([request])
+            return
+        for request, record in zip(batch, records, strict=True):
+            request.answer = AnsweredWindow(request.sent, request.estimate, record)
+
+
+def _to_be_tracked(request: _Request) -> bool:
+    return request.asked is not None and request.asked.start is not None and isinstance(request.answer, AnsweredWindow)
+
+
+def _found(asked: AskedWindow, estimate: Estimate) -> FoundWindow:
+    assert asked.vehicle is not None and asked.start is not None
+    window = Window(asked.start, asked.served.engine.system.sample_rate, asked.values)
+    return FoundWindow(asked.vehicle, window, estimate, asked.served)
+
+
+def _busy() -> Busy:
+    return Busy("the numerics are busy; try again in a second")
+
+
+def _deliver(requests: Sequence[_Request]) -> None:
+    """Tell all that wait at once: woken one by one they would take turns with the next batch."""
+    by_loop: dict[asyncio.AbstractEventLoop, list[_Request]] = {}
+    for request in requests:
+        by_loop.setdefault(request.loop, []).append(request)
+    for loop, theirs in by_loop.items():
+        with suppress(RuntimeError):  # the loop has ended, and nobody waits
+            loop.call_soon_threadsafe(_settle, theirs)
+
+
+def _settle(requests: Sequence[_Request]) -> None:
+    for request in requests:
+        request.settle()

@@ -101,6 +101,7 @@ class Core:
         self.stopping.set()
         with ExitStack() as stack:  # in reverse order, each even when another fails
             stack.callback(self.store.close)
+            stack.callback(self.batcher.close)
             stack.callback(self.compute.close)
             stack.callback(self.jobs.close)
             stack.callback(self.housekeeping.close)
@@ -145,7 +146,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     alarm_signals = AlarmSignals(settings, store, rings)
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
     housekeeping = Housekeeping(settings, store)
-    batcher = Batcher(engine, compute, settings.compute_queue, metrics.observe)
+    batcher = Batcher(pipeline, compute, settings.compute_queue, metrics.observe)
     core = Core(
         settings,
         engine,

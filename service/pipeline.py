@@ -108,19 +108,6 @@ class Pipeline:
             listener(batch)
         return batch
 
-    def track(self, vehicle: str, window: Window, estimate: Estimate, served: ServedModel) -> Batch:
-        """Track and store one window that was identified elsewhere, with what the vehicle was `served` by."""
-        with self.store.read() as connection:
-            known = known_windows(connection, vehicle, served.model_id, [window.start])
-        try:
-            batch = self._commit(vehicle, [] if known else [window], [] if known else [estimate], None, served)
-        except ModelChanged:
-            return self.process(vehicle, [window], priority=Priority.REQUEST)
-        batch.records = batch.records or list(known.values())
-        for listener in self._listeners:
-            listener(batch)
-        return batch
-
     def state(self, vehicle: str) -> TrackerState:
         """The vehicle's tracker state as stored; the initial one for a vehicle never seen."""
         with self.store.read() as connection:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Any
 
 import numpy as np
 from fastapi import APIRouter, Request
-from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 
 from sprung.model.identifier import UnusableWindow
-from sprung.model.signals import Estimate, FloatArray, Window
+from sprung.model.signals import Estimate, FloatArray
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
-from sprung.service.api.bodies import WindowBody, WindowHead, read_window, start_of
+from sprung.service.api.bodies import WindowBody, read_window, start_of
 from sprung.service.api.problems import ApiProblem
+from sprung.service.batching import AskedWindow
 from sprung.service.core import Core
 from sprung.service.engine import Engine
-from sprung.service.engines import ServedModel
 from sprung.service.store.windows import Solved
 from sprung.service.times import NANOSECONDS, now_ns
+from sprung.service.tokens import Actor
 from sprung.service.views import fit_dict, physical, sensor_dict
 
 router = APIRouter(tags=["identify"])
@@ -44,38 +43,40 @@ async def identify(
     answer then also has the tracked `posterior`, and `start` in the body says when the window began (the window
     is taken to end now where it does not).
     """
-    head, values, served = await run_in_threadpool(_read, core, await request.body())
-    engine = served.engine
-    if track and head.vehicle is None:
-        detail = "is needed to track"
-        raise ApiProblem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
-    if track:
-        own_vehicle(actor, head.vehicle)
-    now = now_ns()
-    start = start_of(head, now)
+    content = await request.body()
     try:
-        asked = core.batcher.submit(values, states, (start or now) if track else None, engine)
-        estimate = await asyncio.wrap_future(asked)
+        answered = await core.batcher.ask(lambda: _read(core, content, actor, states, track))
     except UnusableWindow as error:
         raise ApiProblem(422, str(error)) from error
-    answer = _answer(engine, head.vehicle, estimate)
-    if track and head.vehicle is not None:
-        length = round(engine.system.window / engine.system.sample_rate * NANOSECONDS)
-        window = Window(now - length if start is None else start, engine.system.sample_rate, values)
-        batch = await run_in_threadpool(core.pipeline.track, head.vehicle, window, estimate, served)
-        posterior = batch.records[0].posterior
-        answer["tracked"] = batch.records[0].tracked
+    engine = answered.asked.served.engine
+    answer = _answer(engine, answered.asked.vehicle, answered.estimate)
+    if answered.record is not None:
+        posterior = answered.record.posterior
+        answer["tracked"] = answered.record.tracked
         if posterior is not None:
             answer["posterior"] = _parameters(engine, posterior.log_ratio, posterior.std, None)
     return json_response(answer)
 
 
-def _read(core: Core, content: bytes) -> tuple[WindowHead, FloatArray, ServedModel]:
-    """What was sent, and what the vehicle's windows are identified with."""
+def _read(core: Core, content: bytes, actor: Actor, states: bool, track: bool) -> AskedWindow:
+    """What was sent, and what the vehicle's windows are identified with; runs in a thread."""
     head, values = read_window(content, core.engine)
-    if head.vehicle is None:
-        return head, values, core.pipeline.engines.shared
-    return head, values, core.pipeline.engines.lately(core.store, head.vehicle)
+    if track:
+        own_vehicle(actor, _needed(head.vehicle))
+    engines, now = core.pipeline.engines, now_ns()
+    served = engines.shared if head.vehicle is None else engines.lately(core.store, head.vehicle)
+    start = start_of(head, now)  # wrong ones are refused also where nobody needs them
+    if track and start is None:
+        system = served.engine.system
+        start = now - round(system.window / system.sample_rate * NANOSECONDS)
+    return AskedWindow(values, served, head.vehicle, states, start if track else None)
+
+
+def _needed(vehicle: str | None) -> str:
+    if vehicle is None:
+        detail = "is needed to track"
+        raise ApiProblem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
+    return vehicle
 
 
 def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str, Any]:

@@ -259,13 +259,13 @@ def test_clients_that_ask_at_once_share_a_batch_and_each_gets_its_own(
     client: TestClient, core: Core, body: dict[str, Any], system: System
 ) -> None:
     sizes: list[int] = []
-    real = core.batcher._engine.identifier.identify
+    real = core.engine.identifier.identify
 
     def noted(values: Any, *rest: Any, **named: Any) -> Any:
         sizes.append(len(values))
         return real(values, *rest, **named)
 
-    core.batcher._engine.identifier.identify = noted  # type: ignore[method-assign]
+    core.engine.identifier.identify = noted  # type: ignore[method-assign]
     release, started = threading.Event(), threading.Event()
     core.compute.submit(lambda: (started.set(), release.wait()))
     started.wait(5)
