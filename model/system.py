@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from sprung.model.address import Address
+from sprung.model.digest import digest_of, structure_of
 from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.in_place import Follower, Whole, all_in_place, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
@@ -41,12 +39,6 @@ USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
 GAIN_STD = 0.015  # of a channel whose data sheet is not quoted: 1 to 2 % for accelerometers with their electronics
 DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
-# An address without its noise, which the mechanics does not see.
-_WHERE = (
-    *("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range"),
-    *("gain_std", "delay_std"),
-)
-
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
 
@@ -305,71 +297,16 @@ class System:
     @cached_property
     def digest(self) -> str:
         """Hash of everything that the mechanics depends on; addresses and comments do not count."""
-        keep = self.file.model_dump(mode="json", exclude={"hop", "time", *RUNNING})
-        signals = [*keep["inputs"].values(), *keep["sensors"].values()]
-        signals += [keep["speed"] or {}, *((body["load"] or {}) for body in keep["bodies"].values())]
-        for signal in _with_parts(signals):
-            for key in _WHERE:
-                signal.pop(key, None)
-        for source in keep["inputs"].values():
-            if source["kind"] == "support":
-                source["kind"] = "displacement"
-        keep.pop("signals")  # what no window sees
-        for element in keep["elements"].values():
-            element.pop("depends_on")
-        added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
-        for body in keep["bodies"].values():
-            body.pop("load", None)  # what varies from ride to ride does not make another vehicle
-        if not self.on_track:
-            keep["speed"] = None
-        for part, key in [*added, (keep, "speed")]:
-            if part.get(key) is None:
-                part.pop(key, None)
-        _without_empty_laws(keep)
-        return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+        return digest_of(self.file, self.on_track)
 
     @cached_property
     def structure(self) -> str:
-        """Hash of what estimates depend on but for their uncertainty: neither names nor noises, ranges or addresses.
-
-        Values of two files with the same structure are the same values.
-        """
-        keep = self.file.model_dump(
-            mode="json", include={"bodies", "elements", "inputs", "sensors", "estimate", "speed"}
-        )
-        for body in keep["bodies"].values():
-            body.pop("load", None)
-        for signal in _with_parts([*keep["inputs"].values(), *keep["sensors"].values(), keep["speed"] or {}]):
-            for key in ("noise", *_WHERE):
-                signal.pop(key, None)
-        for source in keep["inputs"].values():
-            source["kind"] = "displacement" if source["kind"] == "support" else source["kind"]
-        _without_empty_laws(keep)
-        return hashlib.sha256(json.dumps(keep, sort_keys=True).encode()).hexdigest()[:16]
+        """Hash of what estimates depend on but for their uncertainty; values of files with the same are the same."""
+        return structure_of(self.file)
 
 
 def _whole_again(file: SystemFile, catalogue: tuple[Law, ...] = CATALOGUE) -> System:
     return System(file, catalogue, whole=True)
-
-
-def _with_parts(signals: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Signals, and the addresses that they hold."""
-    return [*signals, *(part for signal in signals for part in signal.values() if isinstance(part, dict))]
-
-
-def _without_empty_laws(part: Any) -> None:
-    """Take out what older files do not have, and the deviations of laws' values."""
-    if isinstance(part, dict):
-        if not part.get("laws", True):
-            del part["laws"]
-        if part.get("by_load") == 0:
-            del part["by_load"]
-        for setting in (s for law in part.get("laws", ()) for s in law.values()):
-            for value in setting.values():
-                if isinstance(value, dict):
-                    value.pop("std", None)
-        for child in part.values():
-            _without_empty_laws(child)
 
 
 def load_system(path: str | Path = MANCHESTER, catalogue: tuple[Law, ...] = CATALOGUE) -> System:

@@ -123,25 +123,15 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         board.forget(vehicle)
         rides.forget(vehicle)
 
-    rings = Rings(
-        settings.ring_vehicles,
-        settings.ring_seconds,
-        len(engine.system.channels),
-        engine.system.sample_rate,
-    )
-    stopping = threading.Event()
+    system = engine.system
+    rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(system.channels), system.sample_rate)
     hub = Hub()
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     feeds: list[LiveFeed] = []
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
     pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms)
-    recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
-    kinds = {
-        "recording": Kind(recordings.run, settings.recording_seconds),
-        "diagnosis": Kind(diagnosis_jobs.run, settings.diagnosis_seconds),
-    }
-    jobs = Jobs(store, kinds, settings.job_queue)
+    jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs)
     diagnoses = Diagnoses(settings, store, rings, jobs)
     alarm_signals = AlarmSignals(settings, store, rings)
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
@@ -167,7 +157,7 @@ def build_core(settings: Settings, engine: Engine) -> Core:
         batcher,
         notices,
         Tokens(store, None if settings.admin_token is None else settings.admin_token.get_secret_value()),
-        stopping,
+        threading.Event(),
         Ingest(pipeline, settings.late_seconds),
         FleetTelling(engine, store, pipeline.model_id),
         archive,
@@ -179,6 +169,16 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     metrics.registry.register(vitals)
     core.requests = request_histogram(metrics.registry)
     return core
+
+
+def _jobs(settings: Settings, pipeline: Pipeline, metrics: Metrics, diagnosis: DiagnosisJobs) -> Jobs:
+    """The queue of jobs, with what runs each kind and how long it may take."""
+    recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
+    kinds = {
+        "recording": Kind(recordings.run, settings.recording_seconds),
+        "diagnosis": Kind(diagnosis.run, settings.diagnosis_seconds),
+    }
+    return Jobs(pipeline.store, kinds, settings.job_queue)
 
 
 def tally_counter(metrics: Metrics, source: str) -> OnTally:

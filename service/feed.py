@@ -17,7 +17,7 @@ from sprung.service import rides
 from sprung.service.compute import Priority
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch, Identified
-from sprung.service.reading import Apart, Here, Reading, ReadRequest, prefetched
+from sprung.service.reading import Apart, Ending, Here, Reading, ReadRequest, prefetched
 from sprung.service.times import NANOSECONDS, to_iso
 from sprung.service.worker import ProcessLimits
 
@@ -146,15 +146,19 @@ def feed_file(
     finally:
         reading.close()
         found.close()
-    ending = reading.ending
-    on_tally(ending.tally)
-    fed.vehicle = name(ending.vehicle)
+    on_tally(reading.ending.tally)
+    fed.vehicle = name(reading.ending.vehicle)
     fed.state = fed.state or pipeline.state(fed.vehicle)
+    _ended(fed, reading.ending)
+    fed.wall_seconds = time.perf_counter() - started
+    return fed
+
+
+def _ended(fed: Fed, ending: Ending) -> None:
+    """Take over what is known of a recording once it has been read."""
     fed.tally, fed.problems, fed.incomplete = ending.tally, ending.problems, ending.incomplete
     fed.expected, fed.lost = ending.expected, ending.lost
     fed.first_ns, fed.last_ns = ending.first_ns, ending.last_ns
-    fed.wall_seconds = time.perf_counter() - started
-    return fed
 
 
 def ride_dict(ride: comfort.RideQuality) -> dict[str, Any]:

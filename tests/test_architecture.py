@@ -27,6 +27,7 @@ ORDER = [
     "parameters",
     "address",
     "schema",
+    "digest",
     "mechanics",
     "laws",
     "systemfile",
@@ -149,6 +150,12 @@ def test_folders_stand_above_those_that_they_import() -> None:
     for package in ("model", "model.diagnosis"):  # their own files hold nothing
         whole.pop(package, None)
     assert circle({name: targets & set(whole) for name, targets in whole.items()}) == []
+
+
+def test_the_drawing_of_the_imports_is_up_to_date() -> None:
+    drawing = run_path(str(ROOT / "docs" / "imports.py"))["drawing"]
+    kept = (ROOT / "docs" / "img" / "imports.svg").read_text(encoding="utf-8")
+    assert kept == drawing(), "docs/img/imports.svg: `make drawing` makes it anew"
 
 
 def test_a_circle_would_be_seen() -> None:

@@ -49,6 +49,26 @@ DESCRIPTION = (
 VALUE_BYTES = 40  # of one value of a window as JSON, generously: a minute of a vehicle without inputs is 1.5 MB
 
 
+_PARTS = (
+    identify,
+    ingest,
+    admin,
+    fleet,
+    fleet_knowledge,
+    history,
+    circumstances,
+    signals,
+    actions,
+    vehicle_model,
+    lists,
+    events,
+    recordings,
+    diagnose,
+    health,
+    docs,
+)
+
+
 def create_app(
     core: Core, on_start: Callable[[], None] = lambda: None, on_stop: Callable[[], None] | None = None
 ) -> FastAPI:
@@ -76,33 +96,26 @@ def create_app(
     app.state.core = core
     problems.install(app)
     describe(app)
-    parts = (
-        identify,
-        ingest,
-        admin,
-        fleet,
-        fleet_knowledge,
-        history,
-        circumstances,
-        signals,
-        actions,
-        vehicle_model,
-        lists,
-        events,
-        recordings,
-        diagnose,
-        health,
-        docs,
-    )
+    _route(app)
+    _guard(app, core)
+    return app
+
+
+def _route(app: FastAPI) -> None:
+    """Give the application its API, pages and static files."""
     checks = [Depends(only_known_parameters), Depends(no_key_twice)]
     for router in (
-        *(part.router for part in (*parts, fleet_page, vehicle_page, work_pages)),
+        *(part.router for part in (*_PARTS, fleet_page, vehicle_page, work_pages)),
         admin.pages,
         signin.pages,
     ):
         app.include_router(router, responses=PROBLEMS, dependencies=checks)
     app.include_router(signin.returns)
     app.mount("/static", assets(), name="static")
+
+
+def _guard(app: FastAPI, core: Core) -> None:
+    """Put what every request passes first before the routes: access, HEAD, the size of bodies."""
     uploads = core.settings.max_upload_bytes
     system = core.engine.system
     app.add_middleware(
@@ -112,4 +125,3 @@ def create_app(
     )
     app.add_middleware(HeadAsGet)
     app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests, oidc=core.oidc)
-    return app
