@@ -396,7 +396,7 @@ def test_an_upload_is_followed_to_its_report_and_what_was_found_is_put_to_use(
     page.locator("progress#sent").wait_for()
     page.locator("#outcome:has-text('diagnosis')").wait_for()
     kept(page, "upload")
-    page.wait_for_selector("a:has-text('report: missing physics')", timeout=60_000)  # the page has come anew
+    page.wait_for_selector("a:has-text('report: missing physics')", timeout=180_000)  # the page has come anew
     page.click("a:has-text('report: missing physics')")
     assert page.inner_text("h1") == "dry friction"
     page.get_by_role("link", name="use").click()
