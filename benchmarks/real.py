@@ -46,8 +46,8 @@ def run(data: Path, out: Path | None = None) -> Iterator[dict[str, Any]]:
             line["reference"] = references(record)
             best = min(line["reference"].values())
             line["met"] = line["held_out"] <= best or report.verdict == "unknown_physics"
-        if record.witness is not None and report.track:
-            peaks, beside = peaks_and_witness(record, report)
+        if record.independent is not None and report.track:
+            peaks, beside = peaks_and_independent(record, report)
             line["track"] = followed(report, peaks, beside)
             if out is not None:
                 line["picture"] = str(frequencies(report, record.name, out, peaks, beside))
@@ -77,9 +77,9 @@ def said(report: Report) -> dict[str, Any]:
     }
 
 
-def peaks_and_witness(record: MeasuredRecord, report: Report) -> tuple[FloatArray, FloatArray]:
-    """Spectral peak (Hz) of every window of a report, and the median of the witness in it."""
-    assert record.witness is not None
+def peaks_and_independent(record: MeasuredRecord, report: Report) -> tuple[FloatArray, FloatArray]:
+    """Spectral peak (Hz) of every window of a report, and the median of the independent measurement in it."""
+    assert record.independent is not None
     low, high = HALF * report.track[0].frequency[0], 2 * report.track[0].frequency[0]
     peaks, beside = [], []
     for point in report.track:
@@ -89,23 +89,23 @@ def peaks_and_witness(record: MeasuredRecord, report: Report) -> tuple[FloatArra
         frequency = np.fft.rfftfreq(PADDED * len(series), 1 / record.sample_rate)
         inside = (frequency > low) & (frequency < high)
         peaks.append(float(frequency[inside][np.argmax(power[inside])]))
-        beside.append(float(np.median(record.witness[at])))
+        beside.append(float(np.median(record.independent[at])))
     return np.array(peaks), np.array(beside)
 
 
-def followed(report: Report, peaks: FloatArray, witness: FloatArray) -> dict[str, Any]:
-    """The lowest natural frequency beside the spectral peak of every window, and both beside the witness."""
+def followed(report: Report, peaks: FloatArray, independent: FloatArray) -> dict[str, Any]:
+    """The lowest natural frequency beside the spectral peak of every window, and both beside the independent."""
     found = np.array([point.frequency[0] for point in report.track])
     sure = np.array([p.adequate and p.deviation[0] < SURE * p.frequency[0] for p in report.track])
-    one, other, rank = found[sure], peaks[sure], witness[sure]
+    one, other, rank = found[sure], peaks[sure], independent[sure]
     return {
         "windows": len(found),
         "sure": len(one),
         "lowest_hz": float(one.min()),
         "highest_hz": float(one.max()),
         "median_difference_to_peak": float(np.median(np.abs(one / other - 1))),
-        "rank_correlation_with_witness": float(spearmanr(one, rank)[0]),
-        "peaks_rank_correlation_with_witness": float(spearmanr(other, rank)[0]),
+        "rank_correlation_with_independent": float(spearmanr(one, rank)[0]),
+        "peaks_rank_correlation_with_independent": float(spearmanr(other, rank)[0]),
     }
 
 

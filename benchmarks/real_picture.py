@@ -60,7 +60,7 @@ def missing_force(report: Report, name: str, folder: Path) -> Path:
     return ink.save(figure, folder / f"{name}.png")
 
 
-def frequencies(report: Report, name: str, folder: Path, peaks: FloatArray, witness: FloatArray) -> Path:
+def frequencies(report: Report, name: str, folder: Path, peaks: FloatArray, independent: FloatArray) -> Path:
     """Writes NAME.png: the lowest natural frequency of every window, its spectral peak, and what it must follow."""
     folder.mkdir(parents=True, exist_ok=True)
     figure = ink.new_figure(9.0, 3.0)
@@ -74,8 +74,8 @@ def frequencies(report: Report, name: str, folder: Path, peaks: FloatArray, witn
     left.set_ylabel("natural frequency, Hz")
     left.set_ylim(0.9 * peaks.min(), 1.1 * peaks.max())
     left.legend(fontsize=7)
-    right.plot(witness, peaks, "o", ms=4, mfc="none", color=ink.NOISE)
-    right.errorbar(witness, found, deviation, fmt=".", ms=4, lw=0.8, color=ink.AFTER)
+    right.plot(independent, peaks, "o", ms=4, mfc="none", color=ink.NOISE)
+    right.errorbar(independent, found, deviation, fmt=".", ms=4, lw=0.8, color=ink.AFTER)
     right.set_xlabel("position of the pin, V (no diagnosis sees it)")
     right.set_ylim(*left.get_ylim())
     return ink.save(figure, folder / f"{name}.png")

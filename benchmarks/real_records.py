@@ -32,7 +32,7 @@ class MeasuredRecord:
     sample_rate: float
     lost: int = 0
     component: bool = False  # displacement [, velocity], force of one element: references can be fitted
-    witness: Array | None = None  # what no diagnosis sees and a natural frequency must follow, (T,)
+    independent: Array | None = None  # what no diagnosis sees and a natural frequency must follow, (T,)
 
 
 def component(name: str, rate: float, velocity: bool) -> System:
@@ -95,7 +95,7 @@ bodies: {{tip: {{mass: {{value: 1.0, fixed: true}}}}}}
 elements: {{beam: {{upper: tip, lower: ground, stiffness: 4.5e+4, damping: 10.0}}}}
 sensors: {{tip: {{kind: acceleration, body: tip, csv: acceleration, noise: 2.0e-3}}}}
 """)
-    return MeasuredRecord(path.stem, system, acceleration[:, None], rate, witness=pin)
+    return MeasuredRecord(path.stem, system, acceleration[:, None], rate, independent=pin)
 
 
 READERS: tuple[tuple[str, Callable[[Path], MeasuredRecord]], ...] = (

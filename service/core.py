@@ -1,4 +1,4 @@
-"""The application without its doors: everything wired once, at start, from the settings."""
+"""The application without its interfaces: everything wired once, at start, from the settings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can go wrong for a user, without any HTTP or exit code: those are given at the doors."""
+"""What can go wrong for a user, without any HTTP or exit code: API and command line give those."""
 
 from __future__ import annotations
 

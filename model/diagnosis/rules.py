@@ -138,7 +138,7 @@ class PlausibleRules:
 
 @dataclass(frozen=True)
 class AcceptanceRules:
-    """When a further finding counts, and how input channels are mended."""
+    """When a further finding counts, and how faults of input channels are compensated."""
 
     minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)
     minor_elsewhere: float = rule(0.002, "of an earlier finding elsewhere; chosen", 0.0005, 0.01)
@@ -176,6 +176,7 @@ class NoiseRules:
     sigmas: float = rule(6.0, "by which the ratio leaves its peers'; derived: chance and modelling errors", 4.0, 8.0)
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
+    white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)
     displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
     velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
 
@@ -228,6 +229,7 @@ class ReportRules:
 
     naming_margin: float = rule(6.0, "evidence over look-alikes to be named alone; derived: odds of 20 to 1", 3.0, 10.0)
     changed: float = rule(0.25, "from nominal, at which a parameter is listed as changed; chosen", 0.15, 0.4)
+    sure: float = rule(5.0, "deviations of a change that is told; derived: no chance in any of 24 values", 4.0, 6.0)
     alike: float = rule(0.5, "correlation from which a sign or scale is a likely reason; chosen", 0.3, 0.7)
     scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
     far: float = rule(1.6, "log-ratio to nominal; chosen: a factor of 5, no rebuilt vehicle is as far off", 1.1, 2.3)
@@ -261,11 +263,12 @@ class ComponentRules:
     as_well: float = rule(1.05, "of the held-out power, up to which a plainer law serves as well; chosen", 1.02, 1.1)
     by_lag: float = rule(0.95, "of the excess power, that a late channel explains; chosen", 0.9, 0.98)
     above: float = rule(
-        2.25, "times the floor's power, from which a channel is blamed; derived: as the verdict", 1.5, 4.0
+        2.25, "times the floor's power, from which the fault is the channel's; derived: as the verdict", 1.5, 4.0
     )
     late: float = rule(
         0.1, "samples, from which a channel is late; derived: sampling at a time is no better", 0.05, 0.3
     )
+    latest: float = rule(0.04, "s, of a late channel; chosen: filters and nodes of test benches", 0.02, 0.08)
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
     lowest_knee: float = rule(0.3, "of the median rate; chosen: a valve that opens below acts as friction", 0.2, 0.5)

@@ -165,7 +165,7 @@ class Explainer:
         clocks: bool = False,
     ) -> dict[int, Explained]:
         """One deviation at a time, the one with the most evidence, or all `clocks` together; `known`: faults that were
-        mended before."""
+        corrected before."""
         found: dict[int, Explained] = {}
         active, point = np.arange(len(windows)), np.zeros((len(windows), len(self.deviations)))
         if start is not None:
@@ -202,9 +202,9 @@ class Explainer:
                 rows = np.flatnonzero((margin == edge) & (loads == with_loads))
                 if len(rows) == 0:
                     continue
-                mended = self.corrected(windows[rows], point[rows])
-                start = None if self.start is None else self.start(mended)
-                inner = mended[:, edge : self.samples - edge]
+                restored = self.corrected(windows[rows], point[rows])
+                start = None if self.start is None else self.start(restored)
+                inner = restored[:, edge : self.samples - edge]
                 refined = self.refiner(inner.shape[1]).refine(
                     inner, start, loads=with_loads, weigh=np.ones(len(rows), dtype=bool), iterations=6
                 )
@@ -265,7 +265,7 @@ class Explainer:
         return named(self.deviations, point, np.zeros(len(point)), np.abs(point) > 0)
 
     def _without(self, window: FloatArray, stuck: tuple[MeasurementFault, ...]) -> Explained:
-        """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not mended."""
+        """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not corrected."""
         names = [channel.name for channel in self.system.channels]
         columns = np.array([names.index(fault.channel) for fault in stuck])
         sensors = columns[columns >= len(self.system.inputs)]
@@ -280,8 +280,8 @@ class Explainer:
 
     def _turned(self, window: FloatArray) -> Explained | None:
         """One window (T, C) with a reversed or two exchanged channels put right."""
-        for mended, fault in self._reversed(window):
-            explained = self._by_steps(mended[None], [(fault,)])
+        for restored, fault in self._reversed(window):
+            explained = self._by_steps(restored[None], [(fault,)])
             if 0 in explained:
                 return explained[0]
         return None
@@ -294,8 +294,8 @@ class Explainer:
         edge = int(np.ceil(max(_LATE) * self.system.sample_rate)) + _MARGIN
         if self.samples <= 4 * edge:
             return None
-        mended = self.corrected(np.repeat(window[None], len(points), axis=0), points)
-        costs = self._nominal_cost(mended[:, edge : self.samples - edge])
+        restored = self.corrected(np.repeat(window[None], len(points), axis=0), points)
+        costs = self._nominal_cost(restored[:, edge : self.samples - edge])
         for at in np.argsort(costs[1:])[:_TRIALS] + 1:
             if costs[at] < _BETTER * costs[0]:
                 explained = self._by_steps(window[None], [()], points[at])
@@ -334,7 +334,7 @@ class Explainer:
                 exchanged = window.copy()
                 exchanged[:, [a, b]] = window[:, [b, a]]
                 tries.append((exchanged, MeasurementFault(f"{names[a]}|{names[b]}", "swapped", 0.0)))
-        costs = self._nominal_cost(np.array([window, *(mended for mended, _ in tries)]))
+        costs = self._nominal_cost(np.array([window, *(restored for restored, _ in tries)]))
         order = np.argsort(costs[1:])
         return [tries[i] for i in order[:3] if costs[1 + i] < _REVERSED * costs[0]]
 

@@ -77,8 +77,8 @@ class Identifier:
         bad = np.array([b for b, e in enumerate(found) if self._asks(e, windows.shape[1])], dtype=np.int64)
         if len(bad):
             for b, cause in self._explainer(windows.shape[1]).explain(windows, bad).items():
-                (mended,) = self._estimates(cause.refined, False, cause.point)
-                found[b] = replace(self._averaged(mended), faults=cause.faults)
+                (restored,) = self._estimates(cause.refined, False, cause.point)
+                found[b] = replace(self._averaged(restored), faults=cause.faults)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
         return found
 
@@ -103,7 +103,7 @@ class Identifier:
         return not estimate.adequate
 
     def _averaged(self, estimate: Estimate) -> Estimate:
-        """A mended window with what is left open of its deviations in the values and their covariance."""
+        """A corrected window with what is left open of its deviations in the values and their covariance."""
         found = estimate.deviating
         if found is None:
             return estimate

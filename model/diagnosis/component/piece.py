@@ -39,6 +39,7 @@ class Seen:
     step: float  # s
     lowest_knee: float  # m/s: a valve that opens far below usual rates acts as friction, and is called so
     reach: float  # times the usual size of a length or rate, either way, within which a formula's are searched
+    latest: float  # s, that a channel may be late
 
     @classmethod
     def of(cls, motion: ElementMotion, rules: ComponentRules = RULES.component) -> Seen:
@@ -46,7 +47,7 @@ class Seen:
         travel = 0.5 * float(np.ptp(motion.deflection))
         rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
         knee = rules.lowest_knee * float(rate[50])
-        return cls(max(travel, 1e-12), rate, seconds, motion.step, knee, rules.formula_reach)
+        return cls(max(travel, 1e-12), rate, seconds, motion.step, knee, rules.formula_reach, rules.latest)
 
     @property
     def rate_rms(self) -> float:
@@ -269,17 +270,19 @@ class Lag:
     key: str = SENSOR_LAG.name
     kind: PieceKind = STATIC
     dissipates: bool = False
-    believed: Believed = lambda fitted: fitted.rules.late * fitted.step < abs(fitted.shape[0]) < 1.4 * _LATEST
+    believed: Believed = lambda fitted: (
+        fitted.rules.late * fitted.step < abs(fitted.shape[0]) < 1.4 * fitted.rules.latest
+    )
     plain: int = 0
     shapes: tuple[str, ...] = ("time",)
     signs: tuple[int, ...] = ()
 
     def grid(self, seen: Seen) -> FloatArray:
-        late = np.geomspace(2e-4, _LATEST, 12)
+        late = np.geomspace(2e-4, seen.latest, 12)
         return np.concatenate([late, -late])[:, None]
 
     def limits(self, seen: Seen) -> list[tuple[float, float]]:
-        return [(-1.5 * _LATEST, 1.5 * _LATEST)]
+        return [(-1.5 * seen.latest, 1.5 * seen.latest)]
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
         return np.zeros((len(motion.deflection), 0))
@@ -291,7 +294,6 @@ class Lag:
         return {}
 
 
-_LATEST = 0.04  # s, of the filters and nodes of a test bench
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
 _RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
 SURFACE = SliderSurface()

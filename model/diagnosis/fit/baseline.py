@@ -66,7 +66,7 @@ def _begun(
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):
-        # far from the truth a lightly damped system fits no better in any direction: let the forces take the blame
+        # far from the truth a lightly damped system fits no better in any direction: their noise accounts for it
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
         problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise))
     if not system.file.inputs:

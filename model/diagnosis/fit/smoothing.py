@@ -54,7 +54,7 @@ def smoothed(problem: Problem, point: Point, working: Working, spectrum: Complex
 def along_measured_motion(problem: Problem, point: Point) -> tuple[Point, Working]:
     """Smooth measured forces, with laws along the motion that results.
 
-    A measured force takes the blame for whatever else pushes the body, so its noise is large and the smoothed
+    A measured force accounts for whatever else pushes the body, so its noise is large and the smoothed
     motion is the one that the sensors saw, not a free run.  Laws' forces, state and smoothed inputs depend on each
     other; they are iterated like the forces of a free run.
     """

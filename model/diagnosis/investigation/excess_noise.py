@@ -26,7 +26,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     known = declared.sensors[np.isin(state.prepared.signals.sensor_index, state.signals.sensor_index)]
     inside = noise.sensors / known
     # what is left of physics is no noise: noise goes on above the band that is compared
-    white = upper_ratio(state, known) > 1 + 0.5 * (inside - 1)
+    white = upper_ratio(state, known) > 1 + rules.white * (inside - 1)
     inaccuracy = rules.inaccuracy * np.mean((after.simulated - before.simulated) ** 2, axis=0)
     white &= (inside**2 - np.median(inside) ** 2) * known**2 > inaccuracy
     found += _outliers(names, inside, white, count, rules)

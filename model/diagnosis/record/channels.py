@@ -302,4 +302,4 @@ def _second_derivative(displacement: FloatArray, acceleration: FloatArray, dt: f
 
 def _missing(name: str, frozen: set[str]) -> str:
     state = "is stuck" if any(f.startswith(name) for f in frozen) else "is missing from the recording"
-    return f"input {name} {state}: nothing can be simulated without it; record it again or mend the channel"
+    return f"input {name} {state}: nothing can be simulated without it; record it again or repair the channel"

@@ -100,11 +100,12 @@ def _noise(course: Investigation) -> dict[str, float]:
 def _changes(outcome: Outcome) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
     course, final = outcome.investigation, outcome.final
+    rules = course.options.rules.report
     sigma, theta = deviations(course.system, final), final.point.theta
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
     for i in order:
-        if abs(theta[i]) > np.log1p(course.options.rules.report.changed) and abs(theta[i]) > 5 * sigma[i]:
+        if abs(theta[i]) > np.log1p(rules.changed) and abs(theta[i]) > rules.sure * sigma[i]:
             change = 100 * (np.exp(theta[i]) - 1)
             words.append(f"{course.system.parameters[i].name} is {change:+.0f} % from nominal")
     return tuple(words)

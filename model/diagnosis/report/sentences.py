@@ -53,7 +53,7 @@ def _worst_bias(outcome: Outcome) -> str | None:
     shift = course.base.point.theta - final.point.theta
     if not len(shift):
         return None
-    shift = np.where(np.abs(shift) > 5 * sigma, shift, 0.0)
+    shift = np.where(np.abs(shift) > course.options.rules.report.sure * sigma, shift, 0.0)
     worst = int(np.argmax(np.abs(shift)))
     if abs(shift[worst]) < 0.01:
         return None
