@@ -94,7 +94,7 @@ def peaks_and_independent(record: MeasuredRecord, report: Report) -> tuple[Float
 
 
 def followed(report: Report, peaks: FloatArray, independent: FloatArray) -> dict[str, Any]:
-    """The lowest natural frequency beside the spectral peak of every window, and both beside the independent measurement."""
+    """The lowest natural frequency of every window and its spectral peak, beside the independent measurement."""
     found = np.array([point.frequency[0] for point in report.track])
     sure = np.array([p.adequate and p.deviation[0] < SURE * p.frequency[0] for p in report.track])
     one, other, rank = found[sure], peaks[sure], independent[sure]

@@ -51,6 +51,7 @@ from sprung.model.diagnosis.report.report import (
 )
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
+from sprung.model.laws import CATALOGUE
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -239,6 +240,9 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
     advice = [note for j in judged for note in j.record.notes]
+    own = [law.name for law in options.catalogue if law not in CATALOGUE]
+    if own:
+        advice.append(f"component tests do not try laws of your own: {', '.join(own)}")
     return Report(
         system=system.name,
         recording=RecordingFacts(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +10,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import butter, sosfiltfilt
 
-from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
+from sprung.model.diagnosis.api import Options, Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.damping import COULOMB_FRICTION
 from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
 from sprung.model.laws.reversals import bouc_wen_memory
 from sprung.model.system import System, load_system, parse_system
@@ -58,11 +60,18 @@ def sweep(seconds: float = 12.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return t, d, v
 
 
-def report(force: np.ndarray, d: np.ndarray, noise: float = 1.0, declared: float = 1.0, seed: int = 0) -> Report:
+def report(
+    force: np.ndarray,
+    d: np.ndarray,
+    noise: float = 1.0,
+    declared: float = 1.0,
+    seed: int = 0,
+    options: Options | None = None,
+) -> Report:
     random = np.random.default_rng(seed)
     measured = force + noise * random.standard_normal(len(force))
     shown = d + 1e-6 * random.standard_normal(len(d))
-    return diagnose(system(declared), RigRecording(np.column_stack([shown, measured])))
+    return diagnose(system(declared), RigRecording(np.column_stack([shown, measured])), options)
 
 
 def laws(found: Report) -> list[str]:
@@ -90,9 +99,11 @@ def test_the_verdict_does_not_hang_on_the_declared_noise(factor: float) -> None:
 
 def test_dry_friction_is_named_with_its_force() -> None:
     _, d, v = sweep()
-    found = report(K * d + C * v + 60 * np.tanh(v / 1e-3), d)
+    own = replace(COULOMB_FRICTION, name="squeak")
+    found = report(K * d + C * v + 60 * np.tanh(v / 1e-3), d, options=Options(catalogue=(*CATALOGUE, own)))
     first = found.findings[0]
     assert "coulomb_friction" in (first.family or first.effect)
+    assert any("squeak" in line for line in found.advice)  # laws of a user's own are not tried here, and this is said
     quoted = {q.name: q.value for q in first.quoted}
     force = quoted.get("breakaway_force", quoted.get("yield_force"))
     assert force == pytest.approx(60, rel=0.1)
