@@ -32,7 +32,7 @@ from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.investigation.course import Investigation, Outcome
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded, under, with_findings
 from sprung.model.diagnosis.investigation.judgement import judged
-from sprung.model.diagnosis.report.narrate import narrate
+from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import System
@@ -88,7 +88,7 @@ class Subject:
             done = self.outcome
             state = under(done.investigation, rules)
             judgement = judged(state, done.before, done.after, done.noise_faults)
-            return Said.of(narrate(replace(done, investigation=state, judgement=judgement), self.record))
+            return Said.of(compose(replace(done, investigation=state, judgement=judgement), self.record))
         if stage in LATE and name not in FIRST:
             state = under(self.state, rules)
         else:
@@ -96,8 +96,8 @@ class Subject:
         state, usual = with_findings(state, _silent), self.outcome
         same = usual.investigation
         if stage != "noise" and (state.fit is same.fit and state.base is same.base):  # as remembered: the same model
-            return Said.of(narrate(replace(usual, investigation=state), self.record))
-        return Said.of(narrate(concluded(state, _silent), self.record))
+            return Said.of(compose(replace(usual, investigation=state), self.record))
+        return Said.of(compose(concluded(state, _silent), self.record))
 
 
 def run(
@@ -269,7 +269,7 @@ def _known(name: str, system: System, record: Falsified) -> Subject:
         return Subject(name, system, record, options, Said.of(diagnose(system, record, options)), reads)
     state = begun(system, record, options, _silent)
     outcome = concluded(with_findings(state, _silent), _silent)
-    return Subject(name, system, record, options, Said.of(narrate(outcome, record)), (), state, outcome)
+    return Subject(name, system, record, options, Said.of(compose(outcome, record)), (), state, outcome)
 
 
 def _silent(share: float, text: str) -> None:

@@ -13,7 +13,7 @@ from sprung.model.diagnosis.component.measured import covariates, is_component_t
 from sprung.model.diagnosis.investigation.course import Options, Outcome, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
-from sprung.model.diagnosis.report.narrate import narrate
+from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.report.report import Finding, Report
 from sprung.model.laws import ElementLaw
 from sprung.model.laws.following import Covariate, following_law
@@ -79,7 +79,7 @@ def diagnose(
     if not system.file.inputs and outcome.judgement.strange is not None:
         outcome = _along_what_was_seen(system, record, options, tell) or outcome
     tell(0.95, "report")
-    report = narrate(outcome, record)
+    report = compose(outcome, record)
     tell(1.0, "done")
     return report
 
@@ -87,7 +87,7 @@ def diagnose(
 def _along_what_was_seen(system: System, record: Recorded, options: Options, tell: Progress) -> Outcome | None:
     """A free decay whose phase no simulation keeps, laws acting along the motion that the sensors saw; None: nor so.
 
-    A law that shifts the frequency takes a linear start astray within a few periods.  With forces that nobody measured
+    A law that shifts the frequency makes a linear start diverge within a few periods.  With forces that nobody measured
     on every body, as strong as they have to be, the fit is one of forces along the measured motion.
     """
     forces = {f"disturbance of {body}": ForceInput(kind="force", body=body) for body in system.bodies}

@@ -123,7 +123,7 @@ class _State:
 
 
 def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whitener | None = None) -> Fit | None:
-    """A fit that may go astray: None where the numbers do."""
+    """A fit that may diverge: None where it does."""
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
             fit = optimise(problem, start, iterations=iterations, whitener=whitener)
@@ -218,7 +218,7 @@ def _begun_anew(problem: Problem, state: _State) -> _State:
     """
     columns = state.lin.jacobian[:, -len(state.point.state) :]
     if not (np.isfinite(columns).all() and np.isfinite(state.lin.residual).all()):
-        return state  # gone astray: judged by its value
+        return state  # diverged: judged by its value
     step = np.linalg.lstsq(columns, state.lin.residual, rcond=None)[0]
     other = _state(problem, replace(state.point, state=state.point.state + step), state.working)
     return other if other.value < state.value else state

@@ -158,7 +158,7 @@ def _without_input_faults(
 
 
 def _on_everything(state: Investigation) -> Fit:
-    """The model fitted to the whole recording, once it has been judged; the first part's where that goes astray."""
+    """The model fitted to the whole recording, once it has been judged; the first part's where that diverges."""
     differentiated = drifting(state.system, state.signals.sensor_index)
     part = transform(state.signals, state.problem.noise, differentiated=differentiated)
     problem = replace(state.problem, part=part)

@@ -27,7 +27,7 @@ TOLERANCE = 1e-6  # of the law's force
 _ITERATIONS = 60
 _PATIENCE, _PROGRESS = 16, 0.5  # it is given up when the error has not fallen by this factor in so many iterations
 _HISTORY = 8
-_REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate gone astray
+_REACH = 4.0  # a trajectory this many times the linear one's reach is an iterate that diverges
 
 
 @dataclass(frozen=True)

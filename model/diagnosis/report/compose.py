@@ -20,7 +20,7 @@ from sprung.model.diagnosis.report.report import (
 from sprung.model.diagnosis.report.values import deviations, figures, formula_of, law_parameters, reported_parameters
 
 
-def narrate(outcome: Outcome, record: Recorded) -> Report:
+def compose(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
     course, before, after = outcome.investigation, outcome.before, outcome.after
     said, names = outcome.judgement, course.signals.sensor_names
