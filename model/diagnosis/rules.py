@@ -285,6 +285,7 @@ class ComponentRules:
     )
     periods: float = rule(4.0, "of the slowest motion that an integral holds; derived: a level needs some", 3.0, 8.0)
     integral_settled: float = rule(1.5, "of those periods lost at either end; chosen", 1.0, 2.5)
+    seen_to_fall: float = rule(0.25, "of a friction's fall with the rate, that it must show; chosen", 0.1, 0.5)
     turn: float = rule(0.05, "of the travel's range, that a turning point turns by; chosen", 0.02, 0.1)
     one_cycle: float = rule(0.1, "of a cycle's travel and duration, within which all are one; chosen", 0.05, 0.2)
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)

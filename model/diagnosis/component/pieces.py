@@ -58,6 +58,15 @@ def _opens_late_enough(fitted: FittedPiece) -> bool:
     return all(-0.02 <= r < 0.98 for r in ratios) and all(k > fitted.corner for k in knees)
 
 
+def _falls(fitted: FittedPiece) -> bool:
+    """Friction that is told to fall with the rate has been above what it falls to, by a part of what is told."""
+    force, static = fitted.values["force"], fitted.values["static_force"]
+    fall, smoothing = fitted.values["stribeck_rate"], fitted.values["smoothing"]
+    rate = fall * np.linspace(0.0, 3.0, 301)
+    shown = np.tanh(rate / smoothing) * (force + (static - force) * np.exp(-((rate / fall) ** 2)))
+    return bool(shown.max() - force > fitted.rules.seen_to_fall * (static - force))
+
+
 def _slips(fitted: FittedPiece) -> bool:
     """What never slips is a spring with a gap."""
     gap, reach = fitted.shape
@@ -115,6 +124,7 @@ _STRIBECK = Piece(
     lambda a, s, e: {"breakaway_force": (a[0] + a[1], "N")},
     kind=FRICTION,
     plain=1,
+    believed=_falls,
 )
 _DAHL = Piece(
     _law("dahl"),

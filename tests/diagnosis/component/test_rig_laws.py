@@ -8,6 +8,10 @@ from scipy.integrate import solve_ivp
 
 from sprung.benchmarks.real_reference import bouc_wen
 from sprung.model.diagnosis.api import Report, diagnose
+from sprung.model.diagnosis.component.piece import FittedPiece
+from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.laws import SpringDamper
 from sprung.model.system import parse_system
 from tests.diagnosis.component.test_component import RATE, C, K, RigRecording, sweep
 
@@ -51,6 +55,17 @@ def named(report: Report, effect: str) -> dict[str, float]:
     first = next(f for f in report.findings if f.effect != "preload")
     assert effect in (first.family or first.effect), first
     return {p.name: p.value for p in (*first.parameters, *first.quoted)}
+
+
+@pytest.mark.parametrize(("smoothing", "believed"), [(0.11, False), (0.01, True)])
+def test_friction_that_falls_has_been_above_what_it_falls_to(smoothing: float, believed: bool) -> None:
+    piece = next(piece for piece in PIECES if piece.effect == "stribeck")
+    values = {"force": 128.0, "static_force": 205.0, "stribeck_rate": 0.13, "smoothing": smoothing}
+    shape = (smoothing, 0.13)
+    fit = FittedPiece(
+        values, np.array([128.0, 77.0]), shape, SpringDamper(K, C), D, 1e-3, RULES.component, 1 / RATE, 20.0
+    )
+    assert piece.believed(fit) is believed
 
 
 def test_presliding_is_dahls_with_its_force_and_stiffness() -> None:
