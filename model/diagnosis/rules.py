@@ -220,6 +220,10 @@ class VerdictRules:
     strange: float = rule(0.6, "error over the signal, of another vehicle than the file's; chosen", 0.45, 0.8)
     least: float = rule(2e-3, "error over the signal that sampling leaves of a perfect model; derived", 1e-3, 4e-3)
     spread: float = rule(4.0, "standard deviations of a level; derived: one in 16 000 leaves them", 3.0, 6.0)
+    parts: int = rule(2, "changes of the structure that are named; chosen: more of them imitate any other", 1, 3)
+    parts_leave: float = rule(
+        0.02, "of the excess error, that two of them may leave; chosen: true ones leave less", 0.01, 0.05
+    )
     slack: float = rule(1.5, "times a declared noise; chosen: a declaration is a round number", 1.2, 2.0)
 
 

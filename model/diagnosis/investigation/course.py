@@ -135,6 +135,7 @@ class Judgement:
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
     strange: float | None  # error over the signal of a model that does not describe the recording
     lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
+    parts: int  # changes of the structure that were needed, where they are too many to be believed; else 0
     carried: bool  # the findings carry the verdict: what they explain outweighs what they leave
     place: str  # where most of what is left is seen
     where: str  # the same in words, with size and frequencies; empty where nothing is left

@@ -23,7 +23,7 @@ from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of
 from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
-from sprung.model.diagnosis.investigation.judgement import judged, unmeasured_share
+from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
@@ -58,7 +58,7 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
         if len(state.found) == count:
             break
         state = without_idle(state)
-        if _still_strange(state, before):
+        if _still_strange(state, before) or another_structure(state):
             break  # what comes next would be names for what another structure does
     return state
 

@@ -9,11 +9,13 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
+from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, bounded_noise, kind_of, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
+from sprung.model.laws import StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
@@ -45,18 +47,40 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     kinds += [kind_of(fault.term.law) for fault in state.input_faults]
     kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
     verdict = verdict_of(kinds + physics, deciding, rules)
+    other = another_structure(state, deciding)
+    verdict = "unknown_physics" if other else verdict
     strange = float(np.sqrt(np.mean(deciding.after**2)))
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
         errors=errors,
         verdict=verdict,
         floor=floor,
-        strange=strange if verdict == "unknown_physics" and strange > rules.strange else None,
+        strange=strange if other or (verdict == "unknown_physics" and strange > rules.strange) else None,
+        parts=changed_parts(state) if other else 0,
         lost_phase=lost,
         carried=carried,
         place=_place(state),
         where=_words(state, errors, after),
     )
+
+
+def changed_parts(state: Investigation) -> int:
+    """How many changes of the structure there are among the findings: elements elsewhere, connections, hung masses."""
+    moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
+    return moved + sum(isinstance(found.trial.term.law, StructureLaw) for found in state.found)
+
+
+def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:
+    """Whether the findings change the structure so often that together they imitate one which the file is not.
+
+    More than a few in any case; more than one where they leave more than next to nothing (`errors`).
+    """
+    rules, parts = state.options.rules.verdict, changed_parts(state)
+    if parts < 2 or errors is None:
+        return parts > rules.parts
+    share = errors.explained(rules)
+    left = bool(np.any(errors.unexplained(rules) > 0)) and share is not None and share < 1 - rules.parts_leave
+    return left or parts > rules.parts
 
 
 def bounded(state: Investigation) -> Noise:

@@ -1,0 +1,41 @@
+"""Many changes of the structure together imitate any other one: then none of them is named."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.investigation.judgement import another_structure
+from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED, WRONG_BODY
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.laws import find_law
+
+
+def investigation(laws: list[str], moved: bool) -> Any:
+    found = [SimpleNamespace(trial=SimpleNamespace(term=SimpleNamespace(law=find_law(name)))) for name in laws]
+    effects = [SIGN_REVERSED, WRONG_BODY] if moved else [SIGN_REVERSED]
+    return SimpleNamespace(
+        options=SimpleNamespace(rules=RULES),
+        setup_faults=[SimpleNamespace(effect=effect) for effect in effects],
+        found=found,
+    )
+
+
+@pytest.mark.parametrize(
+    ("laws", "moved", "after", "other"),
+    [
+        (["missing_connection", "suspended_mass"], True, 0.02, True),  # three, however well they fit
+        (["missing_connection", "suspended_mass"], False, 0.02, False),
+        (["missing_connection", "suspended_mass"], False, 0.20, True),  # two that leave 6 % of the power
+        (["missing_connection", "coulomb_friction"], False, 0.20, False),
+    ],
+)
+def test_changes_of_the_structure_are_named_when_they_are_few(
+    laws: list[str], moved: bool, after: float, other: bool
+) -> None:
+    errors = HeldOutErrors(np.array([0.8]), np.array([after]), np.array([0.02]))
+    assert another_structure(investigation(laws, moved), errors) is other
