@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.own import load_laws
 from sprung.model.simulate.ride import simulate_ride
-from sprung.model.system import parse_system
+from sprung.model.system import load_system, parse_system
+from sprung.service.cli import main
+from sprung.service.core import build_core
+from sprung.service.engine import Engine
+from sprung.service.settings import Settings
 
-ROOT = Path(__file__).parents[1]
 READER = '''
 import numpy as np
 from sprung.model.signals import SampleBlock
@@ -66,8 +71,10 @@ sensors: {a: {kind: acceleration, body: car, csv: a, noise: 0.01}}
 """
 
 
-def package(folder: Path) -> Path:
-    """An installed package, as `pip install --target` leaves it."""
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """An installed package, as `pip install --target` leaves it, on the path of this process."""
+    folder = tmp_path
     site = folder / "site"
     (site / "other").mkdir(parents=True)
     (site / "other" / "__init__.py").write_text("")
@@ -78,17 +85,15 @@ def package(folder: Path) -> Path:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
     points = "[sprung.readers]\nraw8 = other.reading:blocks\n\n[sprung.metrics]\ncars = other.counting:Cars\n"
     (info / "entry_points.txt").write_text(points)
-    return site
+    monkeypatch.syspath_prepend(site)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] == "other"]:
+        del sys.modules[name]
 
 
-def run(arguments: list[str], site: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])}
-    return subprocess.run(
-        [sys.executable, *arguments], env=environment, capture_output=True, text=True, check=False, cwd=ROOT
-    )
-
-
-def test_a_reader_of_another_package_is_replayed(tmp_path: Path) -> None:
+def test_a_reader_of_another_package_is_replayed(
+    tmp_path: Path, package: None, capsys: pytest.CaptureFixture[str]
+) -> None:
     system = parse_system(SYSTEM)
     t = np.arange(3000) / 100
     rng = np.random.default_rng(1)
@@ -100,38 +105,23 @@ def test_a_reader_of_another_package_is_replayed(tmp_path: Path) -> None:
     noisy = inputs + rng.normal(0, [1e-5, 1e-4], inputs.shape)
     np.column_stack([1.79e9 + t, noisy, shown]).tofile(tmp_path / "ride.raw8")
     (tmp_path / "one.yaml").write_text(SYSTEM)
-    done = run(
-        ["-m", "sprung", "replay", str(tmp_path / "ride.raw8"), "--system", str(tmp_path / "one.yaml"), "--json"],
-        package(tmp_path),
-    )
-    summary = json.loads(done.stdout.splitlines()[-1])["summary"]
+    main(["replay", str(tmp_path / "ride.raw8"), "--system", str(tmp_path / "one.yaml"), "--json"])
+    told = capsys.readouterr()
+    summary = json.loads(told.out.splitlines()[-1])["summary"]
     stiffness = next(p for p in summary["parameters"] if p["name"] == "strut.stiffness")
-    assert abs(stiffness["value"] - 23000) < 5 * stiffness["std"], done.stderr
+    assert abs(stiffness["value"] - 23000) < 5 * stiffness["std"], told.err
 
 
-def test_a_metric_of_another_package_is_shown(tmp_path: Path) -> None:
-    code = (
-        "from sprung.service.metrics import Metrics\n"
-        "class Board:\n"
-        "    def __getattr__(self, name): return lambda *a, **k: []\n"
-        "from prometheus_client import generate_latest\n"
-        "import sprung.service.metrics as m\n"
-        "m.FleetCollector = type('None_', (), {'__init__': lambda s, *a: None, 'collect': lambda s: [],"
-        " 'describe': lambda s: []})\n"
-        "print(generate_latest(Metrics(Board(), 1).registry).decode())\n"
-    )
-    done = run(["-c", code], package(tmp_path))
-    assert "other_answer 42.0" in done.stdout, done.stderr
+def test_a_metric_of_another_package_is_shown(package: None, engine: Engine, data_dir: Path) -> None:
+    core = build_core(Settings(data_dir=data_dir), engine)
+    try:
+        assert "other_answer 42.0" in core.metrics.render().decode()
+    finally:
+        core.close()
 
 
 def test_a_law_from_a_file_is_known_to_the_diagnosis(tmp_path: Path) -> None:
     (tmp_path / "laws.py").write_text(LAW)
     (tmp_path / "one.yaml").write_text(SYSTEM.replace("1500}", "1500, laws: [{squeak: {size: 10}}]}"))
-    code = (
-        "from sprung.model.laws import CATALOGUE; from sprung.model.laws.own import load_laws\n"
-        "from sprung.model.system import load_system\n"
-        f"laws = CATALOGUE + load_laws({str(tmp_path / 'laws.py')!r}, ())\n"
-        f"print(load_system({str(tmp_path / 'one.yaml')!r}, laws).laws[0].names)\n"
-    )
-    done = run(["-c", code], tmp_path)
-    assert "strut.squeak.size" in done.stdout, done.stderr
+    laws = CATALOGUE + load_laws(tmp_path / "laws.py", ())
+    assert "strut.squeak.size" in load_system(tmp_path / "one.yaml", laws).laws[0].names

@@ -3,42 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from typing import TypeVar
 
-from sprung.model.signals import Channel, TimeColumn
-from sprung.replay.inspection import Inspection, inspect
-from sprung.replay.record import Record, load_record
+from sprung.replay.inspection import Inspection
+from sprung.replay.record import Record
+from sprung.service.loading import InspectionRequest, RecordRequest, inspect_task, load_task
 from sprung.service.reading import Apart, Here, Reading, ReadRequest, ReadWindows
 from sprung.service.recordings import SLOWEST_BYTES_PER_SECOND
 from sprung.service.settings import Settings, settings_with
-from sprung.service.worker import Emit, ProcessLimits, Task, Worker
+from sprung.service.worker import ProcessLimits, Task, Worker
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")
-
-
-@dataclass(frozen=True, slots=True)
-class RecordRequest:
-    """A recording to load in one piece."""
-
-    path: Path
-    channels: tuple[Channel, ...]
-    sample_rate: float
-    dbc: Path | None
-    time: TimeColumn
-    start: int | None
-
-
-@dataclass(frozen=True, slots=True)
-class InspectionRequest:
-    """A file to look into."""
-
-    path: Path
-    dbc: Path | None
-    time: TimeColumn
 
 
 def own_limits(settings: Settings, path: Path) -> ProcessLimits | None:
@@ -69,23 +47,6 @@ def windows(request: ReadRequest) -> Iterator[ReadWindows]:
     limits = own_limits(settings_with({}), request.path)
     reading: Reading = Here(request) if limits is None else Apart(request, limits)
     return reading.pieces(lambda: None)
-
-
-def load_task(request: RecordRequest, _emit: Emit[None]) -> Record:
-    """In the other process."""
-    return load_record(
-        request.path,
-        request.channels,
-        request.sample_rate,
-        dbc=request.dbc,
-        time=request.time,
-        start=request.start,
-    )
-
-
-def inspect_task(request: InspectionRequest, _emit: Emit[None]) -> Inspection:
-    """In the other process."""
-    return inspect(request.path, request.dbc, request.time)
 
 
 def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:

@@ -20,6 +20,7 @@ from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import spooled
 from sprung.service.diagnosing import load_excerpt
 from sprung.service.improved import write_improved
+from sprung.service.loading import RecordRequest
 from sprung.service.own_laws import write_laws
 
 
@@ -79,7 +80,7 @@ def load(file: Path, system: System, dbc: Path | None, start: int | None = None)
     if file.suffix == ".npz":
         return load_excerpt(file)
     channels = (*system.channels, *system.signals)
-    return apart.load(apart.RecordRequest(file, channels, system.sample_rate, dbc, system.time, start))
+    return apart.load(RecordRequest(file, channels, system.sample_rate, dbc, system.time, start))
 
 
 def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:

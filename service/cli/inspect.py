@@ -17,6 +17,7 @@ from sprung.replay.skeleton import skeleton
 from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
 from sprung.service.errors import UserError
+from sprung.service.loading import InspectionRequest
 from sprung.service.times import to_iso
 
 
@@ -33,7 +34,7 @@ def run(
 ) -> int:
     """Print what is in a recording; 1 when some of it could not be read."""
     time, said = _time(system_file, column, unit, rate)
-    found = apart.look(apart.InspectionRequest(file, dbc, time))
+    found = apart.look(InspectionRequest(file, dbc, time))
     if write_system is not None:
         _write(write_system, skeleton(found, file.stem, said))
     if json_lines:

@@ -16,6 +16,7 @@ from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.cli import apart
 from sprung.service.comparison import Comparison, compare
 from sprung.service.errors import UserError
+from sprung.service.loading import RecordRequest
 
 
 def simulate(
@@ -35,7 +36,7 @@ def simulate(
         raise UserError(f"{out}: is the file that the inputs come from")
     system = load_system(system_file, catalogue)
     database = dbc or (MANCHESTER_DBC if system_file == MANCHESTER else None)
-    record = apart.load(apart.RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
+    record = apart.load(RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
     driven = record.values[:, : len(system.inputs)]
     ride = simulate_ride(
         system, driven, dict(map(_setting, settings)), noise=np.random.default_rng(seed) if noise else None
@@ -71,7 +72,7 @@ def show(
     database = dbc or (MANCHESTER_DBC if system_file is None else None)
 
     def load(path: Path) -> Record:
-        return apart.load(apart.RecordRequest(path, system.channels, system.sample_rate, database, system.time, None))
+        return apart.load(RecordRequest(path, system.channels, system.sample_rate, database, system.time, None))
 
     found = compare(measured, other, system, load)
     per_sensor = {

@@ -31,3 +31,9 @@ def client(core: Core) -> Iterator[TestClient]:
 def broken(client: TestClient, core: Core, system: System) -> str:
     """A vehicle whose parameters have all grown by a third."""
     return worsen(core, system)
+
+
+@pytest.fixture
+def reading_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Uploads are read in this process: one of their own costs each test seconds; test_apart.py has them."""
+    monkeypatch.setattr("sprung.service.recordings.reading_limits", lambda settings, path: None)

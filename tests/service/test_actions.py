@@ -6,7 +6,6 @@ import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jsonschema
 import numpy as np
@@ -99,13 +98,15 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
     assert len(client.get("/jobs").json()["jobs"]) == 1
 
 
-@pytest.mark.parametrize(
-    ("body", "field"),
-    [({}, "text"), ({"text": ""}, "text"), ({"text": "x", "time": "noon"}, "time"), ({"text": "x", "who": 1}, "who")],
-)
-def test_wrong_notes_are_refused(client: TestClient, broken: str, body: dict[str, Any], field: str) -> None:
-    answer = client.post("/vehicles/a/notes", json=body)
-    assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == field
+def test_wrong_notes_are_refused(client: TestClient, broken: str) -> None:
+    for body, field in (
+        ({}, "text"),
+        ({"text": ""}, "text"),
+        ({"text": "x", "time": "noon"}, "time"),
+        ({"text": "x", "who": 1}, "who"),
+    ):
+        answer = client.post("/vehicles/a/notes", json=body)
+        assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == field, body
 
 
 def test_the_newest_window_measured_and_simulated(client: TestClient, broken: str, system: System) -> None:

@@ -13,6 +13,7 @@ from sprung.replay import UnreadableRecording
 from sprung.service import reading
 from sprung.service.cli import apart, main
 from sprung.service.errors import UserError
+from sprung.service.loading import RecordRequest
 from sprung.service.settings import Settings
 
 
@@ -21,8 +22,8 @@ def isolated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SPRUNG_ISOLATE_READING", "true")
 
 
-def request(path: Path, system: System) -> apart.RecordRequest:
-    return apart.RecordRequest(path, system.channels, system.sample_rate, None, system.time, 0)
+def request(path: Path, system: System) -> RecordRequest:
+    return RecordRequest(path, system.channels, system.sample_rate, None, system.time, 0)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the bound is one of Linux")

@@ -33,7 +33,8 @@ def relative(error: ComplexArray, measured: ComplexArray) -> FloatArray:
 
 def _power(spectrum: ComplexArray) -> FloatArray:
     """Sum of squares of every column, (S,)."""
-    return np.einsum("fs,fs->s", spectrum.real, spectrum.real) + np.einsum("fs,fs->s", spectrum.imag, spectrum.imag)
+    parts = spectrum.real, spectrum.imag
+    return np.asarray(sum(np.einsum("fs,fs->s", part, part) for part in parts))
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ class SetupScores:
         self.theta = np.zeros_like(fit.point.theta) if nominal else fit.point.theta
         stride = 1 if most is None else max(1, part.grid.band.stop // most)
         self.grid = ThinnedGrid(part.grid.samples, part.grid.step, part.grid.start, stride)
-        self.every = slice(0, part.grid.band.stop, stride)
-        self.band = slice(stride, part.grid.band.stop, stride)  # the same without zero frequency
+        self.band = slice(stride, part.grid.band.stop, stride)  # the same, without zero frequency
         self.weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(part.sensors[self.band]) ** 2, axis=0), 1e-300))
         self.shown = self._shown(problem.system, self.theta)
         columns = [
@@ -70,7 +69,7 @@ class SetupScores:
     def _shown(self, system: System, theta: FloatArray) -> ComplexArray:
         forward = Forward(system, self.problem.part, self.problem.sensors, theta)
         plant, part = replace(forward.plant, grid=self.grid), self.problem.part
-        return plant.sensors(part.support[self.every], part.force[self.every])[1:]
+        return plant.sensors_once(part.support[self.band], part.force[self.band])
 
     def _flat(self, spectrum: ComplexArray) -> FloatArray:
         flat = (spectrum * self.weight).ravel()

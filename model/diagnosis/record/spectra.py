@@ -129,14 +129,14 @@ class Grid:
 
 @dataclass(frozen=True)
 class ThinnedGrid(Grid):
-    """Every so many-th of the compared bins, from the first on: where responses are asked for, not for series."""
+    """Every so many-th of the compared bins but the first: where responses are asked for, not for series."""
 
     stride: int = 1
 
     @cached_property
     def omega(self) -> FloatArray:
         """Angular frequencies of those bins, rad/s."""
-        bins = np.fft.rfftfreq(self.samples, self.step)[self.band][:: self.stride]
+        bins = np.fft.rfftfreq(self.samples, self.step)[self.band][self.stride :: self.stride]
         return np.asarray(2 * np.pi * bins, dtype=np.float64)
 
 

@@ -39,15 +39,22 @@ class Plant:
             result[:, branch.element] += branch.impedance(self.grid.omega)
         return result
 
-    @cached_property
-    def receptance(self) -> ComplexArray:
-        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system floats."""
+    @property
+    def dynamic_stiffness(self) -> ComplexArray:
+        """Load per displacement, N/m, shape (F, n, n)."""
         s, w = self.structure, self.grid.omega
         n = len(s.mass)
         outer = (s.H[:, :, None] * s.H[:, None, :]).reshape(len(s.H), n * n)
         Z = (self.impedance @ outer).reshape(len(w), n, n)
         index = np.arange(n)
         Z[:, index, index] += s.own_stiffness + 1j * w[:, None] * s.own_damping - w[:, None] ** 2 * s.mass
+        found: ComplexArray = Z
+        return found
+
+    @cached_property
+    def receptance(self) -> ComplexArray:
+        """Displacement per load, m/N, shape (F, n, n); zero at zero frequency where the system floats."""
+        Z = self.dynamic_stiffness
         if np.linalg.cond(Z[0].real) > 1e12:
             result = np.zeros_like(Z)
             result[1:] = np.linalg.inv(Z[1:])
@@ -138,6 +145,16 @@ class Plant:
         """True signals under supports (F, supports) and measured forces (F, forces), (F, S)."""
         s = self.structure
         result = np.einsum("fsn,fn->fs", self.sensor_of_load, self.load(support, force))
+        if np.any(s.L):
+            result += np.einsum("fse,fe->fs", self._of_deflection, support @ s.G.T)
+        found: ComplexArray = result
+        return found
+
+    def sensors_once(self, support: ComplexArray, force: ComplexArray) -> ComplexArray:
+        """The same of a grid without zero frequency, by one solution: for a plant that is asked nothing else."""
+        s = self.structure
+        motion = np.linalg.solve(self.dynamic_stiffness, self.load(support, force)[:, :, None])
+        result = (self.sensor_of_dof @ motion)[:, :, 0]
         if np.any(s.L):
             result += np.einsum("fse,fe->fs", self._of_deflection, support @ s.G.T)
         found: ComplexArray = result

@@ -75,7 +75,7 @@ class TrialElement:
         # series impedances vanish at zero frequency, so the rate carries them and ends that do not meet do no harm
         per_rate = np.zeros_like(factor)
         per_rate[1:] = factor[1:] / (1j * omega[1:])
-        return per_rate * self._rate_spectrum
+        return np.asarray(per_rate * self._rate_spectrum)
 
     @cached_property
     def _rate_spectrum(self) -> ComplexArray:

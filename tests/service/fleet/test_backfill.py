@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -29,10 +30,10 @@ START = 1_790_000_000_000_000_000
 SECONDS = 12
 
 
-@pytest.fixture
-def place(system: System, tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def written(system: System, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two vehicles, three recordings each, listed in no order of time; a file that is none, and one that is cut."""
-    folder = tmp_path / "recordings"
+    folder = tmp_path_factory.mktemp("written")
     (folder / "north").mkdir(parents=True)
     rng = np.random.default_rng(3)
     for vehicle in ("north-1", "north-2"):
@@ -43,6 +44,12 @@ def place(system: System, tmp_path: Path) -> Path:
             write_recording(path, system.channels, values, system.sample_rate, start, vehicle=vehicle)
     (folder / "broken.mcap").write_bytes(b"no recording")
     return folder
+
+
+@pytest.fixture
+def place(written: Path, tmp_path: Path) -> Path:
+    """A copy of the recordings: some tests remove or change files."""
+    return Path(shutil.copytree(written, tmp_path / "recordings"))
 
 
 @pytest.fixture
