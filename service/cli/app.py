@@ -39,7 +39,7 @@ Start = Annotated[
 ]
 Vehicle = Annotated[
     str | None,
-    typer.Option("--vehicle", metavar="NAME", help="Whose it is; default: as recorded, else the file's name."),
+    typer.Option("--vehicle", metavar="NAME", help="Vehicle; default: as recorded, else the file's name."),
 ]
 
 
@@ -146,7 +146,8 @@ def train(
     ] = None,
     system: System = None,
     recordings: Annotated[
-        list[Path] | None, typer.Option("--recordings", metavar="FILE...", help="Train on from these, without labels.")
+        list[Path] | None,
+        typer.Option("--recordings", metavar="FILE...", help="Continue training with these, without labels."),
     ] = None,
     dbc: Dbc = None,
     out: Annotated[Path, typer.Option("--out", metavar="PATH", help="Folder for the weights.")] = Path("weights"),
@@ -172,10 +173,12 @@ def diagnose(
     out: Annotated[
         Path | None, typer.Option("--out", metavar="PATH", help="Folder for the page and the pictures.")
     ] = None,
-    name: Annotated[str | None, typer.Option("--name", metavar="TEXT", help="Of the recording, in the report.")] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="TEXT", help="Name of the recording in the report.")
+    ] = None,
     start: Start = None,
     write_system: Annotated[
-        Path | None, typer.Option("--write-system", metavar="FILE", help="Write the system file with what was found.")
+        Path | None, typer.Option("--write-system", metavar="FILE", help="Write the system file with the findings.")
     ] = None,
     laws: Annotated[
         Path | None,
@@ -202,12 +205,12 @@ def simulate(
     out: Annotated[Path, typer.Option("--out", metavar="PATH", help="Recording to write: .mcap .csv .blf .asc .log.")],
     dbc: Dbc = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=NUMBER", help="Another value, as car.mass=34000.")
+        list[str] | None, typer.Option("--set", metavar="NAME=NUMBER", help="Change a value, as in car.mass=34000.")
     ] = None,
     noise: Annotated[
-        bool, typer.Option("--noise", metavar="NUMBER", help="With the sensors' noise of the system file.")
+        bool, typer.Option("--noise", metavar="NUMBER", help="Add the sensors' noise of the system file.")
     ] = False,
-    seed: Annotated[int, typer.Option("--seed", metavar="NUMBER", help="Of the noise.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", metavar="NUMBER", help="Seed of the noise.")] = 0,
 ) -> int:
     """Write what the sensors of a vehicle with the laws of its system file would measure."""
     from sprung.service.cli.simulate import simulate as run
@@ -241,9 +244,9 @@ def experiment(
         typer.Argument(help="System files of the models, or a report of `sprung diagnose`.", metavar="MODEL..."),
     ],
     system: Annotated[
-        Path | None, typer.Option("--system", help="With a report: the system file with what it found.")
+        Path | None, typer.Option("--system", help="With a report: the system file with its findings.")
     ] = None,
-    menu: Annotated[Path | None, typer.Option("--menu", help="Runs that can be done; some of its own without.")] = None,
+    menu: Annotated[Path | None, typer.Option("--menu", help="Possible runs; default: a built-in menu.")] = None,
     known: Annotated[
         float | None, typer.Option("--known", metavar="NUMBER", help="How well springs and dampers are known: 0.05.")
     ] = None,
@@ -260,9 +263,9 @@ def inspect(
     file: File,
     system: Annotated[Path | None, typer.Option("--system", help="Take `time:` from this system file.")] = None,
     dbc: Dbc = None,
-    time_column: Annotated[str | None, typer.Option("--time-column", help="Where a table keeps the time.")] = None,
-    time_unit: Annotated[str | None, typer.Option("--time-unit", help="Of that column: s, ms, us, ns ...")] = None,
-    rate: Annotated[float | None, typer.Option("--rate", help="Hz, of a table without times.")] = None,
+    time_column: Annotated[str | None, typer.Option("--time-column", help="Time column of a table.")] = None,
+    time_unit: Annotated[str | None, typer.Option("--time-unit", help="Unit of that column: s, ms, us, ns ...")] = None,
+    rate: Annotated[float | None, typer.Option("--rate", help="Sample rate in Hz of a table without times.")] = None,
     write_system: Annotated[
         Path | None, typer.Option("--write-system", help="Write the skeleton of a system file here.")
     ] = None,
@@ -311,9 +314,12 @@ def import_model(
     ],
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="System file to write.")],
     rate: Annotated[
-        float | None, typer.Option("--rate", metavar="NUMBER", help="Hz, of the recordings; else `sample_rate` in it.")
+        float | None,
+        typer.Option(
+            "--rate", metavar="NUMBER", help="Sample rate in Hz of the recordings; default: `sample_rate` in the file."
+        ),
     ] = None,
-    name: Annotated[str | None, typer.Option("--name", help="Of the system; default: the file's.")] = None,
+    name: Annotated[str | None, typer.Option("--name", help="Name of the system; default: the file's.")] = None,
 ) -> int:
     """A system file from a linear model's matrices: a baseline to identify and to look for what it leaves out."""
     from sprung.service.cli.system import import_matrices
@@ -323,7 +329,7 @@ def import_model(
 
 @app.command()
 def export(
-    vehicle: Annotated[str, typer.Argument(help="As recordings call it.", metavar="VEHICLE")],
+    vehicle: Annotated[str, typer.Argument(help="Vehicle, as named in the recordings.", metavar="VEHICLE")],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Default: standard output, as CSV.")] = None,
     kind: Annotated[
         str | None,
@@ -364,7 +370,7 @@ def doctor(
     system: System = None,
     store: StoreUrl = None,
     weights: Weights = None,
-    data_dir: Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As of sprung serve.")] = None,
+    data_dir: Annotated[Path | None, typer.Option("--data-dir", metavar="FOLDER", help="As for sprung serve.")] = None,
     can: Annotated[
         list[str] | None, typer.Option("--can", metavar="INTERFACE:CHANNEL", help="Listen to this bus; repeatable.")
     ] = None,
@@ -379,7 +385,7 @@ def doctor(
 @app.command(context_settings={"allow_extra_args": True, "ignore_unknown_options": True})
 def bench(
     context: typer.Context,
-    name: Annotated[str | None, typer.Argument(help="Without it, the names are listed.")] = None,
+    name: Annotated[str | None, typer.Argument(help="Without a name, all benchmarks are listed.")] = None,
 ) -> int:
     """A benchmark, one JSON line per figure; further arguments go to it (--budget full, --data DIR)."""
     from sprung.service.cli.bench import run
