@@ -20,7 +20,7 @@ from sprung.benchmarks.serve import window_body
 from sprung.benchmarks.trust_service import Served
 from sprung.model.system import MANCHESTER, load_system
 
-VEHICLES, CONNECTIONS = 100, 16
+VEHICLES, MOST_CONNECTIONS = 100, 100
 START_SECONDS = 1_790_000_000
 TARGET_SECONDS = 1.0
 WARM_UP = 0.2  # share of the time after which memory counts
@@ -40,15 +40,16 @@ def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dic
     """Figures of one run; every vehicle sends a window of one second each second."""
     parts = window_body(load_system()).split(b'"bench"')
     sent, memory = LoadSent(), list[tuple[float, int]]()
+    connections = min(vehicles, MOST_CONNECTIONS)  # a vehicle has one of its own
     with Served(folder / "load", system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0
         ends = begun + 60 * minutes
         threads = [
             threading.Thread(
-                target=drive, args=(served.port, parts, range(n, vehicles, CONNECTIONS), begun, ends, sent)
+                target=drive, args=(served.port, parts, range(n, vehicles, connections), begun, ends, sent)
             )
-            for n in range(CONNECTIONS)
+            for n in range(connections)
         ]
         for thread in threads:
             thread.start()
@@ -68,7 +69,7 @@ def drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: fl
     second = 0
     while (due := begun + second) < ends:
         for vehicle in vehicles:
-            moment = due + vehicle / 100
+            moment = due + vehicle % 100 / 100  # spread over the second
             time.sleep(max(0.0, moment - time.monotonic()))
             sent.late += time.monotonic() - moment > 1.0
             name = f"load-{vehicle}"

@@ -96,7 +96,8 @@ def _ride(system: System) -> FloatArray:
     """Samples of one upload, shape (T, C)."""
     truth = np.zeros((1, len(system.parameters)))
     samples = round(UPLOAD_SECONDS * system.sample_rate)
-    return simulate_runs(system, truth, samples, np.random.default_rng(6)).values[0]
+    values: FloatArray = simulate_runs(system, truth, samples, np.random.default_rng(6)).values[0]
+    return values
 
 
 def _ask(port: int, method: str, path: str, body: bytes = b"", kind: str = "application/json") -> tuple[int, Any]:

@@ -27,6 +27,8 @@ from sprung.service.store.windows import WindowRecord
 from sprung.service.together import FoundWindow, track_together
 
 TOGETHER = 32  # windows of one batch: more gain little and let the first one wait longer
+ENOUGH = TOGETHER // 2  # windows, for which no others are waited for
+PATIENCE = 0.01  # s, for windows that are being read
 READERS = 2  # threads that look through bodies
 
 
@@ -136,32 +138,36 @@ class Batcher:
             self._reading -= 1
             if request.asked is not None:
                 self._waiting.append(request)
-                if self._called or self._call():
-                    return
-                self._waiting.remove(request)
-                request.answer = _busy()
-        _deliver([request])
+            refused = [] if self._called or self._more_to_come() else self._call()
+        _deliver([request, *refused] if request.asked is None else refused)
 
-    def _call(self) -> bool:
-        """Ask the numerics for a batch; whether they could be asked."""
+    def _more_to_come(self) -> bool:
+        """Whether a batch is better off with windows that are being read just now; the last of them calls."""
+        if not self._reading or len(self._waiting) >= ENOUGH:
+            return False
+        return not self._waiting or time.perf_counter() - self._waiting[0].since < PATIENCE
+
+    def _call(self) -> list[_Request]:
+        """Ask the numerics for a batch of what waits; those refused, as their queue is full of others' work."""
+        if not self._waiting:
+            return []
         try:
             self._compute.submit(self._identify, Priority.REQUEST)
-        except Busy:  # their queue is full of others' work
-            return False
+        except Busy:
+            refused = list(self._waiting)
+            self._waiting.clear()
+            for request in refused:
+                request.answer = _busy()
+            return refused
         self._called = True
-        return True
+        return []
 
     def _identify(self) -> None:
         """One batch; runs in the numerics' thread."""
-        refused: list[_Request] = []
         with self._lock:
             self._called = False
             batch = [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
-            if self._waiting and not self._call():
-                refused = list(self._waiting)
-                self._waiting.clear()
-        for request in refused:
-            request.answer = _busy()
+            refused = self._call()
         now = time.perf_counter()
         alike: dict[tuple[int, bool, bool], list[_Request]] = {}
         for request in batch:
