@@ -64,6 +64,7 @@ BENCHMARKS: dict[str, tuple[str, str]] = {  # name: (module, what it measures)
         "sprung.benchmarks.naming",
         "component tests of what rigs do, listed or not: right, unknown, wrong, missed",
     ),
+    "shaken": ("sprung.benchmarks.shaken", "simulated buildings on shaken ground, quarter cars with stops and valves"),
     "sensitivity": (
         "sprung.benchmarks.sensitivity",
         "what a diagnosis says when one of its deciding numbers is another",
