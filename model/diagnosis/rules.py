@@ -158,13 +158,20 @@ class AcceptanceRules:
 class FormulaRules:
     """When an unnamed force is told by a formula."""
 
-    partners: int = rule(16, "shapes that are tried in pairs; chosen: 120 pairs take a second", 8, 30)
-    fitted: int = rule(6, "formulas that are fitted; chosen", 3, 9)
+    partners: int = rule(40, "single shapes, and pairs, that are scored at finer values; chosen", 20, 80)
+    rounds: int = rule(2, "of scores along the motion of the best so far; chosen", 1, 3)
+    hopeful: float = rule(0.3, "of the misfit, that scores may promise to leave to be fitted; chosen", 0.15, 0.6)
+    near: float = rule(0.9, "of the best score, from which a formula is fitted; chosen", 0.8, 0.97)
+    fitted: int = rule(6, "single shapes, and pairs, that are fitted; chosen", 3, 9)
     slack: float = rule(15.0, "evidence behind the unnamed force; chosen: what a formula costs more", 8.0, 25.0)
     beyond: float = rule(1.1, "times what a preferred named law explains; chosen", 1.05, 1.3)
     leaves: float = rule(
         0.02, "of the misfit beyond noise, that a formula may leave; derived: a force 15 % off leaves 0.022", 0.01, 0.1
     )
+    chance: float = rule(25.0, "score beside a formula that is chance; derived: some 700 trials", 20.0, 40.0)
+    missing: float = rule(0.05, "of its force, that may be missing; chosen: what counts as equivalent", 0.02, 0.1)
+    rival: float = rule(10.0, "evidence behind, at which another formula says as much; chosen: odds of 150", 5.0, 20.0)
+    agree: float = rule(0.1, "of its force, by which rivals differ; chosen: a false one is 0.15 off", 0.05, 0.15)
     says: float = rule(0.97, "of the unnamed force's gain, that a formula must explain; chosen", 0.9, 0.995)
 
 
@@ -191,7 +198,9 @@ class SetupRules:
     beside: int = rule(2, "faults of single sensors that are fitted beside them; chosen", 1, 4)
     explains: float = rule(0.3, "of the misfit that one may leave once fitted; chosen", 0.15, 0.5)
     parts: int = rule(2, "missing parts that are fitted beside an accepted one; chosen", 1, 4)
-    outdone: float = rule(0.5, "of what it leaves, that a missing part may leave instead; chosen", 0.3, 0.8)
+    outdone: float = rule(
+        0.7, "of what it leaves, that a missing part leaves instead; chosen: noise is in both", 0.4, 0.9
+    )
     latest: float = rule(0.5, "s, of a node; derived: later, a node is another recording", 0.3, 1.0)
     scale: float = rule(1.3, "ratio from which a scale is wrong; derived: less is a sensor's gain", 1.2, 1.5)
     offset: float = rule(0.1, "m, from which a position is wrong; derived: less is a mounting tolerance", 0.05, 0.2)

@@ -291,6 +291,7 @@ class StructureLaw(Parametrised):
     axes: Mapping[int, str] = field(default_factory=dict)  # parameters that are a place along "x" or "y", m
     powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # as of a `BodyLaw`
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
+    strengths: tuple[int, ...] = ()  # parameters in which it is linear at first order, together 0 where it is absent
     prior_cost: float = 0.0
     fault: bool = False
 

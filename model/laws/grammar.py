@@ -24,8 +24,8 @@ DECAYS = "v - z / tau"  # rate of the hidden state
 _AMPLITUDE = 1e18  # of any unit
 _INNER = {  # name: (unit, least, most, trial values over the rms of its motion, meaning)
     "L": ("m", 1e-9, 1e3, (0.2, 0.35, 0.6, 1.0, 1.5, 2.2), "length"),
-    "U": ("m/s", 1e-9, 1e4, (0.1, 0.25, 0.5, 1.0, 1.7, 2.5), "rate"),
-    "tau": ("s", 1e-4, 1e3, (0.01, 0.03, 0.08, 0.2, 0.6), "time of the hidden state"),
+    "U": ("m/s", 1e-9, 1e4, (0.1, 0.16, 0.25, 0.4, 0.65, 1.0, 1.6, 2.5), "rate"),
+    "tau": ("s", 1e-4, 1e3, (0.01, 0.02, 0.04, 0.08, 0.15, 0.3, 0.6), "time of the hidden state"),
 }
 
 
@@ -140,7 +140,11 @@ def law_of(forms: tuple[Shape, ...]) -> ElementLaw:
     for number, form in enumerate(forms):
         amplitude = "abc"[number]
         text = form.text
-        renamed = {name: name if number == 0 or name == "tau" else f"{name}{number + 1}" for name in form.inner}
+        renamed = {
+            name: name if number == 0 or name == "tau" else f"{name}{number + 1}"
+            for name in form.inner
+            if name != "tau" or name not in names  # two shapes have one hidden state
+        }
         for name, new in renamed.items():
             text = _renamed(text, name, new)
         texts.append(f"{amplitude} * {text}")

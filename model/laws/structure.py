@@ -77,6 +77,7 @@ MISSING_CONNECTION = StructureLaw(
     "have",
     axes={2: "x", 3: "y"},
     powers={0: (1.0, 0.0), 1: (0.0, 1.0)},
+    strengths=(0, 1),
     prior_cost=RARE,
 )
 
@@ -152,6 +153,7 @@ WRONG_POSITION = StructureLaw(
     confused_with=("missing_connection", "anti_roll_bar", "mass_change"),
     sentence="sits {offset} from where the system file says",
     variants=("x", "y"),
+    strengths=(0,),
     fault=True,
 )
 

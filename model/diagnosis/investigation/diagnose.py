@@ -20,7 +20,7 @@ from sprung.model.diagnosis.investigation.course import (
     Recorded,
 )
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
-from sprung.model.diagnosis.investigation.formula import formula_of
+from sprung.model.diagnosis.investigation.formula import formula_of, left
 from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
@@ -29,6 +29,7 @@ from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
+from sprung.model.diagnosis.response.terms import is_waveform
 from sprung.model.diagnosis.rules import PlausibleRules, Rules
 from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
@@ -197,7 +198,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     if not trials:
         return state
     tell(share + 0.08, f"checking {trials[0].term.location}")
-    trials, note = _with_formula(state, plain[0], trials)
+    trials, note = _with_formula(state, plain, trials)
     chosen = trials[0]
     if options.held_out and not state.held.still and state.held.compare(state.fit, chosen.fit).refuted:
         return state
@@ -244,22 +245,38 @@ def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[
     return best
 
 
-def _with_formula(state: Investigation, leader: Trial, trials: list[Trial]) -> tuple[list[Trial], tuple[str, ...]]:
+def _with_formula(state: Investigation, plain: list[Trial], trials: list[Trial]) -> tuple[list[Trial], tuple[str, ...]]:
     """Trials led by the formula of the force that leads by evidence where that has no name; a note where none is found.
 
-    A named law that was preferred to an unnamed force makes way only for a formula that explains more than it does.
+    A named law that was preferred to an unnamed force, or that leaves much of what there was, makes way only for a
+    formula that explains more than it does.
     """
-    if leader.named or state.problem.process_noise:
+    leader = _led_by(state, plain)
+    if leader is None or state.problem.process_noise:
         return trials, ()
     with np.errstate(all="ignore"):  # trial formulas overflow
-        formula = formula_of(state.problem, state.fit, leader, state.held)
+        formula, reason = formula_of(state.problem, state.fit, leader, state.held)
     beyond = state.options.rules.formula.beyond
     if formula is not None and (not trials[0].named or formula.explains > beyond * trials[0].explains):
-        return [formula, *(trial for trial in trials if trial is not leader)], ()
+        return [formula, *(trial for trial in trials if trial is not leader or trial.named)], ()
     if formula is not None or trials[0].named:
         return trials, ()
     place = leader.term.location
-    return trials, (f"{place}: surface only; no formula of the grammar says as much as the measured force map",)
+    return trials, (f"{place}: surface only; {reason}",)
+
+
+def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
+    """The trial whose force a formula may be of; None: there is none.
+
+    The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much.
+    """
+    if not plain[0].named:
+        return plain[0]
+    leaves = state.options.rules.formula.leaves * left(state.problem, state.fit)
+    if left(state.problem, plain[0].fit) <= leaves:
+        return None
+    single = (one for one in plain if is_waveform(one.term) and one.term.location in state.system.elements)
+    return next(single, None)
 
 
 def _smoother(state: Investigation, fit: Fit) -> Fit:

@@ -11,8 +11,8 @@ from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.compete import from_nominal, start_of
 from sprung.model.diagnosis.selection.evidence import profile_gain
+from sprung.model.diagnosis.selection.starts import structure_starts
 from sprung.model.laws import StructureLaw
 
 _STEPS = 8  # of a fit without one finding
@@ -57,7 +57,4 @@ def _afresh(state: Investigation, terms: tuple[Term, ...]) -> list[Point]:
     if len(terms) != state.given + 1 or not isinstance(terms[-1].law, StructureLaw):
         return []
     hits = [hit for hit in state.first.candidates if hit.term.key == terms[-1].key]
-    starts = (
-        start for hit in hits for start in (start_of(state.base, hit), *from_nominal(state.problem, state.base, hit))
-    )
-    return list(starts)
+    return [start for hit in hits for start in structure_starts(state.problem, state.base, hit)]

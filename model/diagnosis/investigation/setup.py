@@ -29,7 +29,8 @@ from sprung.model.diagnosis.response.forward import Forward
 from sprung.model.diagnosis.screening.elements import element_candidates
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.screening.structures import structure_candidates
-from sprung.model.diagnosis.selection.compete import compete, from_nominal, start_of
+from sprung.model.diagnosis.selection.compete import compete
+from sprung.model.diagnosis.selection.starts import structure_starts
 from sprung.model.laws import ElementLaw, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -79,7 +80,7 @@ def _left_beside_a_part(problem: Problem, fit: Fit, rival: float) -> float:
     structures = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
     hits = [hit for hit, _ in structure_candidates(projector, structures)]
     best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
-    starts = [start for hit in best for start in (start_of(fit, hit), *from_nominal(problem, fit, hit))]
+    starts = [start for hit in best for start in structure_starts(problem, fit, hit)]
     fits = [try_optimise(problem, start, rules.part_steps) for start in starts]
     series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.memory_decay)
     hits = [hit for hit, _ in element_candidates(projector, series) if hit.term.law in series]

@@ -17,6 +17,7 @@ from scipy.special import chdtrc
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
+from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import Family
 from sprung.model.signals import FloatArray
@@ -30,6 +31,7 @@ class Candidate:
     score: float  # chi-square
     family: Family
     beyond: float = 1.0  # the strength that the screening asks for over the most that the law allows, at least 1
+    start: Point | None = None  # where a fit of it begins, if not beside the model that was screened
 
     @property
     def freedom(self) -> int:

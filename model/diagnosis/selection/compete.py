@@ -12,12 +12,10 @@ import numpy as np
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.fit.smoothing import opened
-from sprung.model.diagnosis.response.point import Point, advance
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.evidence import (
@@ -29,8 +27,7 @@ from sprung.model.diagnosis.selection.evidence import (
     profile_gain,
     unusual_cost,
 )
-from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
-from sprung.model.laws.base import FittedElement, Restart
+from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 
 
 @dataclass(frozen=True)
@@ -116,7 +113,7 @@ def compete(
 
     trials = begun([hit for hit in hits if hit.term.law.named])
     trials += begun([hit for hit in hits if not hit.term.law.named and _may_lead(problem, hit, trials)])
-    trials = _graded(problem, base, trials)
+    trials = graded(problem, base, trials)
     if not trials:
         return []
     best = trials[0].evidence
@@ -133,7 +130,7 @@ def compete(
         all_trials = [*named, *(replace(trial, finished=False) for trial in unnamed), *behind]
     else:
         all_trials = [*named, *finished(unnamed), *behind]
-    return _settled(problem, base, _graded(problem, base, all_trials))
+    return _settled(problem, base, graded(problem, base, all_trials))
 
 
 def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
@@ -148,7 +145,7 @@ def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
         others = [t for t in trials if all(t is not one for one in falling)]
         again = share(lambda trial: _finished(problem, base, trial), falling, WORKERS)
         stuck += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
-        trials = _graded(problem, base, [*again, *others])
+        trials = graded(problem, base, [*again, *others])
     return trials
 
 
@@ -171,11 +168,11 @@ def _begun(problem: Problem, base: Fit, hit: Candidate, again: bool = False) -> 
 
     again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
     """
-    starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+    starts = starts_of(problem, base, hit)
     tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):
-        others = (_try(problem, base, hit, start, 3) for start in _alike_starts(base, hit))
+        others = (_try(problem, base, hit, start, 3) for start in alike_starts(base, hit))
         best = max((t for t in (best, *others) if t is not None), key=lambda t: t.evidence, default=None)
     return best
 
@@ -192,15 +189,6 @@ def noise_bound(problem: Problem, fit: Fit) -> float:
     return 1 + problem.rules.selection.chance * float(np.sqrt(2 / fit.count))
 
 
-def _alike_starts(base: Fit, hit: Candidate) -> list[Point]:
-    """Starts at other parameters of the same law that look alike on the whole."""
-    law = hit.term.law
-    if not isinstance(law, ElementLaw) or law.alike is None:
-        return []
-    terms = [hit.term.at(law.clip(list(values))) for values in law.alike(hit.term.parameters)]
-    return [start_of(base, replace(hit, term=term)) for term in terms]
-
-
 def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     """Whether an unnamed force could explain enough more than named laws: not where they leave noise and more than
     it promises is explained.  With one law alone it stays as what that one was chosen before."""
@@ -211,7 +199,7 @@ def _may_lead(problem: Problem, unnamed: Candidate, named: list[Trial]) -> bool:
     return unnamed.score > best.worth or not quiet
 
 
-def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
+def graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     """Trials by evidence; where one leaves less than the noise that the base's misfit was taken for, by its own."""
     rules = problem.rules.evidence
     least = min((t.fit.reduced for t in trials), default=1.0)
@@ -224,107 +212,6 @@ def _graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
             replace(t, gain=gain, evidence=t.evidence - (t.gain - gain)) for t, gain in zip(trials, gains, strict=True)
         ]
     return sorted(trials, key=lambda t: -t.evidence)
-
-
-def start_of(base: Fit, hit: Candidate) -> Point:
-    """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
-    point = base.point
-    state = point.state
-    law = hit.term.law
-    if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
-        n = (len(state) - len(base.forward.plant.structure.branches)) // 2
-        state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
-    if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
-        state = np.append(state, 0.0)
-    near = point.warm_start
-    if is_waveform(hit.term):
-        near = (*near, base.force_along(hit.term))
-    return Point(point.theta, (*point.terms, hit.term), state, near)
-
-
-def from_nominal(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
-    """The start at nominal parameters, where the present ones are far off: what a gross part drove them to."""
-    start = start_of(base, hit)
-    far = np.max(np.abs(start.theta), initial=0.0) > problem.rules.selection.astray
-    return [replace(start, theta=np.zeros_like(start.theta))] if far else []
-
-
-def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
-    """Starts at other values of the element than those that were read without the law."""
-    law, names = hit.term.law, [p.name for p in problem.system.parameters]
-    if isinstance(law, StructureLaw):
-        return from_nominal(problem, base, hit)
-    at = {quantity: f"{hit.location}.{quantity}" for quantity in ("stiffness", "damping")}
-    if not isinstance(law, ElementLaw) or at["damping"] not in names:
-        return []
-    start = start_of(base, hit)
-    if law.restarts is not None:
-        restarts = law.restarts(_reading(problem, base, hit.location))
-    elif hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
-        stronger = problem.rules.selection.stronger
-        values = law.scaled(hit.term.parameters, 1 / stronger)
-        restarts = (Restart(1.0, stronger * hit.beyond, tuple(values)),)
-    else:
-        return []
-    points = []
-    for restart in restarts:
-        theta = start.theta.copy()
-        for quantity, factor in (("stiffness", restart.stiffness), ("damping", restart.damping)):
-            if at[quantity] in names:
-                theta[names.index(at[quantity])] += np.log(factor)
-        term = hit.term.at(np.array(restart.parameters))
-        points.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
-    return points
-
-
-def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
-    """An element as the present model has it; its damping is estimated."""
-    element, read = problem.system.elements.index(location), base.forward.element_at(location)
-    nominal = next(p.nominal for p in problem.system.parameters if p.name == f"{location}.damping")
-    deflection, rate = (motion[:, element] for motion in base.element_motion)
-    return FittedElement(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
-
-
-def joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
-    """The term at the strength that, with everything else moving along, the base's residual asks for.
-
-    The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
-    which have absorbed much of it, the model may be too far away for a first step.
-    """
-    if problem.memory is None:
-        return _joint_start(problem, base, hit)
-    term = hit.term
-    key = "start", id(base), term.key, term.parameters, term.scales, problem.rules.selection.hint
-    return problem.memory.recall(key, lambda: _joint_start(problem, base, hit))
-
-
-def _joint_start(problem: Problem, base: Fit, hit: Candidate) -> Point:
-    start = start_of(base, hit)
-    law = hit.term.law
-    if not isinstance(law, ElementLaw) or law.strength is None or not law.named:
-        return start
-    hint = hit.term.at(law.scaled(hit.term.parameters, problem.rules.selection.hint))
-    faint = start_of(base, replace(hit, term=hint))
-    try:
-        with np.errstate(all="ignore"):
-            faint, working = opened(problem, faint, base.whitener)
-            lin = linearise(problem, faint, working)
-    except np.linalg.LinAlgError:
-        return start
-    if not np.all(np.isfinite(lin.residual)) or not np.all(np.isfinite(lin.jacobian)):
-        return start
-    count = len(hit.term.parameters)
-    first = lin.jacobian.shape[1] - len(faint.state) - count
-    kept = np.ones(lin.jacobian.shape[1], dtype=bool)
-    kept[first : first + count] = np.arange(count) == law.strength
-    columns = lin.jacobian[:, kept]
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    step = np.zeros(lin.jacobian.shape[1])
-    step[kept] = np.linalg.lstsq(columns / scale, lin.residual, rcond=1e-10)[0] / scale
-    moved = advance(faint, step)
-    if not moved.terms[-1].bounded and np.all(np.isfinite(step)):
-        return moved
-    return start
 
 
 def _try(problem: Problem, base: Fit, hit: Candidate, start: Point, iterations: int) -> Trial | None:

@@ -11,7 +11,7 @@ from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.compete import joint_start
+from sprung.model.diagnosis.selection.starts import joint_start
 from sprung.model.laws import CATALOGUE
 from tests.diagnosis_cases import problem_of, simulate
 

@@ -14,7 +14,7 @@ from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.screening.structures import structure_candidates, unconnected
-from sprung.model.diagnosis.selection.compete import start_of
+from sprung.model.diagnosis.selection.starts import start_of
 from sprung.model.laws import StructureLaw, find_law
 from sprung.model.system import load_system
 

@@ -1,0 +1,161 @@
+"""Where fits of a candidate begin: as it was screened, as everything else moving along has it, and at look-alikes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.jacobian import linearise
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.smoothing import opened
+from sprung.model.diagnosis.response.point import Point, advance
+from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.screening.score import Candidate
+from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
+from sprung.model.laws.base import FittedElement, Restart
+
+
+def starts_of(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+    """Starts of a candidate beside the present model, the first one the likeliest."""
+    if hit.start is not None:
+        return [hit.start]
+    if isinstance(hit.term.law, StructureLaw):
+        return structure_starts(problem, base, hit)
+    return [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+
+
+def start_of(base: Fit, hit: Candidate) -> Point:
+    """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
+    point = base.point
+    state = point.state
+    law = hit.term.law
+    if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
+        n = (len(state) - len(base.forward.plant.structure.branches)) // 2
+        state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
+    if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
+        state = np.append(state, 0.0)
+    near = point.warm_start
+    if is_waveform(hit.term):
+        near = (*near, base.force_along(hit.term))
+    return Point(point.theta, (*point.terms, hit.term), state, near)
+
+
+def structure_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+    """Starts of a part of the structure: as screened, and as everything moving along has it.
+
+    The same at nominal parameters, where the present ones are far off: what a gross part drove them to.
+    """
+    far = np.max(np.abs(base.point.theta), initial=0.0) > problem.rules.selection.astray
+    starts = []
+    for nominal in (False, True)[: 2 if far else 1]:
+        start = start_of(base, hit)
+        start = replace(start, theta=np.zeros_like(start.theta)) if nominal else start
+        beside = joint_start(problem, base, hit, nominal)
+        starts += [start] if beside.terms[-1] is hit.term else [start, beside]
+    return starts
+
+
+def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+    """Starts at other values of the element than those that were read without the law."""
+    law, names = hit.term.law, [p.name for p in problem.system.parameters]
+    at = {quantity: f"{hit.location}.{quantity}" for quantity in ("stiffness", "damping")}
+    if not isinstance(law, ElementLaw) or at["damping"] not in names:
+        return []
+    start = start_of(base, hit)
+    if law.restarts is not None:
+        restarts = law.restarts(_reading(problem, base, hit.location))
+    elif hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
+        stronger = problem.rules.selection.stronger
+        values = law.scaled(hit.term.parameters, 1 / stronger)
+        restarts = (Restart(1.0, stronger * hit.beyond, tuple(values)),)
+    else:
+        return []
+    points = []
+    for restart in restarts:
+        theta = start.theta.copy()
+        for quantity, factor in (("stiffness", restart.stiffness), ("damping", restart.damping)):
+            if at[quantity] in names:
+                theta[names.index(at[quantity])] += np.log(factor)
+        term = hit.term.at(np.array(restart.parameters))
+        points.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
+    return points
+
+
+def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
+    """An element as the present model has it; its damping is estimated."""
+    element, read = problem.system.elements.index(location), base.forward.element_at(location)
+    nominal = next(p.nominal for p in problem.system.parameters if p.name == f"{location}.damping")
+    deflection, rate = (motion[:, element] for motion in base.element_motion)
+    return FittedElement(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
+
+
+def alike_starts(base: Fit, hit: Candidate) -> list[Point]:
+    """Starts at other parameters of the same law that look alike on the whole."""
+    law = hit.term.law
+    if not isinstance(law, ElementLaw) or law.alike is None:
+        return []
+    terms = [hit.term.at(law.clip(list(values))) for values in law.alike(hit.term.parameters)]
+    return [start_of(base, replace(hit, term=term)) for term in terms]
+
+
+def joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool = False) -> Point:
+    """The term at the strength that, with everything else moving along, the base's residual asks for.
+
+    The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
+    which have absorbed much of it, the model may be too far away for a first step.  nominal: from nominal parameters.
+    """
+    if problem.memory is None:
+        return _joint_start(problem, base, hit, nominal)
+    term = hit.term
+    key = "start", id(base), nominal, term.key, term.parameters, term.scales, problem.rules.selection.hint
+    return problem.memory.recall(key, lambda: _joint_start(problem, base, hit, nominal))
+
+
+def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> Point:
+    start = start_of(base, hit)
+    law, hint = hit.term.law, _hint(hit.term, problem.rules.selection.hint)
+    if hint is None:
+        return start
+    strengths = law.strengths if isinstance(law, StructureLaw) else (law.strength,)
+    faint = start_of(base, replace(hit, term=hint))
+    faint = replace(faint, theta=np.zeros_like(faint.theta)) if nominal else faint
+    try:
+        with np.errstate(all="ignore"):
+            faint, working = opened(problem, faint, base.whitener)
+            lin = linearise(problem, faint, working)
+    except np.linalg.LinAlgError:
+        return start
+    if not np.all(np.isfinite(lin.residual)) or not np.all(np.isfinite(lin.jacobian)):
+        return start
+    count = len(hit.term.parameters)
+    first = lin.jacobian.shape[1] - len(faint.state) - count
+    kept = np.ones(lin.jacobian.shape[1], dtype=bool)
+    kept[first : first + count] = np.isin(np.arange(count), strengths)
+    columns = lin.jacobian[:, kept]
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    step = np.zeros(lin.jacobian.shape[1])
+    step[kept] = np.linalg.lstsq(columns / scale, lin.residual, rcond=1e-10)[0] / scale
+    moved = advance(faint, step)
+    if not np.all(np.isfinite(step)) or _void(moved.terms[-1]):
+        return start
+    return moved
+
+
+def _hint(term: Term, share: float) -> Term | None:
+    """A term at a share of its strength; None: its law has none that the rest of its shape can be kept beside."""
+    law = term.law
+    if isinstance(law, ElementLaw) and law.strength is not None and law.named:
+        return term.at(law.scaled(term.parameters, share))
+    if isinstance(law, StructureLaw) and law.strengths:
+        values = [value * share if i in law.strengths else value for i, value in enumerate(term.parameters)]
+        return term.at(np.array(values))
+    return None
+
+
+def _void(term: Term) -> bool:
+    """Whether a joint step has taken a law to a bound; a part of the structure: all that there is of it."""
+    if isinstance(term.law, StructureLaw):
+        return not any(term.parameters[i] for i in term.law.strengths)
+    return term.bounded
