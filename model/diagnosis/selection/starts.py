@@ -13,7 +13,7 @@ from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.point import Point, advance
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
+from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.laws.base import FittedElement, Restart
 
 
@@ -115,10 +115,9 @@ def joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool = Fal
 
 def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> Point:
     start = start_of(base, hit)
-    law, hint = hit.term.law, _hint(hit.term, problem.rules.selection.hint)
+    hint = _hint(hit.term, problem.rules.selection.hint)
     if hint is None:
         return start
-    strengths = law.strengths if isinstance(law, StructureLaw) else (law.strength,)
     faint = start_of(base, replace(hit, term=hint))
     faint = replace(faint, theta=np.zeros_like(faint.theta)) if nominal else faint
     try:
@@ -132,7 +131,7 @@ def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> 
     count = len(hit.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
-    kept[first : first + count] = np.isin(np.arange(count), strengths)
+    kept[first : first + count] = np.isin(np.arange(count), _strengths(hit.term.law))
     columns = lin.jacobian[:, kept]
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     step = np.zeros(lin.jacobian.shape[1])
@@ -143,15 +142,23 @@ def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> 
     return moved
 
 
-def _hint(term: Term, share: float) -> Term | None:
-    """A term at a share of its strength; None: its law has none that the rest of its shape can be kept beside."""
-    law = term.law
+def _strengths(law: Law) -> tuple[int, ...]:
+    """Parameters that a law's effect grows with, the rest of its shape kept; none: there are no such."""
+    if isinstance(law, StructureLaw):
+        return law.strengths
     if isinstance(law, ElementLaw) and law.strength is not None and law.named:
+        return (law.strength,)
+    return ()
+
+
+def _hint(term: Term, share: float) -> Term | None:
+    """A term at a share of its strength; None: its law has none."""
+    law, strengths = term.law, _strengths(term.law)
+    if not strengths:
+        return None
+    if isinstance(law, ElementLaw):
         return term.at(law.scaled(term.parameters, share))
-    if isinstance(law, StructureLaw) and law.strengths:
-        values = [value * share if i in law.strengths else value for i, value in enumerate(term.parameters)]
-        return term.at(np.array(values))
-    return None
+    return term.at(np.array([v * share if i in strengths else v for i, v in enumerate(term.parameters)]))
 
 
 def _void(term: Term) -> bool:
