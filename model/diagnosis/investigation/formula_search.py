@@ -41,11 +41,12 @@ class Scored:
     inner: tuple[_Inner, ...]
     score: float
     amplitudes: tuple[float, ...]
+    cost: float
 
     @property
     def worth(self) -> float:
-        """Score less what its parts cost."""
-        return self.score - formula_cost(sum(form.parts for form in self.parts))
+        """Score less what its parts and values cost."""
+        return self.score - self.cost
 
     @property
     def values(self) -> tuple[float, ...]:
@@ -125,7 +126,12 @@ class FormulaSearch:
     def _scored(self, parts: tuple[Shape, ...], inner: tuple[_Inner, ...]) -> Scored:
         spectra = np.stack([self.spectrum(form, own) for form, own in zip(parts, inner, strict=True)])
         score, amplitudes = self.motion.channel.joint(spectra)
-        return Scored(parts, inner, score, tuple(float(a) for a in amplitudes))
+        cost = self.cost(sum(form.parts for form in parts), sum(1 + len(form.inner) for form in parts))
+        return Scored(parts, inner, score, tuple(float(a) for a in amplitudes), cost)
+
+    def cost(self, parts: int, values: int) -> float:
+        """Of a formula of so many parts and values: those by the Bayesian information criterion."""
+        return formula_cost(parts) + values * float(np.log(len(self.motion.projector.residual)))
 
     def _finer(self, start: Scored) -> Scored:
         """With own values around those of the grid; the time of a hidden state is common to both shapes."""
@@ -243,9 +249,10 @@ class _Columns:
 
     def _costs(self, count: int) -> FloatArray:
         """Of single shapes, (1, forms), or of pairs, (forms, forms)."""
-        parts = np.array([form.parts for form in self.shapes])
-        both = parts[None] if count == 1 else parts + parts[:, None]
-        return np.array([[formula_cost(int(n)) for n in row] for row in both])
+        sizes = [np.array([form.parts for form in self.shapes]), np.array([1 + len(f.inner) for f in self.shapes])]
+        parts, values = (of[None] if count == 1 else of + of[:, None] for of in sizes)
+        found: FloatArray = np.vectorize(self.search.cost, otypes=[float])(parts, values)
+        return found
 
     def _strangers(self) -> BoolArray:
         """Pairs of columns with hidden states of different times, (M, M)."""
