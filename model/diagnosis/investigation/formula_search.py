@@ -101,7 +101,7 @@ class FormulaSearch:
 
     def most(self) -> float:
         """Score of the best single shape."""
-        return float(np.max(_Columns.of(self).product ** 2))
+        return float(np.max(_Columns.of(self).scores))
 
     def best(self) -> tuple[list[Candidate], list[Candidate]]:
         """The best single shapes, and the best pairs: those whose score is next to that of the best of all."""
@@ -179,16 +179,14 @@ def _moved(one: Scored, part: int, at: int, factor: float) -> tuple[_Inner, ...]
 
 @dataclass(frozen=True)
 class _Columns:
-    """Every shape with every trial of its own values, and their products with everything else projected out."""
+    """Every shape with every trial of its own values."""
 
     search: FormulaSearch
     shapes: tuple[Shape, ...]
     first: np.ndarray  # column of each shape's first trial, (forms,)
     inner: list[_Inner]  # of each column, (M,)
     spectra: ComplexArray  # (M, F)
-    product: FloatArray  # with the residual, of normalised columns, (M,)
-    inside: FloatArray  # with the projection's basis, (M, q)
-    scale: FloatArray  # that normalises, 0 where nothing is left, (M,)
+    scores: FloatArray  # of single columns, (M,)
 
     @classmethod
     def of(cls, search: FormulaSearch) -> _Columns:
@@ -203,35 +201,23 @@ class _Columns:
             search.known.update({(form, values): one for values, one in zip(own, found, strict=True)})
             inner += own
             spectra.append(found)
-        h, channel = np.concatenate(spectra), motion.channel
-        inside = np.real(h.conj() @ channel.inside)
-        size = np.abs(h) ** 2 @ channel.size
-        left = size - np.sum(inside**2, axis=1)
-        seen = left > _SEEN * size
-        scale = np.where(seen, 1 / np.sqrt(np.where(seen, left, 1.0)), 0.0)
-        return cls(
-            search, shapes, np.array(first), inner, h, np.real(h.conj() @ channel.product) * scale, inside, scale
-        )
-
-    def across(self) -> FloatArray:
-        """Products of normalised columns with each other, (M, M)."""
-        weighed = self.spectra * np.sqrt(self.search.motion.channel.size)
-        packed = np.concatenate([weighed.real, weighed.imag], axis=1)
-        found: FloatArray = (packed @ packed.T - self.inside @ self.inside.T) * self.scale * self.scale[:, None]
-        return found
+        h = np.concatenate(spectra)
+        return cls(search, shapes, np.array(first), inner, h, motion.channel.scores(h)[0])
 
     def singles(self) -> Iterator[Scored]:
         """Shapes, each at the best values of its own, by worth."""
-        score = self.product**2
-        best = np.maximum.reduceat(score, self.first)
+        best = np.maximum.reduceat(self.scores, self.first)
         for at in np.argsort(self._costs(1)[0] - best):
             here = slice(self.first[at], None if at + 1 == len(self.first) else self.first[at + 1])
-            column = self.first[at] + int(np.argmax(score[here]))
+            column = self.first[at] + int(np.argmax(self.scores[here]))
             yield self.search._scored((self.shapes[at],), (self.inner[column],))
 
     def pairs(self) -> Iterator[Scored]:
         """Pairs of shapes, each at the best values of its own, by worth."""
-        p, r = self.product, self.across()
+        product, gram, size = self.search.motion.channel.products(self.spectra)
+        left = np.diag(gram)
+        scale = np.where(left > _SEEN * size, 1 / np.sqrt(np.maximum(left, 1e-300)), 0.0)
+        p, r = product * scale, gram * scale * scale[:, None]
         with np.errstate(all="ignore"):
             score = (p**2 + p[:, None] ** 2 - 2 * r * p * p[:, None]) / (1 - r**2)
         score[~(np.abs(r) < _ALIKE) | self._strangers()] = 0.0

@@ -177,11 +177,16 @@ class ScalarResponse:
         left = np.where(visible, left, 1.0)
         return np.where(visible, product**2 / left, 0.0), np.where(visible, product / left, 0.0)
 
-    def joint(self, h: ComplexArray) -> tuple[float, FloatArray]:
-        """Statistic and amplitudes of several columns h (m, F) together."""
+    def products(self, h: ComplexArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Of columns h (m, F) with the residual (m,), with each other (m, m), both projected, and squares (m,)."""
         rows = np.concatenate([h.real, h.imag], axis=1)
         product, inside = rows @ self._product, rows @ self._inside
-        gram = (rows * self._size) @ rows.T - inside @ inside.T
+        whole = (rows * self._size) @ rows.T
+        return product, whole - inside @ inside.T, np.diag(whole)
+
+    def joint(self, h: ComplexArray) -> tuple[float, FloatArray]:
+        """Statistic and amplitudes of several columns h (m, F) together."""
+        product, gram, _ = self.products(h)
         scale = 1 / np.sqrt(np.maximum(np.diag(gram), 1e-300))
         values, vectors = np.linalg.eigh(gram * scale * scale[:, None])
         good = values > 1e-6
