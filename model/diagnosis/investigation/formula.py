@@ -72,7 +72,8 @@ def _hopeful(problem: Problem, base: Fit, search: FormulaSearch, hits: list[Cand
     residual = search.motion.projector.residual
     most = max((hit.score for hit in hits), default=0.0)
     promised = (float(residual @ residual) - most) / max(1, base.count - base.jacobian.shape[1])
-    return promised - noise_bound(problem, base) < problem.rules.formula.hopeful * left(problem, base)
+    most_left = problem.rules.formula.hopeful * left(problem, base)
+    return bool(promised - noise_bound(problem, base) < most_left)
 
 
 def left(problem: Problem, fit: Fit) -> float:

@@ -31,7 +31,8 @@ def doubt_of(problem: Problem, trial: Trial, trials: Sequence[Trial]) -> str:
     for rival in trials:
         near = rival is not trial and rival.finished and rival.evidence > trial.evidence - rules.rival
         if near and np.std(whole_force(trial.fit) - whole_force(rival.fit, trial.fit)) > rules.agree * size:
-            return f"{trial.term.law.formula} and {rival.term.law.formula} say as much and differ where it moved"
+            told, other = trial.term.element_law.formula, rival.term.element_law.formula
+            return f"{told} and {other} say as much and differ where it moved"
     if missing(problem, trial.fit) > rules.missing:
         return "what the best formula leaves follows the element's motion"
     return ""
@@ -91,4 +92,4 @@ def missing(problem: Problem, fit: Fit) -> float:
     if most < problem.rules.formula.chance * min(fit.reduced, 1.0):
         return 0.0
     before = Projector(problem, taken_out(problem, fit)).residual
-    return float(np.sqrt(most / max(before @ before - fit.chi_square, 1e-300)))
+    return float(np.sqrt(most / max(float(before @ before) - fit.chi_square, 1e-300)))

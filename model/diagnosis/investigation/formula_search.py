@@ -191,7 +191,9 @@ class _Columns:
     @classmethod
     def of(cls, search: FormulaSearch) -> _Columns:
         motion, shapes = search.motion, forms()
-        first, inner, spectra = [], [], []
+        first: list[int] = []
+        inner: list[_Inner] = []
+        spectra: list[ComplexArray] = []
         for form in shapes:
             law = law_of((form,))
             trials = law.shapes(motion.seen)
