@@ -8,7 +8,8 @@ wrong is named (channel and kind), and values that are off by more than three st
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from sprung.benchmarks.generator.exact import VehicleTransfer, filtered
 from sprung.benchmarks.generator.integrate import SAMPLE_RATE
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.vehicle import read_vehicle
+from sprung.benchmarks.keeping import keep, kept
 from sprung.model.identification.identify import Identifier
 from sprung.model.system import BUNDLED, System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerState
@@ -60,8 +62,14 @@ class RideVerdict:
     silent: int  # values off by more than three deviations, where nothing is said
 
 
-def run(cases: int = 6, seed: int = 5000, file: str = "manchester.yaml", kind: str = "all") -> Iterator[dict[str, Any]]:
-    """cases: of every kind, size and begin.  file: a bundled system; `axleboxes.yaml` has accelerations below."""
+def run(
+    cases: int = 6, seed: int = 5000, file: str = "manchester.yaml", kind: str = "all", folder: Path | None = None
+) -> Iterator[dict[str, Any]]:
+    """cases: of every kind, size and begin.  file: a bundled system; `axleboxes.yaml` has accelerations below.
+
+    folder: where rides that are done are kept; the same command goes on with the others (empty it when the code
+    changed).  A cell's figures come as soon as its rides are done.
+    """
     system = load_system(BUNDLED / file)
     identifier, tracker = Identifier(system), make_tracker(system)
     for name, sizes in SIZES.items():
@@ -69,10 +77,16 @@ def run(cases: int = 6, seed: int = 5000, file: str = "manchester.yaml", kind: s
             for when, begins in (("first window", 0.0), ("mid ride", SECONDS / 2)):
                 found = []
                 for number in range(cases):
-                    rng = np.random.default_rng([seed, list(SIZES).index(name), int(1e6 * size), int(begins), number])
-                    fault = _drawn(system, name, size, begins, rng)
-                    values, truth = ride(system, fault, rng)
-                    found.append(judge(system, identifier, tracker, values, truth, fault))
+                    draw = [seed, list(SIZES).index(name), int(1e6 * size), int(begins), number]
+                    at = None if folder is None else folder / f"{'-'.join(str(n) for n in draw)}.json"
+                    told = kept(at, [file, SECONDS])
+                    if told is None:
+                        rng = np.random.default_rng(draw)
+                        fault = _drawn(system, name, size, begins, rng)
+                        values, truth = ride(system, fault, rng)
+                        told = asdict(judge(system, identifier, tracker, values, truth, fault))
+                        keep(at, [file, SECONDS], told)
+                    found.append(RideVerdict(**told))
                 yield _figures(file, name, size, when, found)
 
 

@@ -128,6 +128,7 @@ def correct(
     share: float,  # of the window that no earlier window saw, in (0, 1]
     bound: float,  # standard deviations beyond which influence no longer grows
     cross: FloatArray | None = None,  # change of `value` per deviation, shape (P, H); taken at the believed ones
+    silent: BoolArray | None = None,  # deviations (H,) of which the window says nothing, though they move it
 ) -> tuple[Belief, Innovation]:
     """Belief after one window.
 
@@ -156,6 +157,10 @@ def correct(
     noise = noise * (max(1.0, distance / limit) / share)
     gain = _solve(own + noise, across.T).T
     posterior = belief.covariance - gain @ across.T
+    if silent is not None:  # Schmidt's filter: what is silent stays as it is, its covariance with the levels does not
+        kept = 2 * belief.size + np.flatnonzero(silent)
+        posterior[np.ix_(kept, kept)] = belief.covariance[np.ix_(kept, kept)]
+        gain[kept] = 0.0
     posterior = 0.5 * (posterior + posterior.T)
     return Belief(belief.mean + gain @ residual, posterior, belief.deviations), Innovation(score, distance > limit)
 

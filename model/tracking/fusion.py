@@ -27,6 +27,11 @@ from sprung.model.tracking.weather import WeatherModel
 
 OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
 BENT = 4.0  # standard deviations of a window that deviations may move it by without being weighed itself
+DOUBTED = 0.3  # of them: moved by so much, what mean sensitivities make of it errs by as much as half of its variance
+VAGUE = 0.2  # standard deviation of a log-ratio that teaches nothing of a parameter that is known: estimates are not
+# given beyond 0.3 as they state it themselves, which leaves out more low values than high ones
+SKEW = 0.03  # standard deviation of a log-ratio below which it is as good as linear: it errs by 0.1 %
+FURTHEST = 1.0  # log-ratio from the belief up to which a window is taken as linear in the values themselves
 STILL = 5.0  # log-likelihood ratio of a change above which a parameter teaches no slopes
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
@@ -42,6 +47,7 @@ class _Window:
     value: FloatArray  # log-ratios (P,)
     covariance: FloatArray  # (P, P)
     cross: FloatArray  # sensitivities to deviations (P, H)
+    weighed: bool  # whether these are its own
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,10 @@ class Fusion:
         if jump is not None and self.armed(state):
             calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
             state = replace(state, changes=change_test.restarted(state.changes, jump.since))
-        window = _Window(mask, time_ns, centre, share, *self._at_belief(estimate, found, calibration, belief, mask))
+        weighed = found is not None and found.whole
+        values = self._at_belief(estimate, found, calibration, belief, mask)
+        window = _Window(mask, time_ns, centre, share, *values, weighed)
+        window = _linear(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)
         new = replace(
@@ -124,7 +133,9 @@ class Fusion:
         if found is None:
             return belief, calibration, None, None, True
         if not found.whole:
-            belief = dev.loaded(belief, model, found, share)
+            moved = calibration.cross @ np.where(model.cargo, 0.0, belief.mean[-model.size :])
+            doubt = float(self._doubt(found.given, moved).max())  # its load is that of gains and delays as stated, too
+            belief = dev.loaded(belief, model, found, share / doubt)
             gains = np.where(model.cargo, found.cross, calibration.cross)
             found = replace(found, cross=gains, point=np.where(model.cargo, found.point, 0.0))
             return belief, calibration, found, None, True
@@ -159,8 +170,9 @@ class Fusion:
                 belief = dev.unsure(belief, self.model)
         cross = window.cross if self.model.size else None
         belief, step = kalman.correct(
-            belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross
-        )
+            belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross,
+            silent=None if window.weighed or cross is None else ~self.model.cargo,
+        )  # fmt: skip
         return _Filtered(belief, measured, watch, fresh, plausible, step.bounded)
 
     def _tested(
@@ -269,8 +281,25 @@ class Fusion:
             return value, estimate.covariance, np.zeros((len(value), 0))
         here = belief.mean[-self.model.size :]
         if found is None:
-            return value + np.where(mask, calibration.cross @ here, 0.0), estimate.covariance, calibration.cross
-        return value + np.where(mask, found.cross @ (here - found.point), 0.0), found.given, found.cross
+            found_at, cross, covariance = np.zeros(len(here)), calibration.cross, estimate.covariance
+        else:
+            found_at, cross, covariance = found.point, found.cross, found.given
+        if found is None or not found.whole:
+            covariance = self._doubted(covariance, cross @ np.where(self.model.cargo, 0.0, here))
+        return value + np.where(mask, cross @ (here - found_at), 0.0), covariance, cross
+
+    def _doubt(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
+        """Factor (P,) on the variances of such a window."""
+        return np.asarray(1 + (moved / DOUBTED) ** 4 / covariance.diagonal() ** 2)
+
+    def _doubted(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
+        """Covariance (P, P) of a window that was not weighed, which deviations move by about `moved` (P,).
+
+        Its own sensitivities are not those of the windows before it, and those of windows that tell much differ from
+        the mean of all: what deviations move little may speak, the rest is left to windows that were weighed.
+        """
+        wide = np.sqrt(self._doubt(covariance, moved))
+        return np.asarray(covariance * np.outer(wide, wide))
 
     def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
@@ -341,6 +370,29 @@ class Fusion:
             own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)
         spread = np.sqrt(std**2 + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
+
+
+def _linear(window: _Window, belief: kalman.Belief) -> _Window:
+    """The window as stiffnesses and dampings themselves, in which it is linear, say it about what is believed.
+
+    Its logarithms are skew: a damper that noise makes too large is stated more surely, by as much, than one that noise
+    makes too small, and a mean weighed so is too large by 1.5 times the variance of one window.
+    """
+    known = belief.level_variance
+    own = np.where(window.mask, window.covariance.diagonal(), 1.0)
+    away = own / (own + known) * (window.value - belief.level)  # from where the belief will be
+    away = np.where(window.mask & (own > SKEW**2), np.clip(away, -FURTHEST, FURTHEST), 0.0)
+    if not away.any():
+        return window
+    scale = np.exp(away)
+    vague = (np.sqrt(own) * scale > VAGUE) & (known < VAGUE**2 / 4)
+    return replace(
+        window,
+        mask=window.mask & ~vague,
+        value=window.value + np.expm1(away) - away,
+        covariance=window.covariance * np.outer(scale, scale),
+        cross=window.cross * scale[:, None],
+    )
 
 
 def proper(covariance: FloatArray) -> bool:
