@@ -80,7 +80,8 @@ class TrialElement:
     @cached_property
     def _rate_spectrum(self) -> ComplexArray:
         """Of the rate over the compared bins, (F,)."""
-        return self.projector.grid.compared_spectra(self.rate[None])[0]
+        found: ComplexArray = self.projector.grid.compared_spectra(self.rate[None])[0]
+        return found
 
 
 def element_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
