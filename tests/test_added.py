@@ -14,6 +14,7 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.laws.own import load_laws
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import load_system, parse_system
+from sprung.replay import recording
 from sprung.service.cli import main
 from sprung.service.core import build_core
 from sprung.service.engine import Engine
@@ -86,7 +87,9 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     points = "[sprung.readers]\nraw8 = other.reading:blocks\n\n[sprung.metrics]\ncars = other.counting:Cars\n"
     (info / "entry_points.txt").write_text(points)
     monkeypatch.syspath_prepend(site)
+    recording.added_readers.cache_clear()  # of a process in which recordings were read before
     yield
+    recording.added_readers.cache_clear()
     for name in [name for name in sys.modules if name.partition(".")[0] == "other"]:
         del sys.modules[name]
 

@@ -27,7 +27,11 @@ from sprung.model.tracking.weather import WeatherModel
 
 OUTLYING = 4.0  # standard deviations of a window about its prediction that a baseline is learned from
 BENT = 4.0  # standard deviations of a window that deviations may move it by without being weighed itself
-DOUBTED = 0.3  # of them: moved by so much, what mean sensitivities make of it errs by as much as half of its variance
+DOUBTED = 0.5  # what mean sensitivities move a window by, per standard deviation of doubt about it: they err by less
+# than all of it, but alike in many windows, and that does not average out
+HARMLESS = (
+    0.3  # standard deviations by which gains and delays move a window whose load counts half: nothing corrects it
+)
 VAGUE = 0.2  # standard deviation of a log-ratio that teaches nothing of a parameter that is known: estimates are not
 # given beyond 0.3 as they state it themselves, which leaves out more low values than high ones
 SKEW = 0.03  # standard deviation of a log-ratio below which it is as good as linear: it errs by 0.1 %
@@ -134,8 +138,8 @@ class Fusion:
             return belief, calibration, None, None, True
         if not found.whole:
             moved = calibration.cross @ np.where(model.cargo, 0.0, belief.mean[-model.size :])
-            doubt = float(self._doubt(found.given, moved).max())  # its load is that of gains and delays as stated, too
-            belief = dev.loaded(belief, model, found, share / doubt)
+            doubt = 1 + float((moved**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
+            belief = dev.loaded(belief, model, found, share / doubt)  # its load is that of gains and delays as stated
             gains = np.where(model.cargo, found.cross, calibration.cross)
             found = replace(found, cross=gains, point=np.where(model.cargo, found.point, 0.0))
             return belief, calibration, found, None, True
@@ -290,7 +294,7 @@ class Fusion:
 
     def _doubt(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
         """Factor (P,) on the variances of such a window."""
-        return np.asarray(1 + (moved / DOUBTED) ** 4 / covariance.diagonal() ** 2)
+        return np.asarray(1 + (moved / DOUBTED) ** 2 / covariance.diagonal())
 
     def _doubted(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
         """Covariance (P, P) of a window that was not weighed, which deviations move by about `moved` (P,).
