@@ -8,7 +8,7 @@ import sqlite3
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -38,26 +38,40 @@ class LoadSent:
 
 def load(folder: Path, minutes: float, vehicles: int = VEHICLES) -> Iterator[dict[str, Any]]:
     """Figures of one run; every vehicle sends a window of one second each second."""
+    connections = min(vehicles, MOST_CONNECTIONS)  # a vehicle has one of its own
+    yield from watched(folder / "load", minutes, vehicles, connections)
+
+
+def watched(
+    folder: Path,
+    minutes: float,
+    vehicles: int,
+    connections: int,
+    beside: Sequence[Callable[[int, float], None]] = (),
+    warm_up: float = WARM_UP,
+) -> Iterator[dict[str, Any]]:
+    """Figures of vehicles that send a window a second over some connections, to a service of their own.
+
+    beside: what else uses the service meanwhile, told its port and the time (`time.monotonic`) at which to end.
+    """
     parts = window_body(load_system()).split(b'"bench"')
     sent, memory = LoadSent(), list[tuple[float, int]]()
-    connections = min(vehicles, MOST_CONNECTIONS)  # a vehicle has one of its own
-    with Served(folder / "load", system=MANCHESTER) as served:
+    with Served(folder, system=MANCHESTER) as served:
         served.ready()
         begun = time.monotonic() + 1.0
         ends = begun + 60 * minutes
+        shares = [range(n, vehicles, connections) for n in range(connections)]
         threads = [
-            threading.Thread(
-                target=drive, args=(served.port, parts, range(n, vehicles, connections), begun, ends, sent)
-            )
-            for n in range(connections)
+            threading.Thread(target=drive, args=(served.port, parts, share, begun, ends, sent)) for share in shares
         ]
+        threads += [threading.Thread(target=use, args=(served.port, ends)) for use in beside]
         for thread in threads:
             thread.start()
         while any(thread.is_alive() for thread in threads):
             memory.append((time.monotonic() - begun, resident(served.process.pid)))
             time.sleep(1.0)
         served.kill()
-    yield from figures(folder / "load" / "sprung.db", sent, memory, minutes, vehicles)
+    yield from figures(folder / "sprung.db", sent, memory, minutes, vehicles, warm_up)
 
 
 def drive(port: int, parts: list[bytes], vehicles: range, begun: float, ends: float, sent: LoadSent) -> None:

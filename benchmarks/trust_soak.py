@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import http.client
 import json
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +15,8 @@ import numpy as np
 
 from sprung.benchmarks.generator import read_vehicle
 from sprung.benchmarks.generator.files import write_mcap
-from sprung.benchmarks.serve import window_body
 from sprung.benchmarks.trust_clients import multipart
-from sprung.benchmarks.trust_load import START_SECONDS, LoadSent, drive, figures, resident
-from sprung.benchmarks.trust_service import Served
+from sprung.benchmarks.trust_load import START_SECONDS, watched
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, System, load_system
@@ -39,31 +37,13 @@ LOOKED_AT = (
 
 def soak(folder: Path, minutes: float) -> Iterator[dict[str, Any]]:
     """Figures of one run: latencies, losses, and how the memory of the service grew."""
-    parts = window_body(load_system()).split(b'"bench"')
-    sent, memory, beside = LoadSent(), list[tuple[float, int]](), Counter[str]()
-    with Served(folder / "soak", system=MANCHESTER) as served:
-        served.ready()
-        begun = time.monotonic() + 1.0
-        ends = begun + 60 * minutes
-        shares = [range(n, VEHICLES, CLIENTS) for n in range(CLIENTS)]
-        threads = [
-            threading.Thread(target=drive, args=(served.port, parts, share, begun, ends, sent)) for share in shares
-        ]
-        threads += [
-            threading.Thread(target=_upload, args=(served.port, folder, ends, beside)),
-            threading.Thread(target=_look, args=(served.port, ends, beside)),
-        ]
-        for thread in threads:
-            thread.start()
-        while any(thread.is_alive() for thread in threads):
-            memory.append((time.monotonic() - begun, resident(served.process.pid)))
-            time.sleep(1.0)
-        served.kill()
-    yield from figures(folder / "soak" / "sprung.db", sent, memory, minutes, VEHICLES, WARM_UP)
+    beside = Counter[str]()
+    others = (partial(_upload, folder=folder, beside=beside), partial(_look, beside=beside))
+    yield from watched(folder / "soak", minutes, VEHICLES, CLIENTS, others, WARM_UP)
     yield {"figure": "beside the windows", "value": dict(sorted(beside.items()))}
 
 
-def _upload(port: int, folder: Path, ends: float, beside: Counter[str]) -> None:
+def _upload(port: int, ends: float, folder: Path, beside: Counter[str]) -> None:
     """A recording now and then, of a vehicle of its own whose time goes on; each until its job has ended."""
     system, vehicle = load_system(), read_vehicle(MANCHESTER)
     values = _ride(system)
