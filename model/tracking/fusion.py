@@ -137,7 +137,7 @@ class Fusion:
         if found is None:
             return belief, calibration, None, None, True
         if not found.whole:
-            moved = calibration.cross @ np.where(model.cargo, 0.0, belief.mean[-model.size :])
+            moved = self._moved(calibration.cross, belief)
             doubt = 1 + float((moved**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
             belief = dev.loaded(belief, model, found, share / doubt)  # its load is that of gains and delays as stated
             gains = np.where(model.cargo, found.cross, calibration.cross)
@@ -289,21 +289,12 @@ class Fusion:
         else:
             found_at, cross, covariance = found.point, found.cross, found.given
         if found is None or not found.whole:
-            covariance = self._doubted(covariance, cross @ np.where(self.model.cargo, 0.0, here))
+            covariance = _doubted(covariance, self._moved(cross, belief))
         return value + np.where(mask, cross @ (here - found_at), 0.0), covariance, cross
 
-    def _doubt(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
-        """Factor (P,) on the variances of such a window."""
-        return np.asarray(1 + (moved / DOUBTED) ** 2 / covariance.diagonal())
-
-    def _doubted(self, covariance: FloatArray, moved: FloatArray) -> FloatArray:
-        """Covariance (P, P) of a window that was not weighed, which deviations move by about `moved` (P,).
-
-        Its own sensitivities are not those of the windows before it, and those of windows that tell much differ from
-        the mean of all: what deviations move little may speak, the rest is left to windows that were weighed.
-        """
-        wide = np.sqrt(self._doubt(covariance, moved))
-        return np.asarray(covariance * np.outer(wide, wide))
+    def _moved(self, cross: FloatArray, belief: kalman.Belief) -> FloatArray:
+        """What gains and delays, as believed, move log-ratios by, (P,)."""
+        return np.asarray(cross @ np.where(self.model.cargo, 0.0, belief.mean[-self.model.size :]))
 
     def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
@@ -374,6 +365,16 @@ class Fusion:
             own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)
         spread = np.sqrt(std**2 + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
+
+
+def _doubted(covariance: FloatArray, moved: FloatArray) -> FloatArray:
+    """Covariance (P, P) of a window that was not weighed, which deviations move by about `moved` (P,).
+
+    Its own sensitivities are not those of the windows before it, and those of windows that tell much differ from
+    the mean of all: what deviations move little may speak, the rest is left to windows that were weighed.
+    """
+    wide = np.sqrt(1 + (moved / DOUBTED) ** 2 / covariance.diagonal())
+    return np.asarray(covariance * np.outer(wide, wide))
 
 
 def _linear(window: _Window, belief: kalman.Belief) -> _Window:
