@@ -63,9 +63,7 @@ def taken_out(problem: Problem, fit: Fit) -> Fit:
     point, term = fit.point, fit.point.terms[-1]
     projector = Projector(problem, fit)
     spectrum = projector.grid.coarse_spectrum(fit.force_along(term))[projector.grid.band]
-    port = term.port(problem.system)
-    response = projector.of_force[:, :, : len(port)] @ port
-    residual = fit.residual + projector.pack(response * spectrum[:, None])
+    residual = fit.residual + projector.seen_of(term.port(problem.system), spectrum)
     own = np.zeros(fit.jacobian.shape[1], dtype=bool)
     own[fit.place(len(point.terms) - 1)] = True
     near = point.warm_start[: sum(is_waveform(other) for other in point.terms[:-1])]
@@ -154,11 +152,11 @@ class FormulaSearch:
 
     def _start(self, one: Scored, hit: Candidate) -> Point:
         """Where a fit of the formula begins: everything else moved as its score has it."""
-        projector, port = self.motion.projector, hit.term.port(self.motion.projector.problem.system)
-        fit, response = projector.fit, projector.of_force[:, :, : len(port)] @ port
+        projector = self.motion.projector
+        fit, port = projector.fit, hit.term.port(projector.problem.system)
         parts = zip(one.amplitudes, one.parts, one.inner, strict=True)
         force = sum(amplitude * self.spectrum(form, own) for amplitude, form, own in parts)
-        left = fit.residual - projector.pack(response * np.asarray(force)[:, None])
+        left = fit.residual - projector.seen_of(port, np.asarray(force))
         scale = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
         step = np.linalg.lstsq(fit.jacobian / scale, left, rcond=_RIDGE)[0] / scale
         first = len(step) - len(fit.point.state)

@@ -142,6 +142,15 @@ class Projector:
         weighted = whitened * self.grid.weight[:, None]
         return np.concatenate([weighted.real.ravel(), weighted.imag.ravel()])
 
+    def of_port(self, port: FloatArray) -> ComplexArray:
+        """Whitened response (F, S) of the sensors to a force along a port (E,): one element, or those of a pair."""
+        response: ComplexArray = self.of_force[:, :, : len(port)] @ port
+        return response
+
+    def seen_of(self, port: FloatArray, force: ComplexArray) -> FloatArray:
+        """What the residual loses to a force (F,) along a port, (2 F S,)."""
+        return self.pack(self.of_port(port) * force[:, None])
+
     def score(self, column: FloatArray, more: tuple[float, float] = (0.0, 0.0)) -> tuple[float, float]:
         """Statistic and amplitude of a column; `more`: product with, and square of, residuals outside the sensors."""
         inside = self.q.T @ column
