@@ -2,8 +2,8 @@
 
 Deflections and rates are continued between samples by polynomials through both, on a grid `FINE` times finer; forces
 are brought back to the samples behind a band-limiting filter.  Slopes by the motion are means over the samples'
-surroundings, weighed as a straight line between samples would be; the one state z of a law with memory is carried from
-sample to sample by
+surroundings, weighed as a straight line between samples would be.  What the forces themselves do above half the sample
+rate is added to the rates (`shake`).  The one state z of a law with memory is carried from sample to sample by
 
     dz_{k+1} = keep_k dz_k + by_d0_k dd_k + by_d1_k dd_{k+1} + by_v0_k dv_k + by_v1_k dv_{k+1}.
 """
@@ -90,6 +90,14 @@ class Along:
     def force(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
         """The force at the samples, (..., B, T)."""
         return band_limited(self.fine(p, element, first), self.parts)
+
+    def ripple(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """The part of the force's impulse that samples do not show, N s, (B, fine)."""
+        force = np.broadcast_to(self.fine(p, element, first), self.d.shape)
+        impulse = np.zeros(force.shape)
+        np.cumsum(0.5 * self.step * (force[:, 1:] + force[:, :-1]), axis=1, out=impulse[:, 1:])
+        shown, per_sample = (band_limited(x, self.parts) for x in (impulse, force * self.step * self.parts))
+        return impulse - _continued(shown, per_sample, self.parts)[0]
 
     def changes(self, p: FloatArray, free: Sequence[int], element: SpringDamper, first: FloatArray) -> FloatArray:
         """What the force changes per log of the free values, then of stiffness and damping, (X, B, T).
@@ -202,6 +210,25 @@ class Along:
                 found[i] += keep * half * self.step * rate[:, :, j] * share
             keep = keep * half**2
         return keep, *found
+
+
+def follows_rate(law: ElementLaw, p: Sequence[float]) -> bool:
+    """Whether the force of a law without memory is another one at another rate."""
+    motion = Motion(np.full(3, 1e-3), np.array([-1e-2, 0.0, 1e-2]))
+    return bool(np.ptp(law.force(motion, p, SpringDamper(1.0, 1.0)) * np.ones(3)) > 0)
+
+
+def shake(along: Sequence[Along], at: Sequence[tuple[Any, ...]], mobility: FloatArray) -> None:
+    """Add to the rates along which laws act what their own forces do above half the sample rate.
+
+    Samples do not show it, but it is what friction meets while its force changes sign, within less than a sample: the
+    bodies are shaken, which rounds the corner.  Springs and dampers are nothing to a body's inertia there, and what the
+    change of the rate makes of the forces is small beside them.  at: each one's values, element and first memory;
+    mobility: accelerations of the sites by forces at them, 1/kg, (B, L, L).
+    """
+    ripples = np.stack([path.ripple(*given) for path, given in zip(along, at, strict=True)])  # (L, B, fine)
+    for path, moved in zip(along, np.einsum("bml,lbt->mbt", mobility, ripples), strict=True):
+        path.v = path.v - moved
 
 
 def _moved(p: Sequence[FloatArray], element: SpringDamper, at: int) -> tuple[_At, _At]:

@@ -1,7 +1,8 @@
 """Gauss-Newton on windows of a system with laws: a linearisation and two steps an iteration.
 
-The model is brought to its own motion again at the new point, and the old products give the second step.  Gains and
-delays are weighed where a window has converged.
+The model is brought to its own motion again at the new point, and the old products give the second step.  Points are
+compared by what they leave as they are: what the best first state would leave is far too small where a force jumps, as
+long as that state is far.  Gains and delays are weighed where a window has converged.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ ITERATIONS = 6
 _OPENING = 1  # rounds of forces and first state before the first iteration
 _CONVERGED = 0.3  # a second step this small, in standard deviations, leaves an error far below it
 _STILL = 0.3  # a first step this small: the window stands at its minimum, whatever the second one says
-_SLACK = 2.0  # of chi-square, by which a step may be worse: neither forces nor smoothed inputs settle closer
+_SLACK = 2.0  # of squares of residuals, by which a step may be worse: forces and smoothed inputs settle no closer
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 
 
@@ -40,6 +41,11 @@ class Second:
     cost: Tensor  # (B,)
     step: Tensor  # of the unknowns, (B, U)
     alone: Tensor  # of the first state without that, (B, N)
+
+    @property
+    def there(self) -> Tensor:
+        """Squares of the residual, (B,); the cost is what the best first state would leave, were the model linear."""
+        return self.residual.square().sum(dim=(1, 2))
 
     @property
     def outputs(self) -> Tensor:
@@ -88,6 +94,7 @@ class LawSearch:
         self.point = WindowPoint(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
         self.best = self.point.take(torch.arange(B))
         self.cost = torch.full((B,), torch.inf, dtype=torch.float64)
+        self.there = self.cost.clone()  # squares of the residual, by which points are better or worse
         self.covariance = torch.eye(U, dtype=torch.float64).repeat(B, 1, 1)
         self.converged = torch.zeros(B, dtype=torch.bool)
         self.iterations = torch.zeros(B, dtype=torch.long)
@@ -149,13 +156,14 @@ class LawSearch:
         columns, flow = w.columns(point, steps, motion, data, smooth)
         residual = w.residual(motion, data, columns.whiten)
         cost, step, alone = columns.solve(residual, point.unknowns)
-        worse = ~(cost <= before * (1 + 1e-6) + _SLACK)
+        there = residual.square().sum(dim=(1, 2))
+        worse = ~(there <= self.there[rows] * (1 + 1e-6) + _SLACK)
         step = self._limited(step)
         dx0 = columns.state_step(alone, step)
         smooth = w.smoothed(columns, residual, step, dx0, steps)
         std = torch.diagonal(columns.covariance, dim1=1, dim2=2).sqrt()
         second = self._second(columns, near, point.moved(step, dx0), data, smooth)
-        held = second.cost <= cost * (1 + 1e-6) + _SLACK
+        held = second.there <= there * (1 + 1e-6) + _SLACK
         still = (step.abs() / std).amax(dim=1) < _STILL
         going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the old products are good enough for one more
@@ -167,12 +175,14 @@ class LawSearch:
         if len(ripe):
             weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)
             self._weigh(rows[ripe], columns.take(ripe), *weighed)
-        there, more, motion = second.point, self._limited(second.step), second.motion
-        forward = there.moved(more, columns.state_step(second.alone, more)).where(held, point.moved(step / 3, dx0 / 3))
+        more, motion = self._limited(second.step), second.motion
+        forward = second.point.moved(more, columns.state_step(second.alone, more))
+        forward = forward.where(held, point.moved(step / 3, dx0 / 3))
         best = self.best.take(rows)
         self.point.put(rows, best.towards(point, 1 / 3).where(worse, forward))
         self.best.put(rows, best.where(worse, point))
         self.cost[rows] = torch.where(done & held, second.cost, torch.where(worse, before, cost))
+        self.there[rows] = torch.where(worse, self.there[rows], there)
         self.smooth[:, rows.numpy()] = smooth
         self.converged[rows], self.covariance[rows], self.states[rows] = done, columns.covariance, motion.states
         self.iterations[rows] += 1
@@ -197,7 +207,7 @@ class LawSearch:
         step = self._limited(old.step)
         there = old.point.moved(step, columns.state_step(old.alone, step))
         new = self._second(columns, flow, there, data, smooth)
-        better = (new.cost <= old.cost * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
+        better = (new.there <= old.there * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
         second.put(at[better], new.take(better))
 
     def _weigh(

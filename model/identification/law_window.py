@@ -23,7 +23,7 @@ from torch import Tensor
 
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
-from sprung.model.identification.law_forces import Acting, Along, slopes_of
+from sprung.model.identification.law_forces import Acting, Along, follows_rate, shake, slopes_of
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra
 from sprung.model.laws import SpringDamper
@@ -53,6 +53,7 @@ class LawWindows:
         self.weights = torch.as_tensor(np.array([a.weights for a in acting]))  # (L, E)
         self.free = [(law, i) for law, a in enumerate(acting) for i in a.free]
         self.memories = [i for i, a in enumerate(acting) if a.law.memory]
+        self.quick = [i for i, a in enumerate(acting) if not a.law.memory and follows_rate(a.law, a.placed.values)]
         noise = bare.sensor_noise
         self.noise = torch.as_tensor(noise)
         moving = m.sensor_kind == ACCELERATION
@@ -149,7 +150,7 @@ class LawWindows:
             their_steps, theirs = (steps, data) if everything else (steps.take(moving), data.take(moving))
             their_smooth = smooth if everything else smooth[:, moving.numpy()]
             states, _ = self.simulate(their_steps, some.force, some.x0, theirs)
-            along = self.along(states, theirs, their_smooth)
+            along = self.along(states, theirs, their_smooth, some, their_steps)
             flow = self.flow(along, some, their_steps) if flow is None else flow
             near = flow if everything else flow.take(moving)
             change = near.answer(self._forces(along, some, their_steps) - some.force)
@@ -169,15 +170,22 @@ class LawWindows:
         at_once = torch.cat([shown / self.noise[torch.as_tensor(data.present)], carried], dim=2)
         return at_once.square().mean(dim=1).amax(dim=1).sqrt()
 
-    def along(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> list[Along]:
-        """The laws along given states."""
+    def along(
+        self, states: Tensor, data: WindowBatch, smooth: FloatArray, point: WindowPoint, steps: Steps
+    ) -> list[Along]:
+        """The laws along given states, and what their own forces make of the motion between samples."""
         d, v = self.site_motion(states, data, smooth)
         rate = self.system.sample_rate
-        return [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
+        along = [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
+        if self.quick:
+            mobility = (self.pull[self.quick] @ steps.compliance @ self.pull[self.quick].T).numpy()
+            shaken = [along[i] for i in self.quick], [self._at(i, point, steps) for i in self.quick]
+            shake(*shaken, mobility)
+        return along
 
     def forces(self, point: WindowPoint, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
         """The laws' forces along given states, (B, T, L)."""
-        return self._forces(self.along(states, data, smooth), point, steps)
+        return self._forces(self.along(states, data, smooth, point, steps), point, steps)
 
     def _forces(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
         shape = point.force.shape[:2]
@@ -204,7 +212,7 @@ class LawWindows:
         self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
     ) -> tuple[Columns, Flow]:
         """Everything that Gauss-Newton needs at a settled point, and what its motion does with changes."""
-        along = self.along(motion.states, data, smooth)
+        along = self.along(motion.states, data, smooth, point, steps)
         flow = self.flow(along, point, steps)
         transfer = self.model.transfer(steps.values, data)
         carried = transfer.drive * self.model.drive_noise[:, None]

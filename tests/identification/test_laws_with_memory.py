@@ -62,7 +62,7 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
 
     point, motion, _ = model.settle(start, model.steps(start, data), data, still)
     steps = model.steps(point, data)
-    along = model.along(motion.states, data, still)
+    along = model.along(motion.states, data, still, point, steps)
     columns = model.shown(point, steps, motion, data, still, along, model.flow(along, point, steps))
     back = torch.linalg.pinv(model.model.compression.matrix(data.present))
     whitened = torch.as_tensor(np.diag(1 / bare.sensor_noise)) @ back
