@@ -17,12 +17,18 @@ import numpy as np
 import scipy.linalg
 
 from sprung.model.schema import Body, ElementSensor, ForceInput, SystemFile
+from sprung.model.sensor_kinds import KINDS, Shown
 from sprung.model.signals import FloatArray, IntArray
 
 ACCELERATION, VELOCITY, DISPLACEMENT, DEFLECTION, FORCE = range(5)
 _HELD = 1e-9  # of the largest stiffness: less holds nothing
-SENSOR_KINDS = ("acceleration", "velocity", "displacement", "deflection", "force")
-RATES = ("roll_rate", "pitch_rate")  # velocities of the degrees of freedom roll and pitch
+_ROWS: dict[Shown, int] = {
+    "acceleration": ACCELERATION,
+    "velocity": VELOCITY,
+    "displacement": DISPLACEMENT,
+    "deflection": DEFLECTION,
+    "force": FORCE,
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +169,7 @@ def assemble(file: SystemFile) -> Mechanics:
     H, G = _deflections(file, freedom)
     S, L = _sensor_rows(file, freedom)
     support_drive, force_drive = _drives(file)
-    kinds = [VELOCITY if s.kind in RATES else SENSOR_KINDS.index(s.kind) for s in file.sensors.values()]
+    kinds = [_ROWS[KINDS[sensor.kind].shows] for sensor in file.sensors.values()]
     F = [freedom.point(source.body, source.position) for source in forces]
     return Mechanics(
         dofs=freedom.dofs,
@@ -236,8 +242,8 @@ def _sensor_rows(file: SystemFile, freedom: _Freedom) -> tuple[FloatArray, Float
     for i, sensor in enumerate(file.sensors.values()):
         if isinstance(sensor, ElementSensor):
             L[i, elements.index(sensor.element)] = 1.0
-        elif sensor.kind in RATES:
-            S[i, freedom.dofs.index(f"{sensor.body}.{sensor.kind.removesuffix('_rate')}")] = 1.0
+        elif axis := KINDS[sensor.kind].axis:
+            S[i, freedom.dofs.index(f"{sensor.body}.{axis}")] = 1.0
         else:
             S[i] = freedom.point(sensor.body, sensor.position)
     return S, L

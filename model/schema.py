@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from sprung.model.address import Address, Laws, Strict, TimeKey
+from sprung.model.sensor_kinds import KINDS, ElementKind, MotionKind
 from sprung.model.units import FACTORS, UnitError, known
 
 
@@ -136,9 +137,9 @@ class Element(Strict):
 
 
 class MotionSensor(Address):
-    """Vertical motion of a point of a body, or the rate (rad/s) at which the body rolls or pitches."""
+    """Vertical motion of a point of a body, or how the body turns about an axis (rad/s)."""
 
-    kind: Literal["acceleration", "velocity", "displacement", "roll_rate", "pitch_rate"]
+    kind: MotionKind
     body: str
     position: Point | None = None
 
@@ -146,7 +147,7 @@ class MotionSensor(Address):
 class ElementSensor(Address):
     """Deflection (m) of an element, or the force (N) it carries, positive in extension."""
 
-    kind: Literal["deflection", "force"]
+    kind: ElementKind
     element: str
 
 
@@ -211,13 +212,7 @@ SI = {
     "stiffness": "N/m",
     "damping": "N s/m",
     "mass": "kg",
-    "acceleration": "m/s^2",
-    "velocity": "m/s",
-    "displacement": "m",
-    "deflection": "m",
-    "force": "N",
-    "roll_rate": "rad/s",
-    "pitch_rate": "rad/s",
+    **{name: kind.unit for name, kind in KINDS.items()},
     "pressure": "Pa",
     "speed": "m/s",
     "temperature": "degC",
@@ -308,10 +303,9 @@ class Parts:
                     )
 
     def _turns(self, name: str, sensor: MotionSensor) -> Iterator[str]:
-        """A rate sensor needs a body that turns about its axis."""
-        axis = sensor.kind.removesuffix("_rate")
-        body = self.bodies.get(sensor.body)
-        if axis in ("roll", "pitch") and body is not None and getattr(body, f"{axis}_inertia") is None:
+        """A sensor of rotation needs a body that turns about its axis."""
+        axis, body = KINDS[sensor.kind].axis, self.bodies.get(sensor.body)
+        if axis and body is not None and getattr(body, f"{axis}_inertia") is None:
             yield f"sensors.{name}.body: {sensor.body} has no {axis}_inertia, so it does not {axis}"
 
     def addresses(self) -> Iterator[tuple[str, str, Address]]:

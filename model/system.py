@@ -28,6 +28,7 @@ from sprung.model.schema import (
     SystemFileError,
     TrackInput,
 )
+from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import Channel, Conditions, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 
@@ -35,7 +36,6 @@ BUNDLED = Path(__file__).parent / "systems"
 MANCHESTER = BUNDLED / "manchester.yaml"
 MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
-USUAL_NOISE = {"m/s^2": 0.01, "m/s": 1e-3, "m": 1e-5, "N": 1.0, "rad/s": 1e-4}
 GAIN_STD = 0.015  # of a channel whose data sheet is not quoted: 1 to 2 % for accelerometers with their electronics
 DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations

@@ -67,10 +67,15 @@ def spelt(unit: str) -> str:
     return name
 
 
+def units_of(si: str) -> dict[str, float]:
+    """Names of the units of the quantity that is measured in `si`; of one that no table has only that."""
+    return FACTORS.get(si, {si: 1.0})
+
+
 def known(unit: str, si: str) -> str | None:
     """The table's name of a unit of the quantity that is measured in `si`; None when it is none."""
     for name in (spelt(unit), _SAME.get(spelt(unit), ""), _SAME.get(spelt(unit).lower(), "")):
-        if name in FACTORS[si] or name in RAW:
+        if name in units_of(si) or name in RAW:
             return name
     if si == "kg" and spelt(unit).lower() in ("lb", "lbs"):
         return "lb"
@@ -87,14 +92,14 @@ def to_si(unit: str | None, si: str, scale: float | None, offset: float, sign: i
     gain = 1.0 if scale is None else scale
     if unit is None:
         return sign * gain, sign * offset
-    name = known(unit, si)
+    name, units = known(unit, si), units_of(si)
     if name is None:
-        near = difflib.get_close_matches(spelt(unit).lower(), [n.lower() for n in FACTORS[si]], n=1, cutoff=0.6)
-        meant = [n for n in FACTORS[si] if n.lower() in near]
+        near = difflib.get_close_matches(spelt(unit).lower(), [n.lower() for n in units], n=1, cutoff=0.6)
+        meant = [n for n in units if n.lower() in near]
         hint = f"did you mean {meant[0]!r}? known are" if meant else "known are"
-        raise UnitError(f"{unit!r} is no unit of {si}; {hint} {', '.join(FACTORS[si])}; or V, mA, count with a scale")
-    if name in FACTORS[si]:
-        factor = FACTORS[si][name]
+        raise UnitError(f"{unit!r} is no unit of {si}; {hint} {', '.join(units)}; or V, mA, count with a scale")
+    if name in units:
+        factor = units[name]
         offset += ZEROS.get(name, 0.0)
         return sign * gain * factor, sign * offset * factor
     if scale is None:

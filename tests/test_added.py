@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -60,6 +61,28 @@ SQUEAK = ElementLaw(
     confused_with=(),
     sentence="a squeak of {size}",
 )
+"""
+KIND = """
+import importlib.util, sys
+import numpy as np
+from pathlib import Path
+
+whole = importlib.util.find_spec("sprung.model.sensor_kinds")
+text = Path(whole.origin).read_text()
+line = '    "force": SensorKind("N", 1.0, "force"),\\n'
+text = text.replace('"pitch_rate"]', '"pitch_rate", "roll_acceleration"]')
+text = text.replace(line, line + '    "roll_acceleration": SensorKind("rad/s^2", 0.01, "acceleration", "roll"),\\n')
+Path(sys.argv[1]).write_text(text)
+spec = importlib.util.spec_from_file_location(whole.name, sys.argv[1])
+module = sys.modules[whole.name] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(module)
+
+from sprung.model.system import parse_system
+system = parse_system(Path(sys.argv[2]).read_text())
+A, B, C, D = system.mechanics.matrices()
+rate, acceleration = list(system.sensors).index("rate"), list(system.sensors).index("turns")
+assert np.allclose(C[acceleration], C[rate] @ A) and np.allclose(D[acceleration], C[rate] @ B) and C[rate].any()
+print(system.channels[-1].unit)
 """
 SYSTEM = """
 name: one
@@ -128,3 +151,14 @@ def test_a_law_from_a_file_is_known_to_the_diagnosis(tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text(SYSTEM.replace("1500}", "1500, laws: [{squeak: {size: 10}}]}"))
     laws = CATALOGUE + load_laws(tmp_path / "laws.py", ())
     assert "strut.squeak.size" in load_system(tmp_path / "one.yaml", laws).laws[0].names
+
+
+def test_a_sensor_kind_is_a_line_of_one_file(tmp_path: Path) -> None:
+    """Of a copy of that file, in a process of its own: the kinds are known before a system is."""
+    system = SYSTEM.replace("mass: 400", "mass: 400, roll_inertia: 90")
+    system = system.replace("upper: car, lower: road", "upper: car, lower: road, position: [0, 1]")
+    rate, turns = "{kind: roll_rate, body: car, csv: r}", "{kind: roll_acceleration, body: car, csv: p, unit: rad/s2}"
+    (tmp_path / "one.yaml").write_text(system.replace("0.01}}", f"0.01}}, rate: {rate}, turns: {turns}}}"))
+    words = [sys.executable, "-c", KIND, str(tmp_path / "kinds.py"), str(tmp_path / "one.yaml")]
+    done = subprocess.run(words, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout.split()) == (0, ["rad/s^2"]), done.stderr

@@ -26,6 +26,7 @@ ORDER = [
     "units",
     "parameters",
     "address",
+    "sensor_kinds",
     "schema",
     "digest",
     "mechanics",

@@ -21,13 +21,13 @@ import yaml
 
 from sprung.model.exchange.from_fmu import read_fmu
 from sprung.model.exchange.statespace import ExchangeError
+from sprung.model.sensor_kinds import KINDS, USUAL_NOISE, Kind
 from sprung.model.signals import FloatArray
-from sprung.model.system import USUAL_NOISE, System, parse_system
+from sprung.model.system import System, parse_system
 
 _KEYS = ("M", "C", "K", "Kb", "Cb", "S", "A", "B", "mass", "sample_rate")
 _SAME = 1e-8  # relative to the largest entry of a matrix
 _DIFFERENCES = 1e-6  # the same of derivatives that an FMU may take by differences
-_UNITS = {"acceleration": "m/s^2", "velocity": "m/s", "displacement": "m", "deflection": "m"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class SpringNetwork:
     Kb: FloatArray  # by the displacements of the supports, (n, s)
     Cb: FloatArray  # by their velocities, (n, s)
     sensors: tuple[
-        tuple[str, int, int], ...
+        tuple[Kind, int, int], ...
     ]  # kind, coordinate, the coordinate that a deflection is counted from or -1
 
 
@@ -130,7 +130,7 @@ def _from_mck(path: Path, given: Mapping[str, FloatArray]) -> SpringNetwork:
     return _checked(path, SpringNetwork(mass, K, C, Kb, Cb, sensors))
 
 
-def _sensor_of_row(path: Path, number: int, row: FloatArray) -> tuple[str, int, int]:
+def _sensor_of_row(path: Path, number: int, row: FloatArray) -> tuple[Kind, int, int]:
     at = np.flatnonzero(row)
     if len(at) == 1 and row[at[0]] == 1:
         return "acceleration", int(at[0]), -1
@@ -190,7 +190,7 @@ def _masses(path: Path, X: FloatArray, given: FloatArray | None) -> FloatArray:
     return mass
 
 
-def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray, same: float) -> tuple[str, int, int]:
+def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray, same: float) -> tuple[Kind, int, int]:
     n = len(A) // 2
     for i in range(n):
         if np.allclose(row, A[n + i], rtol=1e-9, atol=same * np.abs(A[n + i]).max()):
@@ -290,8 +290,8 @@ def _add(elements: dict[str, Any], upper: str, lower: str, k: float, c: float) -
         elements[f"{upper}_{lower}"] = {"upper": upper, "lower": lower} | values
 
 
-def _sensor(kind: str, i: int, j: int, body: list[str], elements: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    noise = USUAL_NOISE[_UNITS[kind]]
+def _sensor(kind: Kind, i: int, j: int, body: list[str], elements: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
+    noise = KINDS[kind].noise
     if kind != "deflection":
         name = f"{body[i]}_{kind}"
         return name, {"kind": kind, "body": body[i], "csv": name, "noise": noise}

@@ -13,10 +13,11 @@ from sprung.model.identification.compression import Compression
 from sprung.model.identification.frequency import FrequencyModel, bin_frequencies
 from sprung.model.identification.gauss_newton import Chord, Linearisation, Transfer, WindowBatch
 from sprung.model.mechanics import DEFLECTION, FORCE
+from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.linear import Discrete, ElementValues, LinearSimulator
 from sprung.model.simulate.loading import by_inertia, load_terms
-from sprung.model.system import USUAL_NOISE, System
+from sprung.model.system import System
 
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something

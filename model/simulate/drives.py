@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.schema import ForceInput, SupportInput
+from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.fusion import motion, motion_noise, motion_shares, used
-from sprung.model.system import USUAL_NOISE, System
+from sprung.model.system import System
 
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2, "force": 0}  # derivatives that a quantity shows
 

@@ -23,10 +23,11 @@ from sprung.model.diagnosis.investigation.setup_response import Group, ModelResp
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.rules import SetupRules
-from sprung.model.schema import MotionSensor
+from sprung.model.schema import MotionSensor, Sensor
+from sprung.model.sensor_kinds import KINDS
 from sprung.model.system import System
 
-_ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a kind shows
+_ORDERS = {"acceleration": 2, "velocity": 1, "displacement": 0}  # derivatives that a sensor of a point shows
 _STANDARD_GRAVITY = 9.80665  # m/s^2
 _ALIKE = 1e-6  # m, of positions that mirror each other
 
@@ -104,7 +105,7 @@ class Wiring:
             yield [], supports
 
     def _turns(self, i: int) -> bool:
-        return isinstance(self.sensors[i], MotionSensor) and self.sensors[i].kind in _ORDERS
+        return _is_of_a_point(self.sensors[i])
 
     def _position(self, i: int) -> tuple[float, float]:
         sensor = self.sensors[i]
@@ -229,7 +230,7 @@ def _positions(one: ModelResponse, system: System, signals: Signals, rules: Setu
     dofs = list(system.mechanics.dofs)
     for i, name in enumerate(map(str, signals.sensor_names)):
         sensor = system.file.sensors[name]
-        if not isinstance(sensor, MotionSensor) or sensor.kind not in _ORDERS:
+        if not (isinstance(sensor, MotionSensor) and _is_of_a_point(sensor)):
             continue
         for axis, turn in ((0, "pitch"), (1, "roll")):
             if f"{sensor.body}.{turn}" not in dofs:
@@ -246,10 +247,14 @@ def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: i
     sensor = system.file.sensors[name]
     assert isinstance(sensor, MotionSensor)
     dof = system.mechanics.dofs.index(f"{sensor.body}.{('pitch', 'roll')[axis]}")
-    change = (1j * one.omega) ** _ORDERS[sensor.kind] * one.motion[:, dof]
+    change = (1j * one.omega) ** _ORDERS[KINDS[sensor.kind].shows] * one.motion[:, dof]
     error = one.measured[:, i] - one.shown[:, i]
     size = max(float(np.sum(np.abs(change) ** 2)), 1e-300)
     return float(np.sum(np.real(change.conj() * error)) / size), change
+
+
+def _is_of_a_point(sensor: Sensor) -> bool:
+    return isinstance(sensor, MotionSensor) and not KINDS[sensor.kind].axis
 
 
 def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:

@@ -20,8 +20,9 @@ from sprung.model.diagnosis.record.spectra import ComplexArray, Grid, derivative
 from sprung.model.diagnosis.rules import RULES, RecordRules
 from sprung.model.mechanics import DISPLACEMENT, rigid_body_modes
 from sprung.model.schema import ForceInput, SupportInput
+from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import FloatArray
-from sprung.model.system import USUAL_NOISE, System
+from sprung.model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _ORDER = 8  # of the differences that tell those
