@@ -208,7 +208,7 @@ class SystemFile(Strict):
                 yield f"signals.{name}: another part of the file has this name already"
 
 
-SI = {
+SI: dict[str, str] = {
     "stiffness": "N/m",
     "damping": "N s/m",
     "mass": "kg",

@@ -263,6 +263,7 @@ class ComponentRules:
     minor: float = rule(0.003, "of the error's power, that a further law must remove; chosen", 1e-3, 0.01)
     naming_margin: float = rule(6.0, "evidence over look-alikes; derived: odds of 20 to 1", 3.0, 10.0)
     plain_cost: float = rule(6.0, "evidence over a commoner law that it contains; derived: odds of 20 to 1", 3.0, 10.0)
+    trials_of_a_law: int = rule(10, "independent ones, of all its shapes; chosen: of some 10 to 40 in a grid", 5, 40)
     starts: int = rule(2, "trial shapes from which a law is refined; chosen", 1, 4)
     close: int = rule(6, "laws that are refined in every round; chosen", 4, 10)
     declared: float = rule(0.02, "of the force, up to which a declared noise is believed; chosen", 0.01, 0.05)

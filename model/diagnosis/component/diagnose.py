@@ -20,6 +20,7 @@ from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
 from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Lag
+from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.search import (
     Progress as Told,
 )
@@ -97,7 +98,8 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell(0.05, "channels, motion and noise")
-    records = component_records(system, record.values, record.sample_rate, options.train_share, options.rules)
+    own = tuple(law for law in options.catalogue if law not in CATALOGUE)
+    records = component_records(system, record.values, record.sample_rate, options.train_share, options.rules, own)
     judged = []
     for number, one in enumerate(records):
 
@@ -115,7 +117,7 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
     turned = _turned(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, tell=tell, given=one.given)
+    found = search(one.task, (*PIECES, *one.own), tell, one.given)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, final.floor, turned)
     alone = _only_one_loop(judged)
@@ -231,18 +233,17 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
     findings: list[Finding] = []
     for one in judged:
         findings += _findings(one)
-    findings.sort(key=_rank)
+    kinds = {f.effect: kind_named(f.effect, options.catalogue) for f in findings}
+    findings.sort(key=lambda f: _rank(f, kinds[f.effect]))
+    told = [f for f in findings if kinds[f.effect] is not EffectKind.NUISANCE]
     rules = replace(options.rules.verdict, carried=options.rules.component.named)
-    verdict = verdict_of([kind_named(f.effect) for f in findings], errors, rules)
-    explained = errors.explained(rules) if any(not _is_nuisance(f) for f in findings) else None
+    verdict = verdict_of([kinds[f.effect] for f in findings], errors, rules)
+    explained = errors.explained(rules) if told else None
     left = errors.unexplained(rules)
     names = [j.record.sensor for j in judged]
     words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
     advice = [note for j in judged for note in j.record.notes]
-    own = [law.name for law in options.catalogue if law not in CATALOGUE]
-    if own:
-        advice.append(f"component tests do not try laws of your own: {', '.join(own)}")
     return Report(
         system=system.name,
         recording=RecordingFacts(
@@ -263,20 +264,16 @@ def _report(system: System, record: Recorded, options: Options, judged: list[Jud
         laws=tuple(law for j in judged for law in _laws(j)),
         noise={j.record.sensor: j.record.task.noise for j in judged if j.record.task.noise > 0},
         unexplained=unexplained,
-        summary=_summary(verdict, findings, explained, unexplained),
+        summary=_summary(verdict, findings, told, explained, unexplained),
         advice=tuple(advice if verdict != "consistent" else []),
         evidence=_arrays(judged, record.sample_rate),
     )
 
 
-def _rank(finding: Finding) -> tuple[int, float]:
+def _rank(finding: Finding, kind: EffectKind) -> tuple[int, float]:
     """Set-up faults first, laws by evidence, nuisances last."""
-    order = {EffectKind.FAULT: 0, EffectKind.NUISANCE: 2}.get(kind_named(finding.effect), 1)
+    order = {EffectKind.FAULT: 0, EffectKind.NUISANCE: 2}.get(kind, 1)
     return order, finding.delta_bic if finding.delta_bic is not None else 0.0
-
-
-def _is_nuisance(finding: Finding) -> bool:
-    return kind_named(finding.effect) is EffectKind.NUISANCE
 
 
 def _findings(one: Judged) -> list[Finding]:
@@ -333,21 +330,23 @@ def _candidates(one: Judged) -> list[CandidateRow]:
     for step in one.found.steps:
         for ranked in (step.chosen, *step.rivals):
             delta = bic(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, int(ranked.count))
-            p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, 180)
+            p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, one.found.tests)
             rows.setdefault(
                 ranked.last.effect, CandidateRow(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
             )
     for effect, gain in one.found.screened.items():
-        rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, 180)))
+        rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, one.found.tests)))
     return list(rows.values())[:20]
 
 
-def _summary(verdict: str, findings: list[Finding], explained: float | None, left: Unexplained) -> str:
+def _summary(
+    verdict: str, findings: list[Finding], told: list[Finding], explained: float | None, left: Unexplained
+) -> str:
     if verdict == "consistent":
         text = "The nominal structure explains the recording down to the noise."
         nuisance = "; ".join(f.sentence for f in findings)
         return f"{text} {nuisance[:1].upper()}{nuisance[1:]}." if nuisance else text
-    text = "; ".join(f.sentence for f in findings if not _is_nuisance(f))
+    text = "; ".join(f.sentence for f in told)
     if not text:
         text = "No law of the catalogue explains what was measured"
     if explained is not None and explained > 0:
@@ -356,7 +355,7 @@ def _summary(verdict: str, findings: list[Finding], explained: float | None, lef
         text += f"; explains {exact} % of the excess error"
     if left.share > 0:
         text += f"; still unexplained: {left.where}"
-    nuisance = "; ".join(f.sentence for f in findings if _is_nuisance(f))
+    nuisance = "; ".join(f.sentence for f in findings if f not in told)
     return f"{text}{'; ' + nuisance if nuisance else ''}."
 
 

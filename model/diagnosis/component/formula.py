@@ -110,7 +110,9 @@ def formula_search(task: ComponentTask, given: ComponentModel) -> Search | None:
     if p_value > rules.alpha or chosen.fit.held_out >= base.held_out:
         return None
     step = Step(chosen, before, (), p_value)
-    return Search(refined(fine, base.model), refined(fine, chosen.fit.model), (step,), {EFFECT: chosen.gain})
+    return Search(
+        refined(fine, base.model), refined(fine, chosen.fit.model), (step,), {EFFECT: chosen.gain}, tests=len(single)
+    )
 
 
 def _worth(one: Ranked) -> float:

@@ -6,20 +6,24 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, spread
 from sprung.model.diagnosis.component.formula import given_piece
+from sprung.model.diagnosis.component.own import own_piece
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, Observed
 from sprung.model.laws.gas import PRELOAD
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
-def given_model(system: System, element: str, notes: list[str]) -> tuple[ComponentModel, tuple[PlacedLaw, ...]]:
+def given_model(
+    system: System, element: str, seen: Observed, notes: list[str]
+) -> tuple[ComponentModel, tuple[PlacedLaw, ...]]:
     """The laws of the system file at an element: with the shapes they have there, to be estimated anew; and those held.
 
-    Laws are held all of whose values the file fixes.  notes: gets a line for every law that is not as the file has it.
+    Laws are held all of whose values the file fixes.  seen: the element's motion.  notes: gets a line for every law
+    that is not as the file has it.
     """
     model, held = ComponentModel(), []
     for placed in system.laws:
@@ -33,7 +37,7 @@ def given_model(system: System, element: str, notes: list[str]) -> tuple[Compone
                 f"{element}: some values of {placed.law.name} are fixed in the system file, others not: component "
                 "tests hold all values of a law or none; none is held"
             )
-        piece, shape = _piece(placed)
+        piece, shape = _piece(placed, seen)
         if piece is None:
             notes.append(f"{element}: {placed.law.name} of the system file is left out: component tests do not fit it")
             continue
@@ -41,7 +45,7 @@ def given_model(system: System, element: str, notes: list[str]) -> tuple[Compone
     return model, tuple(held)
 
 
-def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
+def _piece(placed: PlacedLaw, seen: Observed) -> tuple[Piece | None, tuple[float, ...]]:
     if isinstance(placed.law, ElementLaw) and placed.law.of_formula:
         formula = given_piece(placed.law, placed.values)
         return formula, () if formula is None else formula.shape_of(placed.values)
@@ -50,7 +54,8 @@ def _piece(placed: PlacedLaw) -> tuple[Piece | None, tuple[float, ...]]:
             return piece, piece.shape_of(placed.values)
         if piece.acting is not None and piece.acting.name == placed.law.name:
             return piece, placed.values[1:]  # strength and time of a branch
-    return None, ()
+    own = own_piece(placed.law, seen) if isinstance(placed.law, ElementLaw) and placed.law.where == "element" else None
+    return own, () if own is None else own.shape_of(placed.values)
 
 
 def identified_laws(

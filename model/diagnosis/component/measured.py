@@ -20,8 +20,11 @@ from sprung.model.diagnosis.component.motion import (
     white_noise,
     without_gaps,
 )
+from sprung.model.diagnosis.component.own import observed, own_pieces
+from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
 from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
+from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate
 from sprung.model.schema import ElementSensor, SupportInput
 from sprung.model.signals import FloatArray
@@ -37,6 +40,7 @@ class ComponentRecord:
     task: ComponentTask
     notes: tuple[str, ...]
     given: ComponentModel = NO_LAWS  # laws of the system file
+    own: tuple[Piece, ...] = ()  # laws of the user's that are searched
 
 
 @dataclass(frozen=True)
@@ -97,10 +101,16 @@ def component_elements(system: System, held: set[str]) -> dict[str, str]:
 
 
 def component_records(
-    system: System, values: FloatArray, sample_rate: float, share: float, rules: Rules = RULES
+    system: System,
+    values: FloatArray,
+    sample_rate: float,
+    share: float,
+    rules: Rules = RULES,
+    laws: tuple[Law, ...] = (),
 ) -> list[ComponentRecord]:
     """The component tests in a recording's columns (T, C), in the order of `system.channels`.
 
+    laws: that are searched beside those of the catalogue.
     Errors: `DiagnosisError` when a channel is missing, `TooLittleError` when too little is left or nothing moves.
     """
     elements = component_elements(system, set())
@@ -110,7 +120,7 @@ def component_records(
             "supports) and a sensor {kind: force, element: ...} on it"
         )
     names = [channel.name for channel in (*system.channels, *system.signals)]
-    return [_record(system, values, names, sample_rate, e, s, share, rules) for e, s in elements.items()]
+    return [_record(system, values, names, sample_rate, e, s, share, rules, laws) for e, s in elements.items()]
 
 
 def _record(
@@ -122,6 +132,7 @@ def _record(
     sensor: str,
     share: float,
     rules: Rules,
+    laws: tuple[Law, ...],
 ) -> ComponentRecord:
     notes: list[str] = []
     displacement, velocity, left = _deflection(system, element, values, names, sample_rate, rules.component, notes)
@@ -153,7 +164,16 @@ def _record(
         )
     begin = (first + run.start) / sample_rate
     motion = element_motion(d[run], None if v is None else v[run], sample_rate, begin, rules.component)
-    given, held = given_model(system, element, notes)
+    stated = system.file.elements[element]
+    sizes = observed(motion, SpringDamper(stated.stiffness.value, stated.damping.value))
+    given, held = given_model(system, element, sizes, notes)
+    own, others = own_pieces(laws, element, sizes)
+    if others:
+        notes.append(
+            f"{element}: not searched here: {', '.join(others)}: a component test tries laws of an element whose force "
+            "is linear in `strength`, and follows from the motion alone or with the element's stiffness or damping as "
+            "a factor"
+        )
     task = ComponentTask(
         motion=motion.with_noise(left.deflection, left.rate),
         force=f[run],
@@ -165,7 +185,7 @@ def _record(
         declared=system.file.sensors[sensor].noise,
         held=held,
     )
-    return ComponentRecord(element, sensor, task, tuple(notes), given)
+    return ComponentRecord(element, sensor, task, tuple(notes), given, own)
 
 
 def _deflection(

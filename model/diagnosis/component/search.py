@@ -68,6 +68,7 @@ class Search:
     steps: tuple[Step, ...]
     screened: dict[str, float]  # law -> gain of its best trial alone, as screened
     alone: tuple[Ranked, ...] = ()  # models with one law, best first, named or not
+    tests: int = 1  # that a chance find could have passed
 
 
 def search(
@@ -81,6 +82,7 @@ def search(
     given: laws that the system file puts in place; what is found comes beside them.
     """
     rules = task.rules
+    tests = rules.trials_of_a_law * len(pieces)
     pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), LAG)
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
@@ -99,15 +101,15 @@ def search(
             alone = tuple(ranked)
             for trial in ranked:
                 screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
-        step = _accepted(current, ranked, base, rules)
+        step = _accepted(current, ranked, base, rules, tests)
         if step is None:
             break
         steps.append(step)
         current = _swapped(step.chosen, pieces, rules, len(given.pieces))
         if current is not step.chosen:  # an earlier law gives way to one that suits the later better
-            steps = _renamed(steps, current, len(given.pieces))
+            steps = _renamed(steps, current, len(given.pieces), tests)
     final = refined(fine, current.fit.model)
-    return Search(refined(fine, base.model), final, tuple(steps), screened, alone)
+    return Search(refined(fine, base.model), final, tuple(steps), screened, alone, tests)
 
 
 def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> tuple[LawPiece, ...]:
@@ -221,7 +223,9 @@ def _determined(fit: ComponentFit) -> bool:
     return all(told)
 
 
-def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules) -> Step | None:
+def _accepted(
+    current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules, tests: int
+) -> Step | None:
     """The next law, if there is one that is no chance, serves the held-out part and removes enough."""
     near = [
         r
@@ -243,7 +247,7 @@ def _accepted(current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: 
     chosen, before = _plainest(near, rules), current
     rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
-    p_value = chance(chosen.gain, freedom, len(PIECES) * 10)
+    p_value = chance(chosen.gain, freedom, tests)
     if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
         return None
     if len(before.fit.model.pieces) > 0:
@@ -289,7 +293,7 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     return best
 
 
-def _renamed(steps: list[Step], current: Ranked, given: int) -> list[Step]:
+def _renamed(steps: list[Step], current: Ranked, given: int, tests: int) -> list[Step]:
     """Steps of an exchanged model: every law against the model without it."""
     model = current.fit.model
     result = []
@@ -298,7 +302,7 @@ def _renamed(steps: list[Step], current: Ranked, given: int) -> list[Step]:
         gain = level_gain(without.error, current.fit.error, current.count)
         ranked = Ranked(without, 0.0, 0.0, current.count)
         piece = model.pieces[index]
-        p_value = chance(gain, len(piece.signs) + len(piece.shapes), len(PIECES) * 10)
+        p_value = chance(gain, len(piece.signs) + len(piece.shapes), tests)
         known = next((s for s in steps if s.chosen.last.effect == piece.effect), None)
         result.append(Step(current, ranked, known.rivals if known else (), p_value))
     return result

@@ -1,0 +1,127 @@
+"""Laws without a piece of their own in `pieces`, as a user's are: strength, shapes and trials by what the law states.
+
+A force that is linear in one parameter has that as its strength, and the others as shapes.  One that is linear in none
+gets a strength that has to come out as 1.  A force may be in proportion to the element's spring or damper, which are
+estimated beside it; what depends on both otherwise is no sum of columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from sprung.model.diagnosis.component.motion import ElementMotion
+from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, FittedPiece, Piece, Seen, Shape
+from sprung.model.laws import ElementLaw, Law, Observed, SpringDamper, observe
+from sprung.model.laws.along import force_along
+from sprung.model.signals import FloatArray
+
+_UNIT = SpringDamper(1.0, 1.0)
+_TINY = 1e-300
+
+Scale = Callable[[SpringDamper], float]  # N per strength that a force is in proportion to
+
+
+def observed(motion: ElementMotion, element: SpringDamper) -> Observed:
+    """Sizes of a component's motion as laws ask for them."""
+    d = motion.deflection - motion.middle
+    return observe(d, motion.rate, 1 / motion.step, element.stiffness, element.damping)
+
+
+def own_pieces(laws: Sequence[Law], element: str, seen: Observed) -> tuple[tuple[Piece, ...], tuple[str, ...]]:
+    """Pieces of the laws that can act at an element and be searched, and the names of the others."""
+    pieces, others = [], []
+    for law in laws:
+        if isinstance(law, ElementLaw) and law.at and element not in law.at:
+            continue
+        piece = own_piece(law, seen) if isinstance(law, ElementLaw) and law.where == "element" else None
+        others += [law.name] if piece is None else []
+        pieces += [] if piece is None else [piece]
+    return tuple(pieces), tuple(others)
+
+
+def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
+    """A law as a part of a component's force; None: its force is no sum of columns."""
+    trials = np.atleast_2d(np.asarray(law.shapes(seen), dtype=float))
+    scale = None if trials.shape[1:] != (len(law.parameters),) or not len(trials) else _scale(law, trials[0], seen)
+    if scale is None:
+        return None
+    strong, of_element = law.strength, scale
+    zero = 0.0 if strong is None else law.absent[strong]
+    others = [i for i in range(len(law.parameters)) if i != strong]
+
+    def parameters(strengths: FloatArray, shape: Shape, element: SpringDamper) -> tuple[float, ...]:
+        values = dict(zip(others, map(float, shape), strict=True))
+        if strong is not None:
+            values[strong] = zero + float(strengths[0]) / of_element(element)
+        return tuple(values[i] for i in range(len(law.parameters)))
+
+    def believed(fitted: FittedPiece) -> bool:
+        if not law.admits(tuple(fitted.values.values())):
+            return False
+        whole = float(fitted.strengths[0]) / of_element(fitted.element)
+        return strong is not None or abs(whole - 1) < fitted.rules.lost
+
+    def limits(sizes: Seen) -> list[tuple[float, float]]:
+        return [_limits(law, i, seen, sizes.reach) for i in others]
+
+    return Piece(
+        law=law,
+        shapes=tuple(law.parameters[i].name for i in others),
+        grid=lambda sizes: np.unique(trials[:, others], axis=0),
+        limits=limits,
+        signs=(1 if strong is None else _sign(law, strong),),
+        parameters=parameters,
+        shape_of=lambda values: tuple(float(values[i]) for i in others),
+        kind=HYSTERESIS if law.memory else STATIC,
+        plain=int(law.prior_cost > 0),
+        believed=believed,
+    )
+
+
+def _limits(law: ElementLaw, index: int, seen: Observed, reach: float) -> tuple[float, float]:
+    """Between which a shape is searched: what is admissible, `reach` times the usual size either way."""
+    spec = law.parameters[index]
+    size = abs(float(spec.typical(seen)))
+    if not np.isfinite(size) or size == 0.0:
+        size = 1.0
+    low = max(spec.low, size / reach if spec.low >= 0 else -size * reach)
+    high = min(spec.high, size * reach)
+    return (low, high) if low < high else (spec.low, spec.high)
+
+
+def _sign(law: ElementLaw, index: int) -> int:
+    """Which way its strength may go from where the law is absent: 1, -1, 0 for either."""
+    spec, zero = law.parameters[index], law.absent[index]
+    return int(spec.low >= zero) - int(spec.high <= zero)
+
+
+def _scale(law: ElementLaw, values: FloatArray, seen: Observed) -> Scale | None:
+    """What the force is in proportion to, besides its strength; None: not linear in that, or in both of the element.
+
+    Tried along two swings of the size that was observed.
+    """
+    swing = np.linspace(0.0, 4 * np.pi, 81)
+    d, v = seen.deflection_rms * np.sqrt(2) * np.sin(swing), seen.rate_rms * np.sqrt(2) * np.cos(swing)
+    time = swing * seen.deflection_rms / max(seen.rate_rms, _TINY)
+
+    def force(element: SpringDamper, factor: float = 1.0) -> FloatArray:
+        with np.errstate(all="ignore"):
+            found = force_along(law, tuple(law.scaled(values.tolist(), factor)), d, v, time, element)
+        return np.broadcast_to(np.asarray(found, dtype=float), d.shape)
+
+    def same(one: FloatArray, other: FloatArray) -> bool:
+        return bool(np.allclose(one, other, rtol=1e-6, atol=1e-9 * float(np.max(np.abs(other), initial=0.0))))
+
+    whole = force(_UNIT)
+    if not np.all(np.isfinite(whole)) or (law.strength is not None and not same(force(_UNIT, 2.0), 2.0 * whole)):
+        return None
+    stiffer, damped = force(SpringDamper(2.0, 1.0)), force(SpringDamper(1.0, 2.0))
+    if same(stiffer, whole) and same(damped, whole):
+        return lambda element: 1.0
+    if same(stiffer, 2.0 * whole) and same(damped, whole):
+        return lambda element: max(float(element.stiffness), _TINY)
+    if same(damped, 2.0 * whole) and same(stiffer, whole):
+        return lambda element: max(float(element.damping), _TINY)
+    return None
