@@ -202,6 +202,9 @@ class SetupRules:
         0.7, "of what it leaves, that a missing part leaves instead; chosen: noise is in both", 0.4, 0.9
     )
     latest: float = rule(0.5, "s, of a node; derived: later, a node is another recording", 0.3, 1.0)
+    late_share: float = rule(
+        0.125, "of what is fitted, that a delay may be; derived: as much is lost at either end", 0.06, 0.2
+    )
     scale: float = rule(1.3, "ratio from which a scale is wrong; derived: less is a sensor's gain", 1.2, 1.5)
     offset: float = rule(0.1, "m, from which a position is wrong; derived: less is a mounting tolerance", 0.05, 0.2)
     rounds: int = rule(2, "in which an accepted delay or scale is estimated again; chosen", 1, 4)

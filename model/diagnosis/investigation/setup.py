@@ -23,6 +23,7 @@ from sprung.model.diagnosis.investigation.setup_hypotheses import hypotheses
 from sprung.model.diagnosis.investigation.setup_response import ModelResponse, relative
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
+from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.record.stretch import liveliest
 from sprung.model.diagnosis.response.forward import Forward
@@ -133,7 +134,7 @@ def _best(
             try:
                 fitted = fitted_samples(signals, mended, split)
                 other, again = baseline(changed, mended, declared, fitted, problem.rules, problem.memory)
-            except (ValueError, FloatingPointError):
+            except DiagnosisError:
                 continue
             left = _left(again)
             if left < rules.explains * total:
@@ -164,9 +165,11 @@ def _seen_on_a_stretch(
 
     def left(hypothesis: Hypothesis | None) -> float:
         changed, mended = (system, stretch) if hypothesis is None else hypothesis.undo(system, stretch)
+        if 2 * mended.samples < stretch.samples:
+            return 0.0  # a delay that takes most of it: only the whole recording tells
         try:
             return _left(baseline(changed, mended, declared, mended.samples, problem.rules, roughly=True)[1])
-        except (ValueError, FloatingPointError):
+        except DiagnosisError:
             return np.inf
 
     most = rules.on_a_stretch * left(None)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.record.signals import Signals
-from sprung.model.schema import Element, MotionSensor, SystemFile
+from sprung.model.schema import Element, MotionSensor
 from sprung.model.system import System
 
 Undo = Callable[[System, Signals], tuple[System, Signals]]
@@ -85,8 +85,9 @@ def advance(sensors: Sequence[int], supports: Sequence[int], late: float, forces
     return undo
 
 
-def _with_part(file: SystemFile, kind: str, name: str, part: Element | MotionSensor) -> System:
-    return System(file.model_copy(update={kind: {**getattr(file, kind), name: part}}))
+def _with_part(system: System, kind: str, name: str, part: Element | MotionSensor) -> System:
+    """The system with a part of its file exchanged, its catalogue of laws kept."""
+    return replace(system, file=system.file.model_copy(update={kind: {**getattr(system.file, kind), name: part}}))
 
 
 def moved_sensor(system: System, name: str, axis: int, offset: float) -> System:
@@ -95,7 +96,7 @@ def moved_sensor(system: System, name: str, axis: int, offset: float) -> System:
     assert isinstance(sensor, MotionSensor)
     position = list(sensor.position or system.file.bodies[sensor.body].position)
     position[axis] += offset
-    return _with_part(system.file, "sensors", name, sensor.model_copy(update={"position": (position[0], position[1])}))
+    return _with_part(system, "sensors", name, sensor.model_copy(update={"position": (position[0], position[1])}))
 
 
 def moved_element(system: System, name: str, axis: int, offset: float) -> System:
@@ -103,14 +104,12 @@ def moved_element(system: System, name: str, axis: int, offset: float) -> System
     element = system.file.elements[name]
     position = list(element.position or (0.0, 0.0))
     position[axis] += offset
-    return _with_part(
-        system.file, "elements", name, element.model_copy(update={"position": (position[0], position[1])})
-    )
+    return _with_part(system, "elements", name, element.model_copy(update={"position": (position[0], position[1])}))
 
 
 def attached(system: System, name: str, end: str, to: str) -> System:
     """The system with one end of an element at something else."""
-    return _with_part(system.file, "elements", name, system.file.elements[name].model_copy(update={end: to}))
+    return _with_part(system, "elements", name, system.file.elements[name].model_copy(update={end: to}))
 
 
 def in_system(change: Callable[[System], System]) -> Undo:

@@ -177,7 +177,7 @@ def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
                 continue
         elif count < 2:
             continue
-        late = one.delay(group, rules.latest)
+        late = one.delay(group, rules)
         if late > 0:
             yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, one.left(one.late(group, late)))
 
@@ -209,9 +209,9 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
         Group(tuple(range(len(wired.sensors)))),
         Group((), (), tuple(range(len(wired.signals.force_names)))),
     )
-    late = inert.delay(sensors, rules.latest)
+    late = inert.delay(sensors, rules)
     group = sensors if late > 0 else forces
-    late = late if late > 0 else inert.delay(forces, rules.latest)
+    late = late if late > 0 else inert.delay(forces, rules)
     if late > rules.soonest * one.step and inert.left(inert.late(group, late)) < rules.by_mass * before:
         left = one.left(one.late(group, late))
         yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, left, by_mass=True)
@@ -261,7 +261,7 @@ def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterat
     """Gain and lag of single sensors: no faults of a set-up, but what a position may be mistaken for."""
     for i, name in enumerate(map(str, signals.sensor_names)):
         site = SetupPlace(name, group := Group((i,)))
-        ratio, late = one.ratio(group), one.delay(group, rules.latest)
+        ratio, late = one.ratio(group), one.delay(group, rules)
         if ratio > 0:
             yield Hypothesis.of(ONE_GAIN, site, ratio, one.left(one.scaled(group, ratio)))
         yield Hypothesis.of(ONE_LAG, site, late, one.left(one.late(group, late)))

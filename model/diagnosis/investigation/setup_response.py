@@ -11,6 +11,7 @@ from scipy.optimize import minimize_scalar
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.rules import SetupRules
 from sprung.model.signals import FloatArray
 
 
@@ -127,7 +128,7 @@ class ModelResponse:
         s = self.forward.plant.structure
         return float(np.sqrt(np.max(np.abs(np.linalg.eigvals((s.H.T * s.stiffness) @ s.H / s.mass[:, None])))))
 
-    def delay(self, group: Group, latest: float) -> float:
+    def delay(self, group: Group, rules: SetupRules) -> float:
         """The delay of a group that leaves the least misfit, s: the best of all whole samples, then between them."""
         weight = 1 / np.sqrt(self.size)
         driven, shown, at = self._of(group), self.shown, list(group.sensors)
@@ -142,7 +143,7 @@ class ModelResponse:
         full = np.zeros(self.samples // 2 + 1, dtype=complex)
         full[1 : len(shown) + 1] = (product * weight**2).sum(axis=1)
         agree = np.fft.irfft(full, self.samples)
-        reach = min(int(latest / self.step), self.samples // 2 - 1)
+        reach = int(min(rules.latest / self.step, rules.late_share * self.samples))
         lags = np.arange(-reach, reach + 1)
         best = float(lags[int(np.argmax(agree[lags]))]) * self.step
         found = minimize_scalar(

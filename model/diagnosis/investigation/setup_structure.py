@@ -22,7 +22,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.rules import SetupRules
 from sprung.model.diagnosis.screening.structures import turns
-from sprung.model.schema import SystemFileError
+from sprung.model.schema import ForceInput
 from sprung.model.system import System
 
 
@@ -50,16 +50,17 @@ def _elsewhere(scores: SetupScores, system: System, name: str, rules: SetupRules
 
 
 def _attached(scores: SetupScores, system: System, name: str, rules: SetupRules) -> Iterator[Hypothesis]:
-    element = system.file.elements[name]
+    element, inputs = system.file.elements[name], system.file.inputs
+    supports = [one for one, source in inputs.items() if not isinstance(source, ForceInput)]
     for end in ("upper", "lower"):
         now, other = getattr(element, end), getattr(element, {"upper": "lower", "lower": "upper"}[end])
-        others = [*system.bodies, "ground"] if now in (*system.bodies, "ground") else list(system.file.inputs)
+        others = [*system.bodies, "ground"] if now in (*system.bodies, "ground") else supports
         for to in others:
             if to in (now, other):
                 continue
             try:
                 found = scores.of_system(changes.attached(system, name, end, to), name)
-            except (SystemFileError, ValueError, np.linalg.LinAlgError):
+            except np.linalg.LinAlgError:  # what nothing holds
                 continue
             if found.amount > rules.asked:
                 site = SetupPlace(name, detail=f"{end} {to}")

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.investigation.setup_changes import attached
 from sprung.model.diagnosis.investigation.setup_effects import (
     ELEMENT_POSITION,
     NODE_DELAY,
@@ -17,9 +21,15 @@ from sprung.model.diagnosis.investigation.setup_effects import (
     SetupPlace,
 )
 from sprung.model.diagnosis.investigation.setup_response import Group
+from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.record.channels import prepare
-from sprung.model.system import load_system
+from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.laws import CATALOGUE
+from sprung.model.laws.damping import COULOMB_FRICTION
+from sprung.model.system import load_system, parse_system
+from tests.diagnosis_cases import SYSTEM as QUARTER_CAR
 from tests.diagnosis_cases import quarter_car, simulate
 
 
@@ -58,6 +68,25 @@ def test_a_delay_is_taken_back_and_positions_move_in_the_file() -> None:
         assert same is signals and effect.name == "wrong_position"
         before, after = (getattr(one.file, kind)[name].position for one in (train, moved))
         assert after[1] - before[1] == pytest.approx(0.25) and after[0] == before[0]
+
+
+def test_a_changed_system_knows_the_laws_of_a_user_still() -> None:
+    own = replace(COULOMB_FRICTION, name="squeak")
+    text = QUARTER_CAR.replace("damping: 2.0e+4", "damping: 2.0e+4, laws: [{squeak: {force: 300, smoothing: 2e-3}}]")
+    system = parse_system(text, catalogue=(*CATALOGUE, own))
+    changed = attached(system, "secondary", "lower", "ground")
+    assert [one.law for one in changed.laws] == [one.law for one in system.laws] == [own]
+
+
+def test_an_element_is_never_taken_to_end_at_a_measured_force() -> None:
+    text = QUARTER_CAR.replace("inputs:\n", "inputs:\n  push: {kind: force, body: car, csv: p, noise: 1.0}\n")
+    system, record = parse_system(text), simulate(seconds=5)
+    values = np.column_stack([np.random.default_rng(1).normal(0.0, 50.0, len(record.values)), record.values])
+    signals = prepare(system, values, 100.0).signals
+    problem, fit = baseline(system, signals, declared_noise(system, signals), signals.samples)
+    wrong = structure_hypotheses(problem, fit, replace(RULES.setup, asked=-np.inf))
+    ends = {one.site.detail for one in wrong if one.effect.name == "wrong_body"}
+    assert ends and not any("push" in end for end in ends)
 
 
 def test_what_has_no_value_is_not_undone_by_one() -> None:
