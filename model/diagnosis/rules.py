@@ -165,6 +165,9 @@ class FormulaRules:
     fitted: int = rule(6, "single shapes, and pairs, that are fitted; chosen", 3, 9)
     slack: float = rule(15.0, "evidence behind the unnamed force; chosen: what a formula costs more", 8.0, 25.0)
     beyond: float = rule(1.1, "times what a preferred named law explains; chosen", 1.05, 1.3)
+    likelier: float = rule(
+        30.0, "evidence by which a formula beats a listed law that leaves noise; chosen: a law is expected", 20.0, 60.0
+    )
     leaves: float = rule(
         0.02, "of the misfit beyond noise, that a formula may leave; derived: a force 15 % off leaves 0.022", 0.01, 0.1
     )

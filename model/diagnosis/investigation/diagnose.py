@@ -35,6 +35,7 @@ from sprung.model.diagnosis.screening.families import INPUT
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
+from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
 from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
@@ -249,15 +250,15 @@ def _with_formula(state: Investigation, plain: list[Trial], trials: list[Trial])
     """Trials led by the formula of the force that leads by evidence where that has no name; a note where none is found.
 
     A named law that was preferred to an unnamed force, or that leaves much of what there was, makes way only for a
-    formula that explains more than it does.
+    formula that explains more than it does; one that leaves little, but says less than the unnamed force, for a formula
+    that is far more likely.
     """
     leader = _led_by(state, plain)
     if leader is None or state.problem.process_noise:
         return trials, ()
     with np.errstate(all="ignore"):  # trial formulas overflow
         formula, reason = formula_of(state.problem, state.fit, leader, state.held)
-    beyond = state.options.rules.formula.beyond
-    if formula is not None and (not trials[0].named or formula.explains > beyond * trials[0].explains):
+    if formula is not None and _makes_way(state, trials[0], formula):
         return [formula, *(trial for trial in trials if trial is not leader or trial.named)], ()
     if formula is not None or trials[0].named:
         return trials, ()
@@ -265,18 +266,32 @@ def _with_formula(state: Investigation, plain: list[Trial], trials: list[Trial])
     return trials, (f"{place}: surface only; {reason}",)
 
 
+def _makes_way(state: Investigation, leader: Trial, formula: Trial) -> bool:
+    """Whether the leader makes way for a formula."""
+    rules = state.options.rules.formula
+    if not leader.named or formula.explains > rules.beyond * leader.explains:
+        return True
+    settled = left(state.problem, leader.fit) == 0
+    return settled and formula.evidence > leader.evidence + rules.likelier
+
+
 def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
     """The trial whose force a formula may be of; None: there is none.
 
-    The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much.
+    The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much,
+    or says less than that force by more than chance.
     """
-    if not plain[0].named:
-        return plain[0]
-    leaves = state.options.rules.formula.leaves * left(state.problem, state.fit)
-    if left(state.problem, plain[0].fit) <= leaves:
-        return None
-    single = (one for one in plain if is_waveform(one.term) and one.term.location in state.system.elements)
-    return next(single, None)
+    leader, rules = plain[0], state.options.rules.formula
+    if not leader.named:
+        return leader
+    forces = [one for one in plain if is_waveform(one.term) and one.term.location in state.system.elements]
+    if left(state.problem, leader.fit) > rules.leaves * left(state.problem, state.fit):
+        return next(iter(forces), None)
+    for force in forces:
+        if not force.named and leader.gain < rules.says * force.gain:
+            luck = chance(force.gain - leader.gain, max(1, force.freedom - leader.freedom), 1)
+            return force if luck < state.options.alpha else None
+    return None
 
 
 def _smoother(state: Investigation, fit: Fit) -> Fit:

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation.diagnose import _led_by
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.own import load_laws
 from sprung.model.system import parse_system
@@ -47,6 +54,35 @@ def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop():
     (finding,) = diagnose(quarter_car(), record, Options()).findings
     assert finding.formula == "a * max(-d - L, 0)"
     assert [p.value for p in finding.parameters] == pytest.approx([-1.5e6, 0.002], rel=0.01)
+
+
+@pytest.mark.slow
+def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop():
+    """A stop leaves no more than noise may leave, and yet far more than the formula does."""
+    record = simulate(lambda d, v: -6.44e4 * d / (1 + (d / 3.7e-3) ** 2), seconds=40.0, seed=3)
+    (finding,) = diagnose(quarter_car(), record, Options()).findings
+    assert (finding.location, finding.effect) == ("secondary", "formula")
+
+
+@pytest.mark.parametrize(("gain", "expected"), [(1000.0, False), (1020.0, False), (1100.0, True)])
+def test_a_named_law_is_questioned_where_a_free_force_says_more_by_more_than_chance(gain, expected):
+    fit = SimpleNamespace(reduced=0.9, count=10_000)
+
+    def trial(law, gain, freedom):
+        term = Term(law, "secondary", tuple(1.0 for _ in law.parameters))
+        point = SimpleNamespace(terms=(term,))
+        return Trial(None, SimpleNamespace(point=point, **vars(fit)), gain, gain, gain, freedom)
+
+    (stop,) = (law for law in CATALOGUE if law.name == "bump_stop")
+    force = replace(stop, named=False)
+    state = SimpleNamespace(
+        options=Options(),
+        problem=SimpleNamespace(rules=RULES, process_noise=False),
+        fit=SimpleNamespace(reduced=2.0, count=10_000),
+        system=quarter_car(),
+    )
+    leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
+    assert _led_by(state, [leader, unnamed]) is (unnamed if expected else None)
 
 
 def test_a_law_of_the_catalogue_stays_one():
