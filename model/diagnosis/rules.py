@@ -81,6 +81,10 @@ class ScreeningRules:
     harmonics: int = rule(2, "that are seen; derived: one alone is a line", 2, 3)
     reach: int = rule(24, "bins; derived: a median of 49 knows the level to 18 %", 12, 48)
     colour: float = rule(2.5, "by which exact columns may raise a score; chosen", 1.5, 4.0)
+    per_freedom: float = rule(2.0, "score of every further parameter; derived: Akaike's", 1.0, 4.0)
+    of_shapes: float = rule(4.0, "score by chance, of the shapes of an unnamed force; derived: 2 log 7", 2.0, 6.0)
+    of_places: float = rule(9.0, "the same of the places of a missing part; derived: 2 log 100", 7.0, 12.0)
+    of_lines: float = rule(22.0, "the same of frequencies and phases; derived: 2 log 60 000", 18.0, 26.0)
     lowest_mode: float = rule(1.0, "Hz; derived: below, an elastic mode is a rigid one of a train's body", 0.5, 2.0)
     highest_mode: float = rule(0.4, "of the sample rate; derived: there anti-alias filters cut", 0.3, 0.45)
 
@@ -95,6 +99,7 @@ class EvidenceRules:
     plainly: float = rule(1.2, "ratio of what two fits leave; derived: white noise gives 1.02", 1.05, 1.5)
     log_width: float = rule(4.6, "derived: the logarithm of a factor of 100, an unknown order", 2.3, 9.2)
     widths: float = rule(4.0, "sizes at which a parameter matters; chosen", 2.0, 8.0)
+    rarity: float = rule(1.0, "times the evidence that rare laws state to need; derived: 12 is odds of 400", 0.5, 1.5)
     unusual: float = rule(4.0, "evidence for a factor e outside the usual range; chosen", 2.0, 8.0)
 
 
@@ -187,6 +192,7 @@ class NoiseRules:
     inaccuracy: float = rule(0.05, "of the power that findings changed, which they may have wrong; chosen", 0.02, 0.1)
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
     white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)
+    bins: int = rule(20, "above the band, that tell noise; derived: their level is known to 20 %", 10, 40)
     displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
     velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
 
@@ -249,6 +255,7 @@ class ReportRules:
     naming_margin: float = rule(6.0, "evidence over look-alikes to be named alone; derived: odds of 20 to 1", 3.0, 10.0)
     changed: float = rule(0.25, "from nominal, at which a parameter is listed as changed; chosen", 0.15, 0.4)
     sure: float = rule(5.0, "deviations of a change that is told; derived: no chance in any of 24 values", 4.0, 6.0)
+    no_longer: float = rule(10.0, "times, by which what stood for a finding was read too high; chosen", 5.0, 20.0)
     alike: float = rule(0.5, "correlation from which a sign or scale is a likely reason; chosen", 0.3, 0.7)
     scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
     far: float = rule(1.6, "log-ratio to nominal; chosen: a factor of 5, no rebuilt vehicle is as far off", 1.1, 2.3)

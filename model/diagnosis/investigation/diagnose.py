@@ -185,7 +185,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
             and harmonic(state.problem.part, h.term, plausible) is None
         ]
 
-    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules.selection))
+    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules))
     if not hits:
         return state
     share = 0.25 + 0.17 * number

@@ -45,7 +45,7 @@ def upper_ratio(state: Investigation, declared: np.ndarray) -> np.ndarray:
     """Residual over declared noise above the compared band, up to where anti-alias filters cut, per sensor."""
     grid, plant = state.problem.part.grid, state.fit.forward.plant
     upper = slice(grid.band.stop, int(state.options.rules.noise.upper * grid.samples))
-    if upper.stop - upper.start < 20:
+    if upper.stop - upper.start < state.options.rules.noise.bins:
         return np.full(len(declared), np.inf)
     variance = state.problem.noise.support_variance(grid.omega[upper])
     through = np.einsum("fsi,fi->fs", np.abs(plant.sensor_of_support[upper]) ** 2, variance).mean(axis=0)

@@ -10,8 +10,6 @@ from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import StructureLaw
 
-_NO_LONGER = 900.0  # %, of a value that stood for something else
-
 
 def with_deviation(parameter: LawParameter) -> str:
     """395 +- 6 N, to the digits that the deviation supports."""
@@ -59,6 +57,6 @@ def _worst_bias(outcome: Outcome) -> str | None:
         return None
     change = 100 * (np.exp(shift[worst]) - 1)
     side = "high" if change > 0 else "low"
-    if change > _NO_LONGER:
+    if np.exp(shift[worst]) > course.options.rules.report.no_longer:
         return f"{course.system.parameters[worst].name} is then no longer needed"
     return f"without it {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"

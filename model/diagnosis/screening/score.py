@@ -19,6 +19,7 @@ from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES, ScreeningRules
 from sprung.model.diagnosis.screening.families import Family
 from sprung.model.signals import FloatArray
 
@@ -43,10 +44,9 @@ class Candidate:
         """Chance of such a score if this alone had been tried."""
         return float(chdtrc(self.freedom, self.score))
 
-    @property
-    def strength(self) -> float:
+    def strength(self, rules: ScreeningRules = RULES.screening) -> float:
         """Score less what chance gives: comparable between families."""
-        return self.score - 2.0 * (self.freedom - 1) - self.family.look_elsewhere
+        return self.score - rules.per_freedom * (self.freedom - 1) - self.family.look_elsewhere(rules)
 
     @property
     def location(self) -> str:

@@ -16,7 +16,7 @@ from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.rules import RULES, EvidenceRules, SelectionRules
+from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.evidence import (
     bic,
@@ -64,29 +64,27 @@ class Trial:
         return bic(self.gain, len(self.term.parameters), self.fit.count)
 
 
-def shortlist(
-    screening: Screening, alpha: float, multiplicity: bool = True, rules: SelectionRules = RULES.selection
-) -> list[Candidate]:
+def shortlist(screening: Screening, alpha: float, multiplicity: bool = True, rules: Rules = RULES) -> list[Candidate]:
     """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
     good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
         return []
-    good.sort(key=lambda h: h.strength, reverse=True)
-    top = good[0].strength
+    good.sort(key=lambda h: h.strength(rules.screening), reverse=True)
+    top, screened, chosen_by = good[0].strength(rules.screening), rules.screening, rules.selection
     place = good[0].location
     chosen: list[Candidate] = []
     unnamed: dict[str, int] = {}
     for hit in good:
-        s = hit.strength
-        share = rules.close if hit.location == place else rules.close_elsewhere
-        if s < share * top and s < top - rules.near:
+        s = hit.strength(screened)
+        share = chosen_by.close if hit.location == place else chosen_by.close_elsewhere
+        if s < share * top and s < top - chosen_by.near:
             continue
         if not hit.term.law.named:
             unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
-            if unnamed[hit.location] > rules.unnamed:
+            if unnamed[hit.location] > chosen_by.unnamed:
                 continue
         chosen.append(hit)
-        if len(chosen) >= rules.most:
+        if len(chosen) >= chosen_by.most:
             break
     return chosen
 
@@ -102,10 +100,11 @@ def compete(
     places = sorted({hit.location for hit in hits})
     progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
 
-    again = rules.again * max((hit.strength for hit in hits), default=0.0)
+    screened = problem.rules.screening
+    again = rules.again * max((hit.strength(screened) for hit in hits), default=0.0)
 
     def begun(chosen: list[Candidate]) -> list[Trial]:
-        tried = share(lambda hit: _begun(problem, base, hit, hit.strength > again), chosen, WORKERS)
+        tried = share(lambda hit: _begun(problem, base, hit, hit.strength(screened) > again), chosen, WORKERS)
         return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
@@ -155,8 +154,9 @@ def runner_up(problem: Problem, base: Fit, hits: list[Candidate], chosen: Trial,
     if rivals:
         return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
     fitted = {t.hit.term.key for t in tried}
+    rules = problem.rules
     others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
-    for hit in sorted(others, key=lambda h: h.strength, reverse=True)[: problem.rules.selection.further]:
+    for hit in sorted(others, key=lambda h: h.strength(rules.screening), reverse=True)[: rules.selection.further]:
         trial = _begun(problem, base, hit)
         if trial is not None and trial.gain > 0:
             return replace(trial, finished=False)
@@ -240,7 +240,7 @@ def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float 
     else:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
-    dear = cost(fit, len(hit.term.parameters), rules) + hit.term.law.prior_cost
+    dear = cost(fit, len(hit.term.parameters), rules) + rules.rarity * hit.term.law.prior_cost
     freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(hit, fit, gain, worth, gain - dear, freedom)
 

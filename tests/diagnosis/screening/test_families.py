@@ -29,7 +29,7 @@ def test_freedom_of_a_score_is_its_familys(family, count, freedom):
 
 
 def test_searched_frequencies_make_a_score_count_for_less():
-    assert candidate(40.0, HARMONIC).strength < candidate(40.0, SENSOR).strength
+    assert candidate(40.0, HARMONIC).strength() < candidate(40.0, SENSOR).strength()
 
 
 def test_chances_are_multiplied_by_what_was_tried():
