@@ -104,6 +104,7 @@ def run(
     budget: Literal["quick", "cases", "full"] = "quick",
     seed: int = 4711,
     stage: str = "",
+    cases: str = "",
     count: int = 0,
     seconds: float = 0.0,
     folder: Path | None = None,
@@ -112,21 +113,24 @@ def run(
 ) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, one per number, and the totals.
 
-    budget: `quick` has 8 recordings of a quarter car and a rig of 15 s and a tower, `cases` 28, with weak effects and
-    more kinds of faults, `full` 40 of the bundled vehicle of 60 s; count and seconds say otherwise.
-    stage: of the rules, if only one is asked for.
+    budget: `quick` has 8 recordings of a quarter car and a rig of 15 s, `cases` 28, with weak effects and more kinds of
+    faults, `full` 40 of the bundled vehicle of 60 s; count and seconds say otherwise.  All have structures and rigs
+    besides, each with something of its own (`sensitivity_cases.PARTICULAR` and on).
+    stage: of the rules, or numbers as `stage.name`, separated by commas, if not all are asked for.
+    cases: parts of the names of recordings, separated by commas, if not all are asked for.
     folder: where numbers that are done are kept; on the same recording and engine they are not varied again.
     part: "2/3": only every third recording, the second first, for processes beside each other with one folder.
     write: file for what was found, which the reasons of the rules quote; what it knows of more recordings stays.
     """
     count = count or {"quick": 8, "cases": 28, "full": 40}[budget]
     seconds = seconds or (60.0 if budget == "full" else 15.0)
-    keys = [(name, one) for name, one in RULES.constants() if stage in ("", name)]
+    asked, names = ([one for one in text.split(",") if one] for text in (stage, cases))
+    keys = [(n, one) for n, one in RULES.constants() if not asked or n in asked or f"{n}.{one.name}" in asked]
     settings = [budget, seed, count, seconds, engine_digest()]
     own, parts = (int(x) for x in part.split("/"))
     began, done = time.process_time(), []
     for number, (name, system, record) in enumerate(recordings(budget, count, seconds, seed)):
-        if number % parts != own - 1:
+        if number % parts != own - 1 or (names and not any(one in name for one in names)):
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
         told = _told(name, system, record, keys, file, settings)
@@ -214,10 +218,10 @@ def quoted(
     """What the reasons of the rules say of a run, as JSON of a line per number: what is said otherwise at which end.
 
     before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that, and so
-    do numbers of stages that this run did not vary.
+    do numbers that this run did not vary.
     """
-    stages = {line["stage"] for line in lines}
-    numbers = {name: found for name, found in (before or {}).items() if name.split(".")[0] not in stages} | {
+    asked = {f"{line['stage']}.{line['number']}" for line in lines}
+    numbers = {name: found for name, found in (before or {}).items() if name not in asked} | {
         f"{line['stage']}.{line['number']}": {
             "varied": [line["value"], *line["range"]],
             "recordings": line["recordings"],

@@ -1,12 +1,15 @@
 """Recordings on which deciding numbers are varied: quarter cars, the bundled vehicle, component tests.
 
 Laws strong, and weak enough that a report says so; faults of sensors and of inputs; wrong set-ups; healthy ones.
+Some are there for what only they have: a high sampling rate, a force of no law, a part that the file lacks, a shaker
+whose sensors are exchanged.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import yaml
@@ -65,6 +68,20 @@ sensors:
   a1: {kind: acceleration, body: one, noise: 0.001}
   a2: {kind: acceleration, body: two, noise: 0.001}
 """
+SHAKEN = """
+name: shaken
+sample_rate: 50
+window: 200
+bodies: {f1: {mass: {value: 4000.0, fixed: true}}, f2: {mass: {value: 4000.0, fixed: true}}}
+inputs: {shaker: {kind: force, body: f2, csv: F, noise: 5}}
+elements:
+  s1: {upper: f1, lower: ground, stiffness: 2.0e+6, damping: 8.0e+3}
+  s2: {upper: f2, lower: f1, stiffness: 2.0e+6, damping: 8.0e+3}
+sensors:
+  a1: {kind: acceleration, body: f1, csv: a1, noise: 0.003}
+  b1: {kind: acceleration, body: f1, csv: b1, noise: 0.003}
+  a2: {kind: acceleration, body: f2, csv: a2, noise: 0.003}
+"""
 WHEEL, VELOCITY, CAR_A, CAR_B, BOGIE_A = range(5)  # columns of its recordings
 
 
@@ -74,8 +91,10 @@ class QuarterCarCase:
 
     name: str
     where: tuple[str, str] | None = None  # part of the system file
-    law: dict[str, dict[str, float]] | None = None
+    law: dict[str, dict[str, Any]] | None = None
     wrong: Callable[[FloatArray], None] | None = None  # changes the recorded channels (T, C) in place
+    rate: float = RATE  # Hz
+    also: QuarterCarCase | None = None  # what is wrong besides
 
 
 def _scaled(column: int, factor: float) -> Callable[[FloatArray], None]:
@@ -99,6 +118,11 @@ def _noisy(values: FloatArray) -> None:
 
 def _law(name: str, part: str, law: str, **values: float) -> QuarterCarCase:
     return QuarterCarCase(name, ("elements", part), {law: values})
+
+
+def _hung(part: str, mass: float, frequency: float) -> QuarterCarCase:
+    values = {"mass": mass, "frequency": frequency, "damping_ratio": 0.04, "x": 0.0, "y": 0.0}
+    return QuarterCarCase(f"mass below {part}", ("bodies", part), {"suspended_mass": values})
 
 
 CASES = (
@@ -130,8 +154,19 @@ CASES = (
 )
 
 
+PARTICULAR = (
+    QuarterCarCase("fast", ("elements", "secondary"), CASES[0].law, rate=1000.0),
+    QuarterCarCase(
+        "no law", ("elements", "secondary"), {"formula": {"formula": "a * v * abs(d) / (0.01 + abs(d))", "a": 2e4}}
+    ),
+    _hung("car", 900.0, 6.0),
+    replace(_hung("car", 900.0, 6.0), name="two masses", also=_hung("bogie", 150.0, 14.0)),
+    QuarterCarCase("noise", wrong=_noisy),
+)
+
+
 def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
-    """Of a vehicle, wrong set-ups among them, then component tests and a tower; budget: quick, cases or full."""
+    """Of a vehicle, wrong set-ups among them, then component tests and structures; budget: quick, cases or full."""
     rigs = max(1, count // 8)
     made = _vehicles if budget == "full" else quarter_cars
     for number, (what, system, record) in enumerate(made(count - rigs, seconds, seed)):
@@ -139,6 +174,11 @@ def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[t
     for number in range(rigs):
         yield f"rig-{number}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2 + number))
     yield "tower", parse_system(TOWER), tower(np.random.default_rng(seed + 1))
+    for number, case in enumerate(PARTICULAR):
+        yield case.name, *quarter_car(case, seconds, np.random.default_rng(seed + 100 + number))
+    for name, imperfect in IMPERFECT.items():
+        yield f"rig {name}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2), imperfect)
+    yield "shaken, exchanged", parse_system(SHAKEN), shaken(np.random.default_rng(seed + 3))
 
 
 def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
@@ -159,37 +199,87 @@ def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Syst
 
 def quarter_cars(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
     """A quarter car on a road of random phases, whose parameters differ from the file's by 8 %."""
-    system = parse_system(QUARTER_CAR)
     for number in range(count):
-        random = np.random.default_rng(seed + number)
         case = CASES[number % len(CASES)]
-        file = yaml.safe_load(QUARTER_CAR)
-        if case.where is not None:
-            file[case.where[0]][case.where[1]]["laws"] = [case.law]
-        time = np.arange(round(seconds * RATE)) / RATE
-        f, phase = np.linspace(0.5, 18, 160), random.uniform(0, 2 * np.pi, 160)
-        angle = 2 * np.pi * f * time[:, None] + phase
-        road = np.column_stack([np.sin(angle) @ (6e-4 / f), np.cos(angle).sum(axis=1) * 6e-4 * 2 * np.pi])
-        values = {p.name: p.nominal * float(np.exp(0.08 * random.standard_normal())) for p in system.parameters}
-        sensors = simulate_ride(parse_system(yaml.safe_dump(file, sort_keys=False)), road, values, noise=random).sensors
-        shown = road + np.array([1e-5, 5e-4]) * random.standard_normal(road.shape)
-        channels = np.column_stack([shown, sensors])
-        if case.wrong is not None:
-            case.wrong(channels)
-        yield case.name, system, Falsified("", frozenset(), channels)
+        yield case.name, *quarter_car(case, seconds, np.random.default_rng(seed + number))
 
 
-def rig(seconds: float, random: np.random.Generator) -> Falsified:
-    """A damper with dry friction under two sines."""
-    t = np.arange(int(seconds * RATE)) / RATE
-    sines = [(0.012, 0.7, 0.3), (0.004, 1.9, 1.0)]
+def quarter_car(case: QuarterCarCase, seconds: float, random: np.random.Generator) -> tuple[System, Falsified]:
+    """Its system file, which knows nothing of what is wrong, and a recording."""
+    file = yaml.safe_load(QUARTER_CAR) | {"sample_rate": case.rate}
+    system = parse_system(yaml.safe_dump(file, sort_keys=False))
+    for one in (case, case.also):
+        if one is not None and one.where is not None:
+            file[one.where[0]][one.where[1]]["laws"] = [one.law]
+    time = np.arange(round(seconds * case.rate)) / case.rate
+    f, phase = np.linspace(0.5, 18, 160), random.uniform(0, 2 * np.pi, 160)
+    angle = 2 * np.pi * f * time[:, None] + phase
+    road = np.column_stack([np.sin(angle) @ (6e-4 / f), np.cos(angle).sum(axis=1) * 6e-4 * 2 * np.pi])
+    values = {p.name: p.nominal * float(np.exp(0.08 * random.standard_normal())) for p in system.parameters}
+    sensors = simulate_ride(parse_system(yaml.safe_dump(file, sort_keys=False)), road, values, noise=random).sensors
+    shown = road + np.array([1e-5, 5e-4]) * random.standard_normal(road.shape)
+    channels = np.column_stack([shown, sensors])
+    if case.wrong is not None:
+        case.wrong(channels)
+    return system, Falsified("", frozenset(), channels, sample_rate=case.rate)
+
+
+TWO_SINES = ((0.012, 0.7, 0.3), (0.004, 1.9, 1.0))  # amplitude m, frequency Hz, phase
+
+
+@dataclass(frozen=True)
+class Imperfect:
+    """How a damper on a test bench differs from one with dry friction under two sines."""
+
+    sines: tuple[tuple[float, float, float], ...] = TWO_SINES
+    fall: float = 0.0  # of the friction with the rate
+    late: float = 0.0  # s, of the force's channel
+
+
+IMPERFECT = {
+    "falling friction": Imperfect(fall=0.6),
+    "one loop": Imperfect(((0.012, 1.0, 0.3),)),
+    "late": Imperfect(late=0.03),
+}
+
+
+def rig(seconds: float, random: np.random.Generator, imperfect: Imperfect = Imperfect()) -> Falsified:
+    """A damper with dry friction under sines."""
+    t = np.arange(int(seconds * RATE)) / RATE - imperfect.late
+    sines = imperfect.sines
     d: FloatArray = sum(size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines)  # type: ignore[assignment]
     v: FloatArray = sum(  # type: ignore[assignment]
         size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines
     )
-    force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * np.tanh(v / 1e-3)
+    falls = 1 + imperfect.fall * (np.exp(-((v / 0.02) ** 2)) - 1)
+    force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * falls * np.tanh(v / 1e-3)
     noise = random.standard_normal((2, len(t)))
+    if imperfect.late:
+        t = t + imperfect.late
+        d = np.sum([size * np.sin(2 * np.pi * f * t + phase) for size, f, phase in sines], axis=0)
     return Falsified("", frozenset(), np.column_stack([d + 1e-6 * noise[0], force + 2.0 * noise[1]]))
+
+
+def shaken(random: np.random.Generator, samples: int = 4000) -> Falsified:
+    """Two floors under a measured force, the sensors of one floor each exchanged, springs 15 % off nominal."""
+    fine, mass, H = 8, 4000.0, np.array([[1.0, 0.0], [-1.0, 1.0]])
+    spectrum = np.fft.rfft(random.standard_normal(samples))
+    frequency = np.fft.rfftfreq(samples, 1 / 50)
+    spectrum *= (frequency > 0.3) * np.exp(-((frequency / 12) ** 8))
+    force = fine * np.fft.irfft(spectrum, samples * fine)
+    force *= 800 / np.std(force)
+    K = (H.T * np.array([2.3e6, 1.7e6])) @ H
+    A = np.block([[np.zeros((2, 2)), np.eye(2)], [-K / mass, -0.004 * K / mass]])
+    ahead = expm(A / (50 * fine))
+    push = np.linalg.solve(A, (ahead - np.eye(4))[:, 3]) / mass
+    x, states = np.zeros(4), np.empty((len(force), 4))
+    for i, given in enumerate(0.5 * (force + np.append(force[1:], force[-1]))):
+        states[i], x = x, ahead @ x + push * given
+    floors = (states @ A[2:].T + np.outer(force, [0.0, 1 / mass]))[::fine]
+    shown = np.column_stack([force[::fine], floors[:, 0], floors[:, 1], floors[:, 0]])  # b1 and a2 exchanged
+    return Falsified(
+        "", frozenset(), shown + random.normal(0, 1, shown.shape) * [5, 3e-3, 3e-3, 3e-3], sample_rate=50.0
+    )
 
 
 def tower(random: np.random.Generator, seconds: float = 360.0) -> Falsified:

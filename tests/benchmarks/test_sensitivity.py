@@ -52,10 +52,22 @@ def test_a_component_test_is_not_asked_about_vehicles() -> None:
 def test_quick_recordings_have_a_fault_each_and_the_channels_of_their_system() -> None:
     made = list(recordings("quick", 8, 3.0, 1))
     assert [name.split("-", 1)[1] for name, _, _ in made[:3]] == ["friction", "weak friction", "cubic spring"]
-    assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made[:-1])
-    assert made[-1][0] == "tower" and made[-1][2].values.shape == (18000, 2)
+    assert all(record.values.shape == (300, len(system.channels)) for _, system, record in made[:8])
+    assert made[8][0] == "tower" and made[8][2].values.shape == (18000, 2)
+    assert all(record.values.shape[1] == len(system.channels) for _, system, record in made)
+    assert len({name for name, _, _ in made}) == len(made)
     healthy, rubbing = made[5][2].values, made[0][2].values
     assert np.std(healthy[:, 2]) > 0.1 and np.std(rubbing[:, 2]) > 0.1  # m/s^2
+
+
+def test_numbers_and_recordings_can_be_asked_for_alone_and_others_keep_what_was_known(tmp_path: Path) -> None:
+    file, before = tmp_path / "varied.json", {"varied": [1, 0, 2], "recordings": 3, "changes": []}
+    file.write_text(json.dumps({"set": "", "recordings": [], "numbers": {"component.most": before}}))
+    lines = list(run(stage="component.turn,fit", cases="one loop", seconds=4.0, write=file))
+    assert [line["recording"] for line in lines[:1]] == ["rig one loop"]
+    assert [(line["stage"], line["number"]) for line in lines[1:-1]] == [("fit", "prior"), ("component", "turn")]
+    known = json.loads(file.read_text())["numbers"]
+    assert known["component.most"] == before and known["component.turn"]["recordings"] == 1
 
 
 def test_made_recordings_of_a_rig_repeat_with_their_seed() -> None:
