@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import Field, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +24,7 @@ import numpy as np
 
 from sprung.benchmarks.concealed import engine_digest
 from sprung.benchmarks.keeping import keep, kept
-from sprung.benchmarks.sensitivity_cases import recordings
+from sprung.benchmarks.sensitivity_cases import Made, recordings
 from sprung.benchmarks.setups import Falsified
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import is_component_test
@@ -43,6 +43,7 @@ ALONE = {  # stages of recordings of their own, with what decides there
 }
 LAST = ("verdict", "report")  # stages that read finished investigations
 LATE = ("evidence", "selection", "plausible", "acceptance", "formula", "noise")  # stages that go on from begun ones
+_NAMED = 4  # recordings at most whose names are kept with a number
 FIRST = ("input_faults", "input_rounds", "input_rival", "input_rivals", "input_done")  # of acceptance, but decide early
 
 
@@ -129,11 +130,11 @@ def run(
     settings = [budget, seed, count, seconds, engine_digest()]
     own, parts = (int(x) for x in part.split("/"))
     began, done = time.process_time(), []
-    for number, (name, system, record) in enumerate(recordings(budget, count, seconds, seed)):
+    for number, (name, make) in enumerate(recordings(budget, count, seconds, seed)):
         if number % parts != own - 1 or (names and not any(one in name for one in names)):
             continue
         file = None if folder is None else folder / f"{name.replace(' ', '-')}.json"
-        told = _told(name, system, record, keys, file, settings)
+        told = _told(name, make, keys, file, settings)
         done.append(told)
         changed = {key: one["changed"] for key, one in told["varied"].items() if one and one["changed"]}
         yield {key: told[key] for key in ("recording", "verdict", "findings")} | {"changed": changed}
@@ -152,8 +153,7 @@ def run(
 
 def _told(
     name: str,
-    system: System,
-    record: Falsified,
+    make: Callable[[], Made],
     keys: list[tuple[str, Field[Any]]],
     file: Path | None,
     settings: list[Any],
@@ -164,7 +164,7 @@ def _told(
     wanted = {f"{stage}.{one.name}": (stage, one) for stage, one in keys}
     open_keys = [key for key, (_, one) in wanted.items() if known.get(key, {}).get("varied") != _numbers(one)]
     if not told or open_keys:
-        subject = _known(name, system, record)  # one at a time: remembered fits take a gigabyte
+        subject = _known(name, *make())  # one at a time: remembered fits take a gigabyte
         told = {"recording": name, "verdict": subject.said.verdict, "findings": subject.said.findings}
         for key in open_keys:
             stage, one = wanted[key]
@@ -199,13 +199,15 @@ def vary(subject: Subject, stage: str, number: Field[Any]) -> dict[str, Any] | N
 
 def figure(stage: str, number: Field[Any], done: list[dict[str, Any]]) -> dict[str, Any]:
     """The line of a number, over all recordings that its stage reads."""
-    found = [one for told in done if (one := told["varied"].get(f"{stage}.{number.name}"))]
+    read = {told["recording"]: one for told in done if (one := told["varied"].get(f"{stage}.{number.name}"))}
+    found = list(read.values())
     return {
         "stage": stage,
         "number": number.name,
         "value": number.default,
         "range": list(number.metadata["range"]),
         "recordings": len(found),
+        "on": list(read),
         "changed": [change for one in found for change in one["changed"]],
         "p_value_decades": round(max((one["decades"] for one in found), default=0.0), 2),
         "reason": reason(stage, number),
@@ -220,11 +222,14 @@ def quoted(
     before: what was known.  A number that is what it was, and was varied on more recordings then, keeps that, and so
     do numbers that this run did not vary.
     """
-    asked = {f"{line['stage']}.{line['number']}" for line in lines}
-    numbers = {name: found for name, found in (before or {}).items() if name not in asked} | {
+    others = {f"{n}.{one.name}" for n, one in RULES.constants()} - {
+        f"{line['stage']}.{line['number']}" for line in lines
+    }
+    numbers = {name: found for name, found in (before or {}).items() if name in others} | {
         f"{line['stage']}.{line['number']}": {
             "varied": [line["value"], *line["range"]],
             "recordings": line["recordings"],
+            **({"on": line["on"]} if line["recordings"] <= _NAMED else {}),
             "changes": [_words(change) for change in line["changed"]],
         }
         for line in lines

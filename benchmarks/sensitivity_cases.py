@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -165,23 +166,37 @@ PARTICULAR = (
 )
 
 
-def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
-    """Of a vehicle, wrong set-ups among them, then component tests and structures; budget: quick, cases or full."""
+Made = tuple[System, Falsified]
+
+
+def recordings(budget: str, count: int, seconds: float, seed: int) -> Iterator[tuple[str, Callable[[], Made]]]:
+    """Of a vehicle, wrong set-ups among them, then component tests and structures, each made when it is asked for.
+
+    budget: quick, cases or full.
+    """
     rigs = max(1, count // 8)
     made = _vehicles if budget == "full" else quarter_cars
-    for number, (what, system, record) in enumerate(made(count - rigs, seconds, seed)):
-        yield f"{number}-{what}", system, record
+    for number, (what, make) in enumerate(made(count - rigs, seconds, seed)):
+        yield f"{number}-{what}", make
     for number in range(rigs):
-        yield f"rig-{number}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2 + number))
-    yield "tower", parse_system(TOWER), tower(np.random.default_rng(seed + 1))
+        yield f"rig-{number}", partial(_made, RIG, rig, seed + 2 + number, seconds)
+    yield "tower", partial(_made, TOWER, tower, seed + 1)
     for number, case in enumerate(PARTICULAR):
-        yield case.name, *quarter_car(case, seconds, np.random.default_rng(seed + 100 + number))
+        yield case.name, partial(quarter_car, case, seconds, seed + 100 + number)
     for name, imperfect in IMPERFECT.items():
-        yield f"rig {name}", parse_system(RIG), rig(seconds, np.random.default_rng(seed + 2), imperfect)
-    yield "shaken, exchanged", parse_system(SHAKEN), shaken(np.random.default_rng(seed + 3))
+        yield f"rig {name}", partial(_made, RIG, partial(rig, imperfect=imperfect), seed + 2, seconds)
+    yield "shaken, exchanged", partial(_made, SHAKEN, shaken, seed + 3)
 
 
-def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
+def _made(text: str, make: Callable[..., Falsified], seed: int, *more: float) -> Made:
+    return parse_system(text), make(np.random.default_rng(seed), *more)
+
+
+def _known(system: System, record: Falsified) -> Made:
+    return system, record
+
+
+def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Callable[[], Made]]]:
     """The bundled vehicle, laws strong and weak, by the independent generator."""
     system, vehicle = load_system(), read_vehicle(MANCHESTER)
     kinds = ["clean", "coulomb_friction", "bump_stop", "sensor_gain", "sensor_noise", "bouc_wen", "damper_asymmetry"]
@@ -194,18 +209,19 @@ def _vehicles(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Syst
         if what == "clean" and number < len(strong):  # the others stay healthy
             record = falsified(system, values, SETUPS[number % len(SETUPS)], random)
             what = record.kind
-        yield what, system, record
+        yield what, partial(_known, system, record)
 
 
-def quarter_cars(count: int, seconds: float, seed: int) -> Iterator[tuple[str, System, Falsified]]:
+def quarter_cars(count: int, seconds: float, seed: int) -> Iterator[tuple[str, Callable[[], Made]]]:
     """A quarter car on a road of random phases, whose parameters differ from the file's by 8 %."""
     for number in range(count):
         case = CASES[number % len(CASES)]
-        yield case.name, *quarter_car(case, seconds, np.random.default_rng(seed + number))
+        yield case.name, partial(quarter_car, case, seconds, seed + number)
 
 
-def quarter_car(case: QuarterCarCase, seconds: float, random: np.random.Generator) -> tuple[System, Falsified]:
+def quarter_car(case: QuarterCarCase, seconds: float, seed: int) -> Made:
     """Its system file, which knows nothing of what is wrong, and a recording."""
+    random = np.random.default_rng(seed)
     file = yaml.safe_load(QUARTER_CAR) | {"sample_rate": case.rate}
     system = parse_system(yaml.safe_dump(file, sort_keys=False))
     for one in (case, case.also):
@@ -234,16 +250,17 @@ class Imperfect:
     sines: tuple[tuple[float, float, float], ...] = TWO_SINES
     fall: float = 0.0  # of the friction with the rate
     late: float = 0.0  # s, of the force's channel
+    rubs: bool = True
 
 
 IMPERFECT = {
     "falling friction": Imperfect(fall=0.6),
     "one loop": Imperfect(((0.012, 1.0, 0.3),)),
-    "late": Imperfect(late=0.03),
+    "late": Imperfect(late=0.03, rubs=False),
 }
 
 
-def rig(seconds: float, random: np.random.Generator, imperfect: Imperfect = Imperfect()) -> Falsified:
+def rig(random: np.random.Generator, seconds: float, imperfect: Imperfect = Imperfect()) -> Falsified:
     """A damper with dry friction under sines."""
     t = np.arange(int(seconds * RATE)) / RATE - imperfect.late
     sines = imperfect.sines
@@ -251,7 +268,7 @@ def rig(seconds: float, random: np.random.Generator, imperfect: Imperfect = Impe
     v: FloatArray = sum(  # type: ignore[assignment]
         size * 2 * np.pi * f * np.cos(2 * np.pi * f * t + phase) for size, f, phase in sines
     )
-    falls = 1 + imperfect.fall * (np.exp(-((v / 0.02) ** 2)) - 1)
+    falls = imperfect.rubs * (1 + imperfect.fall * (np.exp(-((v / 0.02) ** 2)) - 1))
     force = 3.6e4 * d + 1.3e3 * v + random.uniform(40.0, 160.0) * falls * np.tanh(v / 1e-3)
     noise = random.standard_normal((2, len(t)))
     if imperfect.late:

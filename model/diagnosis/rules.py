@@ -29,12 +29,12 @@ def reason(stage: str, number: Field[Any]) -> str:
     found = _varied()["numbers"].get(f"{stage}.{number.name}")
     low, high = number.metadata["range"]
     if found is None or found["varied"] != [number.default, low, high]:
-        told = "not varied as it is now"
-    elif found["changes"]:
-        told = f"on {found['recordings']} recordings changes {'; '.join(found['changes'])}"
-    else:
-        told = f"on {found['recordings']} recordings insensitive from {low:g} to {high:g}"
-    return f"{number.metadata['reason']}; {told}"
+        return f"{number.metadata['reason']}; not varied as it is now"
+    where = "; ".join(found.get("on", [f"{found['recordings']} recordings"]))
+    told = f"insensitive from {low:g} to {high:g}"
+    if found["changes"]:
+        told = f"changes {'; '.join(found['changes'])}"
+    return f"{number.metadata['reason']}; on {where} {told}"
 
 
 @cache

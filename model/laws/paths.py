@@ -45,12 +45,20 @@ def presliding_path(deflection: FloatArray, reach: float, level: FloatArray | No
     ways, middle = np.diff(deflection), 0.5 * (level[1:] + level[:-1])
     keep = np.exp(-np.abs(ways) / (reach * middle))
     towards = np.sign(ways) * middle * (1 - keep)
-    path = np.empty(len(deflection))
-    bent, path[0] = 0.0, 0.0
-    for i, (a, b) in enumerate(zip(keep.tolist(), towards.tolist(), strict=True), 1):
-        bent = a * bent + b
-        path[i] = bent
-    return path
+    return np.concatenate([[0.0], recurrence(keep, towards)])
+
+
+def recurrence(keep: FloatArray, add: FloatArray) -> FloatArray:
+    """x_i = keep_i x_(i - 1) + add_i from 0, (T,), for factors between 0 and 1: steps are joined two by two.
+
+    Hillis and Steele (1986): log2 T passes over arrays instead of T steps.
+    """
+    factor, found, shift = keep.copy(), add.copy(), 1
+    while shift < len(found) and factor[shift:].any():
+        found[shift:] += factor[shift:] * found[:-shift]
+        factor[shift:] *= factor[:-shift].copy()
+        shift *= 2
+    return found
 
 
 def maxwell_path(deflection: FloatArray, time_constant: float, step: float) -> FloatArray:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from sprung.model.laws.paths import presliding_path, stop_path
+from sprung.model.laws.paths import presliding_path, recurrence, stop_path
 from sprung.model.laws.reversals import Stretches
 
 T = np.arange(1500) / 200
@@ -51,3 +51,14 @@ def test_dahls_slider_is_bent_as_if_stepped(motion: str) -> None:
         z = keep * z + math.copysign(1 - keep, way)
         stepped.append(z)
     np.testing.assert_allclose(presliding_path(d, reach), stepped, atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 1000])
+def test_a_recurrence_is_that_of_its_steps(count: int) -> None:
+    random = np.random.default_rng(count)
+    keep, add = np.exp(-random.exponential(0.3, count)), random.standard_normal(count)
+    found, x = [], 0.0
+    for a, b in zip(keep, add, strict=True):
+        x = a * x + b
+        found.append(x)
+    np.testing.assert_allclose(recurrence(keep, add), found, rtol=1e-12, atol=1e-12)

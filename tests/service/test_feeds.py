@@ -54,7 +54,7 @@ def recording(tmp_path: Path, csv_engine: Engine) -> Path:
 
 
 @pytest.fixture
-def core(csv_engine: Engine, tmp_path: Path) -> Core:
+def core(csv_engine: Engine, tmp_path: Path, reading_here: None) -> Core:
     core = build_core(Settings(data_dir=tmp_path / "data", misfit_seconds=5, job_queue=2), csv_engine)
     core.diagnosis_jobs.task = diagnose
     return core
@@ -94,7 +94,10 @@ def test_a_file_is_fed_whole_and_counted(csv_engine: Engine, recording: Path, tm
     assert (fed.lost, fed.expected) == (0, 28 * 100 * SECONDS)
 
 
-def test_an_upload_becomes_a_job_and_its_windows_are_stored(client: TestClient, recording: Path) -> None:
+def test_an_upload_becomes_a_job_and_its_windows_are_stored(
+    client: TestClient, recording: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.undo()  # this one is read as in operation: in a process of its own
     response = upload(client, recording)
     assert response.status_code == 202
     job = response.json()
@@ -149,7 +152,7 @@ def test_an_upload_that_cannot_be_read_fails_with_one_line_and_the_users_name_fo
 
 
 def test_a_job_that_a_stop_interrupts_goes_on_at_the_next_start(
-    csv_engine: Engine, tmp_path: Path, recording: Path
+    csv_engine: Engine, tmp_path: Path, recording: Path, reading_here: None
 ) -> None:
     settings = Settings(data_dir=tmp_path / "data")
     core = build_core(settings, csv_engine)

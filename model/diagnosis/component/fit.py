@@ -27,6 +27,7 @@ from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
 _RELATIVE = 1e-4  # steps of finite differences
+_KEPT = 2_500_000  # samples of columns that a task remembers: rounds of trials and refinements ask for them again
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,19 @@ class ComponentTask:
     def delayed(self, late: float) -> ComponentTask:
         """The same with the motion of that long ago, s."""
         return self if late == 0.0 else replace(self, motion=self.motion.delayed(late))
+
+    def columns_of(self, piece: Part, shape: tuple[float, ...]) -> FloatArray:
+        """Force per strength of a piece along the motion, (T, m); what was asked for lately is remembered."""
+        key = (id(piece), shape)
+        if key not in self._columns:
+            if len(self._columns) * len(self.force) > _KEPT:
+                self._columns.clear()
+            self._columns[key] = (piece, piece.columns(self.motion, shape))
+        return self._columns[key][1]
+
+    @cached_property
+    def _columns(self) -> dict[tuple[int, tuple[float, ...]], tuple[Part, FloatArray]]:
+        return {}  # with the piece, so that its number is no other's
 
     @property
     def bounded_noise(self) -> float:
@@ -113,8 +127,8 @@ class ComponentModel:
 
     def columns(self, task: ComponentTask) -> FloatArray:
         """(T, m) of all pieces."""
-        motion = task.motion.delayed(self.late)
-        found = [p.columns(motion, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
+        late = task.delayed(self.late)
+        found = [late.columns_of(p, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
         return np.column_stack(found) if found else np.zeros((len(task.force), 0))
 
     @property

@@ -177,7 +177,7 @@ def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> li
     found = []
     for row in piece.grid(task.seen):
         shape = tuple(float(value) for value in row)
-        columns = piece.columns(task.motion, shape)[train]
+        columns = task.columns_of(piece, shape)[train]
         if not np.all(np.isfinite(columns)):
             continue
         _, left = bounded_solution(np.column_stack([fixed, columns]), force[train], (*signs, *piece.signs))
