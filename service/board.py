@@ -11,7 +11,7 @@ from sprung.service.engine import Engine
 from sprung.service.processed import Batch
 from sprung.service.store.status import HEALTHS, without_numbers
 from sprung.service.times import now_ns
-from sprung.service.views import VehicleView, vehicle_view
+from sprung.service.views import VehicleView, beside_window, vehicle_view
 
 OTHER = "other"
 MOST_REASONS = 40  # of one vehicle, as labels of a metric
@@ -54,7 +54,9 @@ class Board:
             return
         if last is None and held is not None and held.view.model == batch.served.engine.digest:
             last = held.view.last
-        view = vehicle_view(batch.served.engine, batch.vehicle, batch.state, last)
+        engine = batch.served.engine
+        made = batch.view or vehicle_view(engine, batch.vehicle, batch.state, last)
+        view = beside_window(engine, made, last)
         with self._lock:
             entry = self._entries.setdefault(batch.vehicle, Entry(view, self._clock()))
             entry.view = view

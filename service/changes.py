@@ -14,7 +14,7 @@ from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.standing import UNINFORMATIVE
 from sprung.service.store.status import NewStatus
 from sprung.service.store.windows import VehicleWindows, WindowRecord, add_windows
-from sprung.service.views import vehicle_view
+from sprung.service.views import VehicleView, vehicle_view
 
 OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
 
@@ -35,10 +35,11 @@ def keep_changes(
     now: int,
     on_alarms: OnAlarms | None,
     recording_id: str | None = None,
-) -> None:
+) -> dict[str, VehicleView]:
     """Windows, roll-ups, trackers, alarms and lines of the fleet's list, each vehicle once; all of them are held.
 
-    on_alarms: None while nobody is to see anything of it (`service.store.staging`): only the history is kept then.
+    Returns how the vehicles are seen now.  on_alarms: None while nobody is to see anything of it
+    (`service.store.staging`): only the history is kept then, and nothing is returned.
     """
     stored = [VehicleWindows(one.vehicle, one.after.served.model_id, one.records) for one in changes if one.records]
     if stored:
@@ -51,13 +52,12 @@ def keep_changes(
         found = fleet.save_alarms(connection, one.vehicle, one.after.served.model_id, one.after.state.alarms)
         if found and on_alarms is not None:
             on_alarms(connection, one.vehicle, found)
-    if on_alarms is not None:
-        keep_statuses(connection, changes, now)
+    return {} if on_alarms is None else keep_statuses(connection, changes, now)
 
 
-def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now: int) -> None:
-    """Lines of the fleet's list, with the windows that are new."""
-    statuses = []
+def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now: int) -> dict[str, VehicleView]:
+    """Lines of the fleet's list, with the windows that are new; how the vehicles are seen with it."""
+    statuses, views = [], {}
     for one in changes:
         unfitting = [
             record
@@ -67,18 +67,20 @@ def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now:
         counts = Counter(record.outcome for record in one.records)
         counts["unfitting"] = len(unfitting)
         told = (r for r in reversed(one.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
-        statuses.append(new_status(one.vehicle, one.after, next(told, None), counts))
+        view = vehicle_view(one.after.served.engine, one.vehicle, one.after.state, next(told, None))
+        views[one.vehicle] = view
+        statuses.append(new_status(one.after, view, counts))
         reasons = [(record.outcome, record.reason, record.start) for record in one.records if record.reason]
         reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
         status.add_reasons(connection, one.vehicle, one.after.served.model_id, reasons)
     status.save_statuses(connection, statuses, now)
+    return views
 
 
-def new_status(vehicle: str, at: HeldVehicle, last: WindowRecord | None, counts: Counter[str]) -> NewStatus:
-    """A vehicle's line, `last` being its newest window that was identified."""
-    engine = at.served.engine
-    found = vehicle_view(engine, vehicle, at.state, last).status(engine.system.elements)
-    return NewStatus(vehicle, at.served.model_id, at.revision, found, counts)
+def new_status(at: HeldVehicle, view: VehicleView, counts: Counter[str]) -> NewStatus:
+    """A vehicle's line."""
+    found = view.status(at.served.engine.system.elements)
+    return NewStatus(view.vehicle, at.served.model_id, at.revision, found, counts)
 
 
 def _row(at: HeldVehicle) -> fleet.TrackerRow:

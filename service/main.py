@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -26,6 +26,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
+from sprung.service.identifying import apart
 from sprung.service.live import LiveFeed
 from sprung.service.lock import held
 from sprung.service.recordings import file_row, finish_row
@@ -60,6 +61,8 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     """
     engine = load_engine(settings)
     with ExitStack() as stack:
+        if settings.identify_apart:
+            engine = replace(engine, identifier=stack.enter_context(apart(engine.identifier)))
         stack.enter_context(held(settings.data_dir))
         listening = stack.enter_context(_listen(settings))
         core = build_core(settings, engine)

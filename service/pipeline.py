@@ -25,7 +25,7 @@ from sprung.service.store.partitions import prepare
 from sprung.service.store.standing import counted
 from sprung.service.store.windows import Posterior, Solved, WindowRecord, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.views import body_loads, running
+from sprung.service.views import VehicleView, body_loads, running, vehicle_view
 
 LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
 FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after which they are asked again
@@ -186,20 +186,25 @@ class Pipeline:
             for one, (records, after, ran) in zip(asked, followed, strict=True)
             if records
         ]
-        if changes:
-            keep_changes(connection, changes, now, self._on_alarms if self._shown else None, recording_id)
+        on_alarms = self._on_alarms if self._shown else None
+        views = keep_changes(connection, changes, now, on_alarms, recording_id) if changes else {}
         held = {one.vehicle: one.after for one in changes}
         share = {"track": (tracked - started) / len(asked), "store": (time.perf_counter() - tracked) / len(asked)}
         return [
-            self._folded(one, records, held.get(one.vehicle, after), dict(share))
+            self._folded(one, records, held.get(one.vehicle, after), dict(share), views.get(one.vehicle))
             for one, (records, after, _) in zip(asked, followed, strict=True)
         ]
 
     def _folded(
-        self, one: ToFold, records: list[WindowRecord], after: HeldVehicle, seconds: dict[str, float]
+        self,
+        one: ToFold,
+        records: list[WindowRecord],
+        after: HeldVehicle,
+        seconds: dict[str, float],
+        view: VehicleView | None,
     ) -> Folded:
         late = sum(record.solved is not None and not record.tracked for record in records)
-        batch = Batch(one.vehicle, records, list(one.windows), late, after.state, one.at.served, seconds)
+        batch = Batch(one.vehicle, records, list(one.windows), late, after.state, one.at.served, seconds, view)
         return Folded(batch, after)
 
     def settle(self, folded: Folded) -> None:
@@ -290,8 +295,8 @@ class Pipeline:
         at = self._current(connection, [vehicle])[vehicle]
         after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
         on_alarms = self._on_alarms if self._shown else None
-        keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
-        return Batch(vehicle, [], [], 0, after.state, at.served)
+        views = keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
+        return Batch(vehicle, [], [], 0, after.state, at.served, view=views.get(vehicle))
 
     def tell(self, batch: Batch) -> None:
         """Let every listener know of a change that came without windows."""
@@ -316,7 +321,8 @@ class Pipeline:
         last = latest_window(connection, vehicle, at.served.model_id)
         status.forget_counts(connection, vehicle)
         counts = status.count_windows(connection, vehicle, at.served.model_id)
-        status.save_statuses(connection, [new_status(vehicle, at, last, counts)], now)
+        view = vehicle_view(at.served.engine, vehicle, at.state, last)
+        status.save_statuses(connection, [new_status(at, view, counts)], now)
 
     def switched(self, connection: Connection, vehicle: str) -> Batch:
         """After a vehicle was given another model, inside the transaction that did it: its line in the fleet's list

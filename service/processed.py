@@ -9,6 +9,7 @@ from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.engines import ServedModel
 from sprung.service.store.windows import WindowRecord
+from sprung.service.views import VehicleView
 
 
 @dataclass(slots=True)
@@ -22,6 +23,7 @@ class Batch:
     state: TrackerState  # after the batch
     served: ServedModel  # with which the vehicle is followed
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
+    view: VehicleView | None = None  # how the vehicle is seen after it; None: nobody has looked
 
 
 @dataclass(frozen=True, slots=True)

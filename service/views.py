@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 from urllib.parse import quote
@@ -174,7 +174,6 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         )
         for r, p in zip(reports, engine.system.tracked, strict=True)
     )
-    per_sensor = {} if last is None or last.solved is None else sensor_dict(engine, last.solved.per_sensor)
     return VehicleView(
         vehicle,
         engine.digest,
@@ -183,10 +182,19 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         state.alarms,
         last,
         state.time,
-        per_sensor,
+        _of_sensors(engine, last),
         engine.tracker.sensors(state),
         body_loads(engine, state),
     )
+
+
+def beside_window(engine: Engine, view: VehicleView, last: WindowRecord | None) -> VehicleView:
+    """The same with another window as the newest one."""
+    return view if view.last is last else replace(view, last=last, per_sensor=_of_sensors(engine, last))
+
+
+def _of_sensors(engine: Engine, last: WindowRecord | None) -> dict[str, float]:
+    return {} if last is None or last.solved is None else sensor_dict(engine, last.solved.per_sensor)
 
 
 def spoken(parameter: str) -> str:

@@ -179,10 +179,10 @@ class _Tether:
         self._parent = parent
 
     def __reduce__(self) -> tuple[Callable[[int], int], tuple[int]]:
-        return _tie, (self._parent,)
+        return tie, (self._parent,)
 
 
-def _tie(parent: int) -> int:
+def tie(parent: int) -> int:
     """Have the kernel end this process with its parent, where it can; returns the parent."""
     if sys.platform == "linux":
         with suppress(OSError, AttributeError):

@@ -324,7 +324,8 @@ class Attribution:
         of_baseline = np.where(state.calibration.moved[members] > 0, own, strays)
         known = float(np.sqrt(np.mean(own**2)))
         spread = float(np.mean(own**2 + of_baseline**2 + dev.pending(state.calibration, self.model)[members]))
-        std = float(np.hypot(np.sqrt(spread), dev.bending(kind, off)))
+        bent = float(dev.bending(np.asarray(off))) if kind == "gain" else 0.0
+        std = float(np.hypot(np.sqrt(spread), bent))
         if abs(off) + 2 * known < max(dev.JUMPED[kind], MENDED * abs(alarm.peak or 0.0)):
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak

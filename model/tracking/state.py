@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from sprung.model.tracking.innovation import InnovationCusum
 from sprung.model.tracking.misfit import MisfitFloor
 from sprung.model.tracking.weather import Weather
 
+_Record = VarianceInflation | InnovationCusum | Changes | DeviationRecord | Weather | Cargo  # of arrays only
 FORMAT = 3
 _READ = (1, 2, FORMAT)
 
@@ -100,7 +102,7 @@ class TrackerState:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON values; arrays as base64 of little-endian bytes, so that nothing is rounded."""
-        upper = np.triu_indices(len(self.belief.mean))
+        upper = _upper(len(self.belief.mean))
         return {
             "format": FORMAT,
             "names": list(self.names),
@@ -111,16 +113,16 @@ class TrackerState:
             "idle": self.idle,
             "outliers": self.outliers,
             "belief": _pack_all({"mean": self.belief.mean, "covariance": self.belief.covariance[upper]}),
-            "scatter": _pack_all(asdict(self.inflation)),  # keys are those of format 1
-            "surprise": _pack_all(asdict(self.innovation)),
-            "changes": _pack_all(asdict(self.changes)),
+            "scatter": _packed(self.inflation),  # keys are those of format 1
+            "surprise": _packed(self.innovation),
+            "changes": _packed(self.changes),
             "fit": asdict(self.fit),
-            "calibration": _pack_all(asdict(self.calibration)),
+            "calibration": _packed(self.calibration),
             "stuck": [asdict(stuck) for stuck in self.stuck],
             "alarms": [asdict(alarm) for alarm in self.alarms],
             "coverage": asdict(self.coverage),
-            "weather": None if self.weather is None else _pack_all(asdict(self.weather)),
-            "cargo": None if self.cargo is None else _pack_all(asdict(self.cargo)),
+            "weather": None if self.weather is None else _packed(self.weather),
+            "cargo": None if self.cargo is None else _packed(self.cargo),
         }
 
     @classmethod
@@ -178,7 +180,7 @@ def _weather(data: Mapping[str, Any]) -> Weather | None:
 def _belief(data: Mapping[str, Any]) -> Belief:
     arrays = _unpack_all(data["belief"])
     mean, covariance = arrays["mean"], arrays["covariance"]
-    upper = np.triu_indices(len(mean))
+    upper = _upper(len(mean))
     full = np.zeros((len(mean), len(mean)))
     full[upper] = covariance
     full.T[upper] = covariance
@@ -207,14 +209,35 @@ def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:
     return {name: _pack(array) for name, array in arrays.items()}
 
 
+def _packed(record: _Record) -> dict[str, str]:
+    """A record of nothing but arrays."""
+    return {name: _pack(getattr(record, name)) for name in _names(type(record))}
+
+
+@cache
+def _names(kind: type[_Record]) -> tuple[str, ...]:
+    return tuple(field.name for field in fields(kind))
+
+
+@cache
+def _upper(size: int) -> tuple[IntArray, IntArray]:
+    """Indices of the upper triangle of a matrix of this size."""
+    return np.triu_indices(size)
+
+
 def _unpack_all(packed: Mapping[str, str]) -> dict[str, Any]:
     return {name: _unpack(text) for name, text in packed.items()}
 
 
 def _pack(array: Any) -> str:
-    kind = array.dtype.newbyteorder("<").str
-    found: str = kind + ":" + base64.b64encode(array.astype(kind).tobytes()).decode("ascii")
+    kind = _little_endian(array.dtype)
+    found: str = kind + ":" + base64.b64encode(np.ascontiguousarray(array, kind)).decode("ascii")
     return found
+
+
+@cache
+def _little_endian(kind: np.dtype[Any]) -> str:
+    return kind.newbyteorder("<").str
 
 
 def _unpack(text: str) -> Any:

@@ -242,11 +242,10 @@ class Tracker:
         if H == 0 or state.calibration.recent[-1] == 0:
             return tuple(stuck)
         value, std = state.belief.mean[-H:], self.model.relative_std(state.belief.covariance[-H:, -H:])
-        least = np.array([dev.NAMED.get(kind, np.inf) for kind in self.model.kinds])
         off = value - self.model.common(value)
-        bent = [dev.bending(kind, v) for kind, v in zip(self.model.kinds, off, strict=True)]
-        std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + np.square(bent))
-        chosen = (np.abs(off) > least) & (np.abs(off) > 3 * std)
+        bent = np.where(self.model.gains, dev.bending(off), 0.0)
+        std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + bent**2)
+        chosen = (np.abs(off) > self.model.named) & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
