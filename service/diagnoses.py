@@ -46,7 +46,8 @@ class Diagnoses:
 
     def on_batch(self, batch: Batch) -> None:
         """Keep the samples; start a diagnosis when the vehicle's windows have not fitted for long enough."""
-        self._rings.add(batch.vehicle, batch.fresh)
+        urgent = batch.state.misfit_since is not None or bool(batch.state.active)
+        self._rings.add(batch.vehicle, batch.fresh, urgent)
         since, now = batch.state.misfit_since, batch.state.time
         if not batch.fresh or since is None or now is None:
             return

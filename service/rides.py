@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -14,7 +13,10 @@ from prometheus_client.registry import Collector
 from sprung.model import comfort
 from sprung.model.tracking.tracker import TrackerState
 from sprung.service.engine import Engine
+from sprung.service.places import Places
 from sprung.service.processed import Batch
+
+SILENT_SECONDS = 120.0  # after which a vehicle makes room for another
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,50 +29,58 @@ class RideMinute:
 
 
 class Rides:
-    """Collects minutes of the `limit` vehicles heard from last: each holds a minute of its accelerometers."""
+    """Collects minutes of `limit` vehicles, see `Places`: each holds a minute of its accelerometers."""
 
     def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._rides: OrderedDict[str, tuple[str, comfort.RideQuality]] = OrderedDict()  # by vehicle: system, ride
-        self._latest: dict[str, RideMinute] = {}
+        self._rides: Places[_Ride] = Places(limit, SILENT_SECONDS)
         self._lock = threading.Lock()
 
     def on_batch(self, batch: Batch) -> None:
         """Take the windows of a batch."""
-        engine = batch.served.engine
-        if not self._limit or not batch.fresh:
+        if not batch.fresh:
             return
         with self._lock:
-            digest, ride = self._rides.get(batch.vehicle, ("", None))
-            if ride is None or digest != engine.system.digest:
-                ride = comfort.RideQuality(engine.system, most=1)
-            self._rides[batch.vehicle] = (engine.system.digest, ride)
-            self._rides.move_to_end(batch.vehicle)
-            while len(self._rides) > self._limit:
-                self._latest.pop(self._rides.popitem(last=False)[0], None)
-            before = len(ride.minutes) and ride.minutes[-1].start
-            for window in batch.fresh:
-                if window.outcome != "dropped":
-                    ride.push(window.start, window.values)
-            if ride.minutes and ride.minutes[-1].start != before:
-                start, sensors = ride.by_minute()[-1]
-                self._latest[batch.vehicle] = RideMinute(start, sensors, cost(engine, batch.state))
+            ride = self._rides.heard(batch.vehicle, _Ride)
+            if ride is not None:
+                ride.take(batch)
 
     def latest(self, vehicle: str) -> RideMinute | None:
         """The newest minute of a vehicle; None before the first."""
         with self._lock:
-            return self._latest.get(vehicle)
+            ride = self._rides.get(vehicle)
+            return None if ride is None else ride.latest
 
     def forget(self, vehicle: str) -> None:
         """A vehicle was deleted or taken out of service."""
         with self._lock:
-            self._rides.pop(vehicle, None)
-            self._latest.pop(vehicle, None)
+            self._rides.pop(vehicle)
 
     def all(self) -> dict[str, RideMinute]:
         """The newest minutes by vehicle."""
         with self._lock:
-            return dict(self._latest)
+            return {vehicle: ride.latest for vehicle, ride in self._rides.all().items() if ride.latest is not None}
+
+
+class _Ride:
+    """One vehicle's."""
+
+    def __init__(self) -> None:
+        self._digest = ""  # of the system that the minute is of
+        self._quality: comfort.RideQuality | None = None
+        self.latest: RideMinute | None = None
+
+    def take(self, batch: Batch) -> None:
+        engine, ride = batch.served.engine, self._quality
+        if ride is None or self._digest != engine.system.digest:
+            self._digest = engine.system.digest
+            ride = self._quality = comfort.RideQuality(engine.system, most=1)
+        before = len(ride.minutes) and ride.minutes[-1].start
+        for window in batch.fresh:
+            if window.outcome != "dropped":
+                ride.push(window.start, window.values)
+        if ride.minutes and ride.minutes[-1].start != before:
+            start, sensors = ride.by_minute()[-1]
+            self.latest = RideMinute(start, sensors, cost(engine, batch.state))
 
 
 def cost(engine: Engine, state: TrackerState) -> float | None:

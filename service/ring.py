@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
 
 from sprung.model.signals import FloatArray, Window
+from sprung.service.places import Places
 from sprung.service.times import NANOSECONDS
 
 
@@ -63,21 +63,19 @@ class Ring:
 
 
 class Rings:
-    """Rings of the vehicles heard from most recently; the others are forgotten."""
+    """Rings of as many vehicles as there is room for, see `Places`."""
 
     def __init__(self, vehicles: int, seconds: float, channels: int, sample_rate: float) -> None:
-        self._limit = vehicles
         self._shape = (max(1, round(seconds * sample_rate)), channels, sample_rate)
-        self._rings: OrderedDict[str, Ring] = OrderedDict()
+        self._rings: Places[Ring] = Places(vehicles, seconds)
         self._lock = threading.Lock()
 
-    def add(self, vehicle: str, windows: list[Window]) -> None:
-        """Take a vehicle's windows."""
+    def add(self, vehicle: str, windows: list[Window], urgent: bool = False) -> None:
+        """Take a vehicle's windows; urgent: something is wrong with it."""
         with self._lock:
-            ring = self._rings.get(vehicle) or self._rings.setdefault(vehicle, Ring(*self._shape))
-            self._rings.move_to_end(vehicle)
-            while len(self._rings) > self._limit:
-                self._rings.popitem(last=False)
+            ring = self._rings.heard(vehicle, lambda: Ring(*self._shape), urgent)
+            if ring is None:
+                return
             for window in windows:
                 if window.outcome != "dropped" and len(window.values):  # without: the samples stayed on board
                     ring.add(window)

@@ -81,7 +81,7 @@ class Settings(BaseSettings):
 
     parameter_series_vehicles: int = Field(default=20, ge=0)  # vehicles with per-parameter metrics
     vehicles_in_memory: int = Field(default=256, gt=0)  # tracker states held between windows
-    ring_vehicles: int = Field(default=16, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
+    ring_vehicles: int = Field(default=100, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
     ring_seconds: float = Field(default=60.0, gt=0)
 
     late_seconds: float = Field(

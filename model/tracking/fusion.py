@@ -356,10 +356,13 @@ class Fusion:
         reference = np.where(self.model.cargo, 0.0, calibration.reference)
         return np.asarray(base + calibration.base_cross @ reference)
 
-    def drift(self, state: TrackerState) -> Drift:
-        """value / baseline - 1 and its standard deviation; NaN before any window."""
+    def drift(self, state: TrackerState, baseline: FloatArray | None = None) -> Drift:
+        """value / baseline - 1 and its standard deviation; NaN before any window.
+
+        baseline: that of the state, (P,), where the caller knows it.
+        """
         level, std = state.belief.level, np.sqrt(state.belief.level_variance)
-        whole = level - self.baseline(state)
+        whole = level - (self.baseline(state) if baseline is None else baseline)
         own = whole
         if state.weather is not None:
             own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)

@@ -217,8 +217,8 @@ class Tracker:
 
     def report(self, state: TrackerState) -> tuple[ParameterReport, ...]:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
-        base, drift = self._fusion.baseline(state), self._fusion.drift(state)
-        return reported(self.parameters, state, self.settings, base, drift)
+        base = self._fusion.baseline(state)
+        return reported(self.parameters, state, self.settings, base, self._fusion.drift(state, base))
 
     def health(self, state: TrackerState) -> Health:
         """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M."""

@@ -5,11 +5,12 @@ from __future__ import annotations
 import ipaddress
 import logging
 import math
+import random
 import re
-import secrets
 import time
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import lru_cache
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
 
@@ -252,7 +253,7 @@ class Limiter:
 def request_id_of(headers: Mapping[str, str]) -> str:
     """The client's name for its request where it is a decent one, else a new one."""
     given = headers.get("x-request-id", "")
-    return given if REQUEST_ID.fullmatch(given) else secrets.token_hex(8)
+    return given if REQUEST_ID.fullmatch(given) else f"{random.getrandbits(64):016x}"  # no secret
 
 
 def session_of(headers: Mapping[str, str]) -> str | None:
@@ -278,6 +279,7 @@ def is_loopback(host: str) -> bool:
         return host.lower() == "localhost"
 
 
+@lru_cache(maxsize=100)
 def _is_address(host: str) -> bool:
     try:
         ipaddress.ip_address(host)

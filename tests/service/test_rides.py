@@ -11,6 +11,7 @@ from fastapi.testclient import TestClient
 from sprung.model.comfort import W_K
 from sprung.model.system import System
 from sprung.service.core import Core
+from sprung.service.places import Places
 from tests.service_fakes import make_window
 
 FREQUENCY = 5.0  # Hz, a whole number of periods in a window
@@ -59,9 +60,10 @@ def test_a_deleted_vehicle_leaves_no_comfort_behind(client: TestClient, core: Co
     assert core.rides.latest(riding) is None
 
 
-def test_vehicles_heard_from_longest_ago_are_given_up_first(core: Core, system: System) -> None:
-    core.rides._limit = 1
-    for vehicle in ("first", "second"):
-        core.pipeline.process(vehicle, [shaken(system, number, 0.5) for number in range(140)])
-    assert core.rides.latest("first") is None
-    assert core.rides.latest("second") is not None
+def test_vehicles_that_report_in_turns_keep_their_minutes(core: Core, system: System) -> None:
+    core.rides._rides = Places(1, 120.0)
+    for number in range(0, 140, 20):
+        for vehicle in ("first", "second"):
+            core.pipeline.process(vehicle, [shaken(system, n, 0.5) for n in range(number, number + 20)])
+    assert core.rides.latest("first") is not None
+    assert core.rides.latest("second") is None

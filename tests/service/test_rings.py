@@ -38,12 +38,17 @@ def test_a_ring_does_not_pass_off_old_samples_as_new(system: System) -> None:
     assert after is not None and len(after.values) == 100 and (after.values == 3.0).all()
 
 
-def test_rings_forget_the_vehicle_heard_from_longest_ago(system: System) -> None:
-    rings = Rings(2, 1.0, len(system.channels), 100.0)
-    for vehicle in ("a", "b", "a", "c"):
-        rings.add(vehicle, [make_window(system, 0)])
-    assert rings.excerpt("b") is None
-    assert rings.excerpt("a") is not None and rings.excerpt("c") is not None
+def test_vehicles_that_report_in_turns_keep_their_rings(system: System) -> None:
+    rings = Rings(2, 60.0, len(system.channels), 100.0)
+    for number in range(3):
+        for vehicle in ("a", "b", "c"):
+            rings.add(vehicle, [make_window(system, number)])
+    assert rings.excerpt("c") is None
+    for vehicle in ("a", "b"):
+        held = rings.excerpt(vehicle)
+        assert held is not None and len(held.values) == 200  # all three windows, which overlap
+    rings.add("c", [make_window(system, 3)], urgent=True)  # it has an alarm
+    assert rings.excerpt("c") is not None and rings.excerpt("a") is None
 
 
 def test_an_excerpt_comes_back_as_it_was_saved(tmp_path: Path) -> None:
