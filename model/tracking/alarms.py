@@ -139,7 +139,7 @@ class Attribution:
         weather, model = state.weather, self.weather
         if weather is None or not model.groups:
             return []
-        odd = weathers.unusual(weather, model, self.names, share)
+        odd = weathers.unusual(weather, model, share)
         if not odd.any():
             return []
         out, told = [], set()

@@ -61,6 +61,8 @@ def departed(cargo: Cargo, pressure: FloatArray, prior: FloatArray) -> Cargo:
 
 def felt(cargo: Cargo, pressure: FloatArray) -> Cargo:
     """During a ride: its mean pressure."""
+    if np.isnan(pressure).all():
+        return cargo
     logarithm = _log(pressure)
     moved = np.where(np.isfinite(cargo.pressure), cargo.pressure + MEMORY * (logarithm - cargo.pressure), logarithm)
     return replace(cargo, pressure=np.where(np.isfinite(moved), moved, cargo.pressure))

@@ -18,6 +18,7 @@ from scipy.special import expit
 from sprung.model.identification.deviations import CARGO, Deviation
 from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
+from sprung.model.tracking.middle import median
 
 FORGETTING = 0.975  # of the evidence for a jump, per window that is weighed: 40 s; some channels show little at once
 EVIDENCE = 22.0  # log-likelihood ratio of a jump; 2 exp(-22) times 92 directions: 0.1 in a month without pause
@@ -69,7 +70,7 @@ class DeviationModel:
         out = np.zeros(self.size)
         for at in self.groups:
             telling = at if among is None or not among[at].any() else at[among[at]]
-            out[at] = _middle(values[telling])
+            out[at] = median(values[telling])
         return out
 
     def relative_std(self, covariance: FloatArray) -> FloatArray:
@@ -92,6 +93,16 @@ class DeviationModel:
         for at in self.groups:
             apart[np.ix_(at, at)] -= 1 / len(at)
         return apart
+
+    @cached_property
+    def cargo_at(self) -> IntArray:
+        """Where all that describes loads is."""
+        return np.flatnonzero(self.cargo)
+
+    @cached_property
+    def loads_at(self) -> IntArray:
+        """Where the masses of loads are."""
+        return np.flatnonzero(self.loads)
 
     @cached_property
     def gains(self) -> BoolArray:
@@ -243,7 +254,7 @@ def weigh(
             calibration,
             cross=calibration.cross + mixed * (found.cross - calibration.cross),
             excess=calibration.excess + mixed * (explained(belief, found) - calibration.excess),
-            recent=np.append(calibration.recent[1:], time),
+            recent=np.array([*calibration.recent[1:], time], dtype=np.int64),
         ),
         belief,
         jump,
@@ -315,7 +326,7 @@ def explained(belief: Belief, found: Deviating) -> float:
 
 def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float) -> Belief:
     """Belief after a window that speaks of loads only."""
-    at = np.flatnonzero(model.cargo)
+    at = model.cargo_at
     rows = at + len(belief.mean) - model.size
     M = found.information[at][:, at] * share
     u = found.score[at] * share - M @ (belief.mean[rows] - found.point[at])
@@ -323,13 +334,6 @@ def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float
     gain = np.linalg.solve(np.eye(len(at)) + M @ across[rows], np.column_stack([u, M]))
     covariance = belief.covariance - across @ gain[:, 1:] @ across.T
     return replace(belief, mean=belief.mean + across @ gain[:, 0], covariance=0.5 * (covariance + covariance.T))
-
-
-def _middle(values: FloatArray) -> float:
-    """The median; `np.median` takes ten times as long for so few."""
-    ordered = np.sort(values)
-    half = len(ordered) // 2
-    return float(ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half]))
 
 
 def _judged(
@@ -376,28 +380,28 @@ def boarded(
     """Belief after a stop: any load, or what is known of its mass, `mean` and `variance` (L,)."""
     covariance, state = belief.covariance.copy(), belief.mean.copy()
     first = len(belief.mean) - model.size
-    at = np.flatnonzero(model.cargo) + first
+    at = model.cargo_at + first
     covariance[at, :] = covariance[:, at] = 0.0
     state[at], covariance[at, at] = 0.0, np.diag(model.prior)[model.cargo]
     if mean is not None and variance is not None:
-        masses = np.flatnonzero(model.loads) + first
+        masses = model.loads_at + first
         state[masses], covariance[masses, masses] = mean, variance
     return replace(belief, mean=state, covariance=covariance)
 
 
 def moved(belief: Belief, model: DeviationModel, found: Deviating) -> bool:
     """Whether a window's loads are none that the belief allows: something was put on, or let down, on the way."""
-    at = np.flatnonzero(model.cargo)
+    at = model.cargo_at
     if not len(at):
         return False
-    values, vectors = np.linalg.eigh(found.information[np.ix_(at, at)])
+    values, vectors = np.linalg.eigh(found.information[at][:, at])
     told = values > 1e-9 * max(float(values[-1]), 1e-300)
     root = vectors[:, told] * np.sqrt(values[told])  # information = root root', of what the window tells
     rows = at + len(belief.mean) - model.size
     seen = root.T @ (found.point[at] - belief.mean[rows]) + (vectors[:, told].T @ found.score[at]) / np.sqrt(
         values[told]
     )
-    spread = np.eye(len(seen)) + root.T @ belief.covariance[np.ix_(rows, rows)] @ root
+    spread = np.eye(len(seen)) + root.T @ belief.covariance[rows][:, rows] @ root
     return bool(seen @ np.linalg.solve(spread, seen) > LOST_LOAD**2)
 
 

@@ -224,9 +224,9 @@ class Fusion:
     ) -> tuple[kalman.Belief, Cargo | None]:
         """Loads are open again after a stop, and where a window shows another one; pressures say what they are."""
         model, cargo = self.model, state.cargo
-        if not self.model.size or cargo is None or not model.loads.any():
+        if not self.model.size or cargo is None or not len(model.loads_at):
             return belief, cargo
-        rows = np.flatnonzero(model.loads) + len(belief.mean) - model.size
+        rows = model.loads_at + len(belief.mean) - model.size
         pressure = np.full(len(rows), np.nan)
         if conditions is not None and len(conditions.pressure) == len(rows):
             pressure = np.array(conditions.pressure)
@@ -241,7 +241,7 @@ class Fusion:
 
     def load(self, belief: kalman.Belief) -> float | None:
         """Logarithm of the loaded mass over the empty one, of the first load; None where it is not known."""
-        at = np.flatnonzero(self.model.loads)
+        at = self.model.loads_at
         if not len(at):
             return None
         row = len(belief.mean) - self.model.size + int(at[0])

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from sprung.model.signals import FloatArray
+from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.tracking.alarms import HARD, Drift
 from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.settings import TrackerSettings
@@ -52,31 +52,23 @@ def reported(
 
     base: log-ratios to nominal of the healthy state, (P,).
     """
-    level, std = state.belief.level, np.sqrt(state.belief.level_variance)
-    base_std = np.sqrt(state.changes.baseline_variance)
-    learned = state.changes.learned >= settings.learning
-    reports = []
-    for i, parameter in enumerate(parameters):
-        value, own = parameter.nominal * float(np.exp(level[i])), bool(learned[i])
-        healthy = parameter.nominal * float(np.exp(base[i])) if own else None
-        reports.append(
-            ParameterReport(
-                name=parameter.name,
-                unit=parameter.unit,
-                nominal=parameter.nominal,
-                value=value,
-                std=value * float(std[i]),
-                ratio=value / parameter.nominal,
-                log_ratio=float(level[i]),
-                log_std=float(std[i]),
-                identifiable=bool(std[i] < KNOWN * settings.prior),
-                baseline=healthy,
-                baseline_std=None if healthy is None else healthy * float(base_std[i]),
-                drift=float(drift.whole[i]) if own else None,
-                drift_std=float(drift.std[i]) if own else None,
-            )
-        )
-    return tuple(reports)
+    log_std = np.sqrt(state.belief.level_variance)
+    nominal = np.array([parameter.nominal for parameter in parameters])
+    value, healthy = nominal * np.exp(state.belief.level), nominal * np.exp(base)
+    now = (value, value * log_std, value / nominal, state.belief.level, log_std, log_std < KNOWN * settings.prior)
+    since = (healthy, healthy * np.sqrt(state.changes.baseline_variance), drift.whole, drift.std)
+    learned = (state.changes.learned >= settings.learning).tolist()
+    return tuple(
+        ParameterReport(p.name, p.unit, p.nominal, *standing, *(changed if known else _LEARNING))
+        for p, standing, changed, known in zip(parameters, _rows(now), _rows(since), learned, strict=True)
+    )
+
+
+def _rows(columns: Sequence[FloatArray | BoolArray]) -> Iterator[tuple[Any, ...]]:
+    return zip(*(column.tolist() for column in columns), strict=True)
+
+
+_LEARNING = (None, None, None, None)  # baseline and drift, with their deviations
 
 
 def health_of(state: TrackerState, settings: TrackerSettings) -> Health:

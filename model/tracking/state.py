@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from binascii import b2a_base64
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from functools import cache
@@ -231,8 +232,7 @@ def _unpack_all(packed: Mapping[str, str]) -> dict[str, Any]:
 
 def _pack(array: Any) -> str:
     kind = _little_endian(array.dtype)
-    found: str = kind + ":" + base64.b64encode(np.ascontiguousarray(array, kind)).decode("ascii")
-    return found
+    return kind + ":" + b2a_base64(np.ascontiguousarray(array, kind), newline=False).decode("ascii")
 
 
 @cache

@@ -241,19 +241,23 @@ class Tracker:
         H = self.model.size
         if H == 0 or state.calibration.recent[-1] == 0:
             return tuple(stuck)
-        value, std = state.belief.mean[-H:], self.model.relative_std(state.belief.covariance[-H:, -H:])
+        value = state.belief.mean[-H:]
         off = value - self.model.common(value)
+        far = np.abs(off) > self.model.named
+        if not far.any():
+            return tuple(stuck)
+        std = self.model.relative_std(state.belief.covariance[-H:, -H:])
         bent = np.where(self.model.gains, dev.bending(off), 0.0)
         std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + bent**2)
-        chosen = (np.abs(off) > self.model.named) & (np.abs(off) > 3 * std)
+        chosen = far & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
         """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
         H = self.model.size
         found = {}
-        for h in np.flatnonzero(self.model.loads):
-            value, std = state.belief.mean[-H:][h], float(np.sqrt(np.diag(state.belief.covariance)[-H:][h]))
+        for h in self.model.loads_at:
+            value, std = state.belief.mean[-H:][h], float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
             if std < KNOWN * self._fusion.limit[h]:
                 found[self.deviations[h].name] = (float(value), std)
         return found

@@ -22,6 +22,7 @@ from functools import cached_property
 import numpy as np
 
 from sprung.model.signals import BoolArray, Conditions, FloatArray, IntArray
+from sprung.model.tracking.middle import median
 
 CONDITIONS = 3
 KELVIN, SPEED = 10.0, 10.0  # units of the conditions
@@ -38,7 +39,9 @@ MOST_RESTED = 0.08  # what a pause may bring at most
 FAST = 0.05  # log-ratio by which a kind may leave its settled level: oil that warms up, a front that passes
 SETTLING = 6 * 3600.0  # s in which a common level becomes the weather that it is compared with
 NEAR = 0.025  # of a kind's middle: elements within this, or within their errors, move with it
+_NOTHING = np.zeros(1)
 RANGE = {"damping": 0.2, "stiffness": 0.12}  # what weather alone may do, where nobody measures it
+OTHERS_RANGE = 0.1  # of other quantities
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +53,7 @@ class WeatherModel:
     std: FloatArray  # shape (P, 1 + K)
     kind_mean: FloatArray  # of kinds, shape (G, 1 + K)
     kind_std: FloatArray  # shape (G, 1 + K)
+    most: FloatArray  # log-ratio that weather alone may bring a kind to, shape (G,)
 
     @cached_property
     def groups(self) -> int:
@@ -62,7 +66,7 @@ class WeatherModel:
 
     def of_kinds(self, values: FloatArray) -> FloatArray:
         """The value (G,) of each parameter's kind, 0 where it has none, shape (P,)."""
-        return np.append(values, 0.0)[self.group]  # group -1 is the last
+        return np.concatenate((values, _NOTHING))[self.group]  # group -1 is the last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,7 +104,8 @@ def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection
             mean[i], std[i] = physics, np.hypot(std[i], np.multiply(open_, [0, 1, 1, 1]))
         else:
             kind_mean[group[i]], kind_std[group[i]] = physics, open_
-    return WeatherModel(group, mean, std, kind_mean, kind_std)
+    most = [RANGE.get(names[int(np.argmax(group == g))].rpartition(".")[2], OTHERS_RANGE) for g in range(G)]
+    return WeatherModel(group, mean, std, kind_mean, kind_std, np.array(most, dtype=np.float64))
 
 
 def _groups(names: Sequence[str], nominal: Sequence[float]) -> IntArray:
@@ -194,18 +199,12 @@ def learned(
     for g, members in enumerate(model.members):
         rows = members[usable[members]]
         if len(rows) >= FEWEST:
-            middle[g], fit[g] = _median(without[rows]), 1.0
+            middle[g], fit[g] = median(without[rows]), 1.0
             noise[g] = 1.57 * variance[rows].sum() / len(rows) ** 2
     mean, covariance = _regressed(
         weather.kind_mean, weather.kind_covariance, x, middle, _floored(noise, OF_KINDS, seconds), fit > 0
     )
     return replace(weather, kind_mean=mean, kind_covariance=covariance)
-
-
-def _median(values: FloatArray) -> float:
-    """Of a few values: NumPy's own spends most of its time on what they may be."""
-    ordered, half = np.sort(values), len(values) // 2
-    return float(ordered[half]) if len(values) % 2 else 0.5 * float(ordered[half - 1] + ordered[half])
 
 
 def _floored(variance: FloatArray, correlated: tuple[float, float], seconds: float) -> FloatArray:
@@ -244,7 +243,7 @@ def together(
         rows = members[usable[members]]
         if len(rows) < FEWEST:
             continue
-        middle = _median(left[rows])
+        middle = median(left[rows])
         near = np.abs(left[rows] - middle) < reach[rows]
         if np.count_nonzero(near) < MOST_OF * len(rows):
             continue
@@ -270,13 +269,11 @@ def usual(weather: Weather, model: WeatherModel) -> FloatArray:
     return model.of_kinds(weather.settled)
 
 
-def unusual(weather: Weather, model: WeatherModel, names: Sequence[str], share: float = 1.0) -> BoolArray:
+def unusual(weather: Weather, model: WeatherModel, share: float = 1.0) -> BoolArray:
     """Kinds that moved faster than weather does, or further, shape (G,); `share` of the limits."""
-    quantities = [names[members[0]].rpartition(".")[2] for members in model.members]
-    most = np.array([RANGE.get(quantity, 0.1) for quantity in quantities])
     certain = 4.0 * np.sqrt(weather.variance)
     fast = np.abs(weather.common - weather.settled) > share * (FAST + weather.slack) + certain
-    return np.asarray(fast | (np.abs(weather.common) > share * most + certain))
+    return np.asarray(fast | (np.abs(weather.common) > share * model.most + certain))
 
 
 def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
@@ -291,7 +288,7 @@ def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
     kind_mean, kind_std = _spread(
         model.kind_mean, model.kind_std, [(w.kind_mean, w.kind_covariance) for w in found], rows
     )
-    return WeatherModel(model.group, mean, std, kind_mean, kind_std)
+    return replace(model, mean=mean, std=std, kind_mean=kind_mean, kind_std=kind_std)
 
 
 def _spread(

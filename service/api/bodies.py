@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import chain
 from typing import Annotated
 
 import numpy as np
@@ -9,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, StringConstraints, Validation
 from pydantic_core import from_json
 
 from sprung.model.signals import FloatArray
+from sprung.model.system import System
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.api.twice import keys_twice
 from sprung.service.engine import Engine
@@ -176,18 +179,13 @@ def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], plac
         wrong.append(_wrong(f"{place}channels", f"are {len(channels)}; more than {MOST_CHANNELS} are not looked at"))
         return values
     names = {channel.name: i for i, channel in enumerate(system.channels)}
-    for name, samples in channels.items():
+    together = _numbers(channels, system.window) if names.keys() >= channels.keys() else None
+    if together is not None:
+        values[:, [names[name] for name in channels]] = together
+    else:
+        wrong += _faults(channels, names, system, place)
         if len(wrong) >= SHOWN_ERRORS:
             return values
-        if name not in names:
-            wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {system.name}"))
-            continue
-        column = _numbers(samples, system.window)
-        if column is None:
-            at, fault = _not_numbers(samples, system.window)
-            wrong.append(_wrong(f"{place}channels.{name}{at}", fault))
-        else:
-            values[:, names[name]] = column
     wrong += [
         _wrong(f"{place}channels.{channel.name}", "is missing; without every input nothing can be identified")
         for channel in system.inputs
@@ -198,15 +196,33 @@ def _samples(channels: object, engine: Engine, wrong: list[dict[str, str]], plac
     return values
 
 
-def _numbers(samples: object, length: int) -> FloatArray | None:
-    """`length` finite numbers, shape (T,); None where the samples are anything else."""
-    if not isinstance(samples, list) or len(samples) != length or not set(map(type, samples)) <= {float, int}:
+def _numbers(channels: dict[str, object], length: int) -> FloatArray | None:
+    """`length` finite numbers of each channel, shape (T, channels); None where any is anything else."""
+    lists = list(channels.values())
+    if not lists or not all(isinstance(samples, list) and len(samples) == length for samples in lists):
+        return None
+    samples: list[object] = list(chain.from_iterable(lists))  # type: ignore[arg-type]
+    if not set(map(type, samples)) <= {float, int}:
         return None
     try:
-        column = np.array(samples, dtype=float)
+        columns = np.array(samples, dtype=float).reshape(len(lists), length)
     except OverflowError:  # an integer beyond all floats
         return None
-    return column if column.min() >= -LARGEST and column.max() <= LARGEST else None
+    return columns.T if columns.min() >= -LARGEST and columns.max() <= LARGEST else None
+
+
+def _faults(channels: dict[str, object], names: Mapping[str, int], system: System, place: str) -> list[dict[str, str]]:
+    """What is wrong with samples by channel, of which something is; at most a few more than are shown."""
+    wrong: list[dict[str, str]] = []
+    for name, samples in channels.items():
+        if len(wrong) >= SHOWN_ERRORS:
+            break
+        if name not in names:
+            wrong.append(_wrong(f"{place}channels.{name[:160]}", f"is no channel of {system.name}"))
+        elif _numbers({name: samples}, system.window) is None:
+            at, fault = _not_numbers(samples, system.window)
+            wrong.append(_wrong(f"{place}channels.{name}{at}", fault))
+    return wrong
 
 
 def _not_numbers(samples: object, length: int) -> tuple[str, str]:

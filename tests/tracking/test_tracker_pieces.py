@@ -115,7 +115,7 @@ def test_batched_change_test_alarms_exactly_when_the_tracker_does() -> None:
     covariance = correlated(rng, np.array([0.003, 0.01, 0.02, 0.03, 0.03]))
     errors = CorrelatedErrors(covariance[None], vehicles, rng)
     none, kinds = np.zeros((size, 4)), np.zeros((0, 4))  # nothing in common, no slopes
-    alone = WeatherModel(np.full(size, -1), none, none, kinds, kinds)
+    alone = WeatherModel(np.full(size, -1), none, none, kinds, kinds, np.zeros(0))
     tracker = Tracker([TrackedParameter(f"element_{i}.damping") for i in range(size)], weather=alone)
     states = [tracker.initial_state() for _ in range(vehicles)]
     fleet = Fleet(vehicles, size, tracker.settings)
