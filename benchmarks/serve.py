@@ -205,7 +205,10 @@ def serve_sprung(port: int, folder: str) -> None:
     from sprung.service.api.app import create_app
     from sprung.service.core import build_core
     from sprung.service.engine import load_engine
+    from sprung.service.numerics import numerics
     from sprung.service.settings import Settings
 
     settings = Settings(data_dir=Path(folder))
-    uvicorn.run(create_app(build_core(settings, load_engine(settings))), port=port, log_level="error", access_log=False)
+    with numerics(load_engine(settings), settings) as (engine, following):
+        app = create_app(build_core(settings, engine, following))
+        uvicorn.run(app, port=port, log_level="error", access_log=False)

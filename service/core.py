@@ -24,6 +24,7 @@ from sprung.service.engine import Engine
 from sprung.service.feed import OnTally
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.telling import FleetTelling
+from sprung.service.following import Following, follow
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.hub import Hub
 from sprung.service.jobs import Jobs, Kind
@@ -109,8 +110,11 @@ class Core:
             stack.callback(self.ingest.close)
 
 
-def build_core(settings: Settings, engine: Engine) -> Core:
-    """Wire the application.  Raises UserError when the store cannot be opened."""
+def build_core(settings: Settings, engine: Engine, following: Following = follow) -> Core:
+    """Wire the application; `following` feeds windows to trackers.
+
+    Raises UserError when the store cannot be opened.
+    """
     store = open_store(settings.store_url)
     archive = open_archive(settings.archive)
     compute = Compute(settings.compute_queue)
@@ -129,7 +133,9 @@ def build_core(settings: Settings, engine: Engine) -> Core:
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     feeds: list[LiveFeed] = []
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
-    pipeline = Pipeline(engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms)
+    pipeline = Pipeline(
+        engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms, follow=following
+    )
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
     jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs)
     diagnoses = Diagnoses(settings, store, rings, jobs)

@@ -1,12 +1,26 @@
-"""One vehicle's windows through the tracker, in the order in which they come."""
+"""Vehicles' windows through the tracker, in the order in which they come."""
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+
+import numpy as np
 
 from sprung.model.signals import Conditions, Estimate, Window
 from sprung.model.tracking.tracker import Tracker, TrackerState
+from sprung.service.engine import Engine
+from sprung.service.forked import Forked, ProcessEnded
+from sprung.service.processed import HeldVehicle, ToFold, outcome_of
+from sprung.service.store.circumstances import Ran
+from sprung.service.store.standing import counted
+from sprung.service.store.windows import Posterior, Solved, WindowRecord
 from sprung.service.times import AHEAD
+from sprung.service.views import body_loads, running
+
+_NO_SAMPLES = np.zeros((0, 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,3 +52,125 @@ class Followed:
         if estimate is None:
             return replace(at, state=tracker.missed(at.state))
         return Followed(tracker.update(at.state, estimate, window.start, conditions), window.start)
+
+
+@dataclass(frozen=True, slots=True)
+class Passed:
+    """What has become of windows."""
+
+    followed: Followed
+    records: list[WindowRecord]
+    ran: list[Ran]
+
+
+Following = Callable[[Sequence[ToFold], int], list[Passed]]
+
+
+def follow(asked: Sequence[ToFold], now: int) -> list[Passed]:
+    """Feed each vehicle's windows to its tracker.  now: ns, the clock of this host."""
+    return [
+        _pass(one.at.served.engine, one.at.served.model_id, _reached(one.at), one.windows, one.estimates, now)
+        for one in asked
+    ]
+
+
+def _reached(at: HeldVehicle) -> Followed:
+    return Followed(at.state, at.last_window_ns)
+
+
+def _pass(
+    engine: Engine,
+    model_id: int,
+    followed: Followed,
+    windows: Sequence[Window],
+    estimates: Sequence[Estimate | None],
+    now: int,
+) -> Passed:
+    tracker, system = engine.tracker, engine.system
+    records, ran = [], []
+    for window, estimate in zip(windows, estimates, strict=True):
+        posterior, before = None, followed
+        followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
+        fed = estimate is not None and followed.last == window.start and followed is not before
+        if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
+            posterior = Posterior(*tracker.posterior(followed.state))
+        loads = body_loads(engine, followed.state) if fed else {}
+        outcome, reason = outcome_of(window, estimate)
+        stood = counted(outcome, model_id) if posterior is not None else {}
+        ran.append(Ran(window.start, running(system, window, loads) | stood))
+        solved = None if estimate is None else Solved.of(estimate)
+        records.append(WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior))
+    return Passed(followed, records, ran)
+
+
+class FollowingApart:
+    """`follow` in a process of its own, see `service.forked`; here from when that has ended.
+
+    The process keeps the states that it has made last, so that they are sent in one direction only.
+    """
+
+    def __init__(self, engine: Engine, vehicles: int) -> None:
+        """engine: of the service's system file; vehicles with another one are followed here.  vehicles: kept there."""
+        self._tracker = engine.tracker
+        self._most = vehicles
+        self._there: OrderedDict[_Key, TrackerState] = OrderedDict()  # what the process knows
+        self._lock = threading.Lock()
+        self.forked = Forked("tracks vehicles", {"follow": _Follower(engine).follow})
+
+    def __call__(self, asked: Sequence[ToFold], now: int) -> list[Passed]:
+        """As `follow`."""
+        mine = [one for one in asked if self._is_mine(one)]
+        if not mine:
+            return follow(asked, now)
+        with self._lock:
+            keys = [(one.vehicle, one.at.served.model_id) for one in mine]
+            sent = [self._sent(key, one) for key, one in zip(keys, mine, strict=True)]
+            try:
+                found: list[Passed] = self.forked.call("follow", sent, self._too_many(keys), now)
+            except ProcessEnded:
+                return follow(asked, now)
+            for key, passed in zip(keys, found, strict=True):
+                self._there[key] = passed.followed.state
+                self._there.move_to_end(key)
+        passed_there = iter(found)
+        others = iter(follow([one for one in asked if not self._is_mine(one)], now))
+        return [next(passed_there if self._is_mine(one) else others) for one in asked]
+
+    def _is_mine(self, one: ToFold) -> bool:
+        return one.at.served.engine.tracker is self._tracker
+
+    def _sent(self, key: _Key, one: ToFold) -> _Sent:
+        known = self._there.get(key) is one.at.state
+        windows = [replace(window, values=_NO_SAMPLES) for window in one.windows]
+        return key, None if known else one.at.state, one.at.last_window_ns, windows, one.estimates
+
+    def _too_many(self, keys: Sequence[_Key]) -> list[_Key]:
+        """States that the process is to forget, heard of longest ago."""
+        surplus = len(self._there.keys() | set(keys)) - self._most
+        gone = [key for key in self._there if key not in keys][: max(0, surplus)]
+        for key in gone:
+            del self._there[key]
+        return gone
+
+
+class _Follower:
+    """In the process."""
+
+    def __init__(self, engine: Engine) -> None:
+        self._engine = engine
+        self._states: dict[_Key, TrackerState] = {}
+
+    def follow(self, sent: Sequence[_Sent], gone: Sequence[_Key], now: int) -> list[Passed]:
+        for key in gone:
+            self._states.pop(key, None)
+        found = []
+        for key, state, last, windows, estimates in sent:
+            at = Followed(self._states[key] if state is None else state, last)
+            passed = _pass(self._engine, key[1], at, windows, estimates, now)
+            self._states[key] = passed.followed.state
+            found.append(passed)
+        return found
+
+
+_Key = tuple[str, int]  # vehicle, row of `models`
+_Sent = tuple[_Key, TrackerState | None, int, list[Window], Sequence[Estimate | None]]  # None: the one that is there

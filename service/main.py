@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -26,9 +26,9 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
-from sprung.service.identifying import apart
 from sprung.service.live import LiveFeed
 from sprung.service.lock import held
+from sprung.service.numerics import numerics
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
 from sprung.service.store.work import add_recording
@@ -59,13 +59,12 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     watch: callbacks that show a recording's progress and outcome; announce: told the address once it is open.
     Raises UserError for settings, files and buses that cannot be used.
     """
-    engine = load_engine(settings)
+    loaded = load_engine(settings)
     with ExitStack() as stack:
-        if settings.identify_apart:
-            engine = replace(engine, identifier=stack.enter_context(apart(engine.identifier)))
+        engine, following = stack.enter_context(numerics(loaded, settings))
         stack.enter_context(held(settings.data_dir))
         listening = stack.enter_context(_listen(settings))
-        core = build_core(settings, engine)
+        core = build_core(settings, engine, following)
         stack.callback(core.close)
         notice = access_notice(settings, core.tokens.any or core.oidc is not None)
         core.feeds = [live_feed(core, text, feeds.vehicle) for text in feeds.buses]

@@ -17,15 +17,13 @@ from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_s
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
-from sprung.service.following import Followed
-from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold, outcome_of
+from sprung.service.following import Following, follow
+from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold
 from sprung.service.store import Store, fleet, status
-from sprung.service.store.circumstances import Ran
 from sprung.service.store.partitions import prepare
-from sprung.service.store.standing import counted
-from sprung.service.store.windows import Posterior, Solved, WindowRecord, known_windows, latest_window
+from sprung.service.store.windows import WindowRecord, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.views import VehicleView, body_loads, running, vehicle_view
+from sprung.service.views import VehicleView, vehicle_view
 
 LEARNED_FROM = 30  # vehicles, whose slopes over weather a new one is told
 FRESH_GROWTH, FRESH_NS = 1.1, 3600 * NANOSECONDS  # vehicles and time after which they are asked again
@@ -48,10 +46,12 @@ class Pipeline:
         clock: Callable[[], int] = now_ns,
         on_alarms: OnAlarms = lambda connection, vehicle, changes: None,
         staging: str | None = None,
+        follow: Following = follow,
     ) -> None:
         """on_alarms: told of alarms that open, change or close, inside the transaction that stores them.
 
-        staging: digest under which everything is kept unseen (`service.store.staging`).
+        staging: digest under which everything is kept unseen (`service.store.staging`); follow: feeds windows to
+        trackers.
         """
         self.engine = engine
         self.store = store
@@ -59,6 +59,7 @@ class Pipeline:
         self._listeners = listeners
         self._limit = vehicles_in_memory
         self._clock = clock
+        self._follow = follow
         self._on_alarms = on_alarms
         self._shown = staging is None
         self._vehicles: OrderedDict[str, HeldVehicle] = OrderedDict()
@@ -179,20 +180,23 @@ class Pipeline:
         if not asked:
             return []
         now, started = self._clock(), time.perf_counter()
-        followed = [self._follow(one, now) for one in asked]
+        followed = [
+            (one, passed, replace(one.at, state=passed.followed.state, last_window_ns=passed.followed.last))
+            for one, passed in zip(asked, self._follow(asked, now), strict=True)
+        ]
         tracked = time.perf_counter()
         changes = [
-            TrackerChange(one.vehicle, after.with_stored(r.start for r in records), records, ran)
-            for one, (records, after, ran) in zip(asked, followed, strict=True)
-            if records
+            TrackerChange(one.vehicle, after.with_stored(r.start for r in passed.records), passed.records, passed.ran)
+            for one, passed, after in followed
+            if passed.records
         ]
         on_alarms = self._on_alarms if self._shown else None
         views = keep_changes(connection, changes, now, on_alarms, recording_id) if changes else {}
         held = {one.vehicle: one.after for one in changes}
         share = {"track": (tracked - started) / len(asked), "store": (time.perf_counter() - tracked) / len(asked)}
         return [
-            self._folded(one, records, held.get(one.vehicle, after), dict(share), views.get(one.vehicle))
-            for one, (records, after, _) in zip(asked, followed, strict=True)
+            self._folded(one, passed.records, held.get(one.vehicle, after), dict(share), views.get(one.vehicle))
+            for one, passed, after in followed
         ]
 
     def _folded(
@@ -216,35 +220,6 @@ class Pipeline:
         """Keep others from folding windows of some vehicles until the transaction ends; how their trackers stand."""
         fleet.take_vehicles(connection, vehicles, self._clock(), listed=self._shown)
         return self._current(connection, vehicles)
-
-    def _follow(self, asked: ToFold, now: int) -> tuple[list[WindowRecord], HeldVehicle, list[Ran]]:
-        """Feed the windows, in order."""
-        at = asked.at
-        tracker, system = at.served.engine.tracker, at.served.engine.system
-        followed = Followed(at.state, at.last_window_ns)
-        records, ran = [], []
-        for window, estimate in zip(asked.windows, asked.estimates, strict=True):
-            posterior, before = None, followed
-            followed = followed.after(tracker, window, estimate, now, system.conditions(window.auxiliary))
-            fed = estimate is not None and followed.last == window.start and followed is not before
-            if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
-                posterior = Posterior(*tracker.posterior(followed.state))
-            loads = body_loads(at.served.engine, followed.state) if fed else {}
-            outcome, reason = outcome_of(window, estimate)
-            stood = counted(outcome, at.served.model_id) if posterior is not None else {}
-            ran.append(Ran(window.start, running(system, window, loads) | stood))
-            records.append(
-                WindowRecord(
-                    window.start,
-                    outcome,
-                    reason,
-                    window.repaired_samples,
-                    fed,
-                    None if estimate is None else Solved.of(estimate),
-                    posterior,
-                )
-            )
-        return records, replace(at, state=followed.state, last_window_ns=followed.last), ran
 
     def _current(self, connection: Connection, vehicles: Collection[str]) -> dict[str, HeldVehicle]:
         """The vehicles' trackers: from memory when that is still what is stored, else read anew."""

@@ -67,7 +67,7 @@ class Settings(BaseSettings):
     tls_client_ca: Path | None = None  # PEM; with it, clients must show a certificate of this authority
     shutdown_seconds: int = Field(default=20, gt=0)
 
-    identify_apart: bool = True  # in a process of its own, where the machine has two processors
+    apart: bool = True  # identify and track, each in a process of its own, where there are two processors
     compute_queue: int = Field(default=64, gt=0)  # windows waiting for the numerics before 503
     job_queue: int = Field(default=16, gt=0)  # uploads and diagnoses waiting before 503
     min_free_bytes: int = Field(default=200_000_000, ge=0)  # on the disk of data_dir; below, not ready and no uploads

@@ -1,0 +1,141 @@
+"""Functions in a forked process, and trackers and identification there."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sprung.model.identifier import UnusableWindow
+from sprung.model.system import System
+from sprung.service.compute import Compute
+from sprung.service.engine import Engine
+from sprung.service.following import FollowingApart, follow
+from sprung.service.forked import Forked, ProcessEnded
+from sprung.service.identifying import IdentifierApart
+from sprung.service.pipeline import Pipeline
+from sprung.service.store import Store, open_store
+from tests.service_fakes import make_window
+
+pytestmark = [
+    pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only"),
+    pytest.mark.filterwarnings("ignore:This process:DeprecationWarning"),  # a test runner has threads, which do nothing
+]
+
+
+def _double(value: int) -> int:
+    if value < 0:
+        raise UnusableWindow("a negative one")
+    return 2 * value if value else 1 // value
+
+
+@pytest.fixture
+def doubling() -> Iterator[Forked]:
+    with closing(Forked("doubles", {"double": _double, "pid": os.getpid})) as forked:
+        yield forked
+
+
+def test_functions_run_in_another_process(doubling: Forked) -> None:
+    assert doubling.call("double", 21) == 42
+    assert doubling.call("pid") == doubling.pid != os.getpid()
+
+
+def test_what_a_function_raises_is_raised_here(doubling: Forked) -> None:
+    with pytest.raises(UnusableWindow, match="a negative one"):
+        doubling.call("double", -1)
+    with pytest.raises(RuntimeError, match="ZeroDivisionError"):
+        doubling.call("double", 0)
+    assert doubling.call("double", 2) == 4
+
+
+def test_a_process_that_was_killed_is_told_once(doubling: Forked, caplog: pytest.LogCaptureFixture) -> None:
+    assert doubling.pid is not None
+    os.kill(doubling.pid, signal.SIGKILL)
+    for _ in range(2):
+        with pytest.raises(ProcessEnded):
+            doubling.call("double", 1)
+    assert [r.message for r in caplog.records if "the process that doubles ended (status -9)" in r.message]
+    assert len(caplog.records) == 1 and doubling.pid is None
+
+
+def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
+    told = tmp_path / "pid"
+    maker = os.fork()
+    if maker == 0:
+        told.write_text(str(Forked("waits", {}).pid))
+        os._exit(0)
+    os.waitpid(maker, 0)
+    pid, deadline = int(told.read_text()), time.monotonic() + 10
+    while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]:
+        assert time.monotonic() < deadline, "it is still there"
+        time.sleep(0.02)
+
+
+def test_calls_of_several_threads_get_their_own_answers(doubling: Forked) -> None:
+    wrong: list[int] = []
+
+    def ask(first: int) -> None:
+        wrong.extend(n for n in range(first, first + 200) if doubling.call("double", n) != 2 * n)
+
+    threads = [threading.Thread(target=ask, args=(1000 * k + 1,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not wrong
+
+
+def test_an_identifier_apart_answers_as_it_does_here(engine: Engine, system: System) -> None:
+    apart = IdentifierApart(engine.identifier)
+    values = np.stack([make_window(system, n).values for n in range(3)])
+    with closing(apart.forked):
+        there = replace(engine, identifier=apart)
+        assert there.digest == engine.digest
+        here, _ = engine.identify(values)
+        for _ in range(2):  # the second time the process is gone
+            found, _ = there.identify(values)
+            for one, other in zip(here, found, strict=True):
+                np.testing.assert_array_equal(one.log_ratio, other.log_ratio)
+                np.testing.assert_array_equal(one.covariance, other.covariance)
+            if apart.forked.pid is not None:
+                os.kill(apart.forked.pid, signal.SIGKILL)
+        assert (apart.examine is None) == (not hasattr(engine.identifier, "examine"))
+
+
+@pytest.mark.parametrize("vehicles", [1, 10])
+def test_trackers_apart_come_to_the_same(engine: Engine, system: System, tmp_path: Path, vehicles: int) -> None:
+    """With room for one vehicle in the process, and for all; it is killed on the way."""
+    states = {}
+    for name in ("here", "apart"):
+        following = FollowingApart(engine, vehicles) if name == "apart" else None
+        store, compute = open_store(f"sqlite:///{tmp_path}/{name}.db"), Compute(4)
+        pipeline = Pipeline(engine, store, compute, clock=lambda: 0, follow=following or follow)
+        for part in range(4):
+            for vehicle in ("a", "b"):
+                pipeline.process(vehicle, [make_window(system, 10 * part + n) for n in range(10)])
+            if part == 1:
+                _relearn(pipeline, store)
+            if part == 2 and following is not None and following.forked.pid is not None:
+                os.kill(following.forked.pid, signal.SIGKILL)
+        states[name] = [pipeline.state(vehicle).to_dict() for vehicle in ("a", "b")]
+        if following is not None:
+            following.forked.close()
+        compute.close()
+        store.close()
+    assert states["here"] == states["apart"]
+
+
+def _relearn(pipeline: Pipeline, store: Store) -> None:
+    """The state changes on this side only."""
+    with store.write() as connection:
+        batch = pipeline.relearn("a", None, connection)
+    pipeline.tell(batch)
