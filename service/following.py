@@ -12,7 +12,7 @@ import numpy as np
 from sprung.model.signals import Conditions, Estimate, Window
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from sprung.service.engine import Engine
-from sprung.service.forked import Forked, ProcessEnded
+from sprung.service.forked import ForkedFunctions, ProcessEnded
 from sprung.service.processed import HeldVehicle, ToFold, outcome_of
 from sprung.service.store.circumstances import Ran
 from sprung.service.store.standing import counted
@@ -55,7 +55,7 @@ class Followed:
 
 
 @dataclass(frozen=True, slots=True)
-class Passed:
+class FollowedWindows:
     """What has become of windows."""
 
     followed: Followed
@@ -63,10 +63,10 @@ class Passed:
     ran: list[Ran]
 
 
-Following = Callable[[Sequence[ToFold], int], list[Passed]]
+Following = Callable[[Sequence[ToFold], int], list[FollowedWindows]]
 
 
-def follow(asked: Sequence[ToFold], now: int) -> list[Passed]:
+def follow(asked: Sequence[ToFold], now: int) -> list[FollowedWindows]:
     """Feed each vehicle's windows to its tracker.  now: ns, the clock of this host."""
     return [
         _pass(one.at.served.engine, one.at.served.model_id, _reached(one.at), one.windows, one.estimates, now)
@@ -85,7 +85,7 @@ def _pass(
     windows: Sequence[Window],
     estimates: Sequence[Estimate | None],
     now: int,
-) -> Passed:
+) -> FollowedWindows:
     tracker, system = engine.tracker, engine.system
     records, ran = [], []
     for window, estimate in zip(windows, estimates, strict=True):
@@ -100,7 +100,7 @@ def _pass(
         ran.append(Ran(window.start, running(system, window, loads) | stood))
         solved = None if estimate is None else Solved.of(estimate)
         records.append(WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior))
-    return Passed(followed, records, ran)
+    return FollowedWindows(followed, records, ran)
 
 
 class FollowingApart:
@@ -115,9 +115,9 @@ class FollowingApart:
         self._most = vehicles
         self._there: OrderedDict[_Key, TrackerState] = OrderedDict()  # what the process knows
         self._lock = threading.Lock()
-        self.forked = Forked("tracks vehicles", {"follow": _Follower(engine).follow})
+        self.forked = ForkedFunctions("tracks vehicles", {"follow": _Follower(engine).follow})
 
-    def __call__(self, asked: Sequence[ToFold], now: int) -> list[Passed]:
+    def __call__(self, asked: Sequence[ToFold], now: int) -> list[FollowedWindows]:
         """As `follow`."""
         mine = [one for one in asked if self._is_mine(one)]
         if not mine:
@@ -126,7 +126,7 @@ class FollowingApart:
             keys = [(one.vehicle, one.at.served.model_id) for one in mine]
             sent = [self._sent(key, one) for key, one in zip(keys, mine, strict=True)]
             try:
-                found: list[Passed] = self.forked.call("follow", sent, self._too_many(keys), now)
+                found: list[FollowedWindows] = self.forked.call("follow", sent, self._too_many(keys), now)
             except ProcessEnded:
                 return follow(asked, now)
             for key, passed in zip(keys, found, strict=True):
@@ -160,7 +160,7 @@ class _Follower:
         self._engine = engine
         self._states: dict[_Key, TrackerState] = {}
 
-    def follow(self, sent: Sequence[_Sent], gone: Sequence[_Key], now: int) -> list[Passed]:
+    def follow(self, sent: Sequence[_Sent], gone: Sequence[_Key], now: int) -> list[FollowedWindows]:
         for key in gone:
             self._states.pop(key, None)
         found = []

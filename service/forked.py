@@ -34,7 +34,7 @@ def forks() -> bool:
     return sys.platform == "linux" and len(os.sched_getaffinity(0)) > 1 and threading.active_count() == 1
 
 
-class Forked:
+class ForkedFunctions:
     """A process with some functions.  Make it before the first thread is started.
 
     `call` may be used from any thread; one call is worked on at a time.

@@ -8,7 +8,7 @@ from typing import Any
 
 from sprung.model.identifier import Identifies, StageTimes
 from sprung.model.signals import Estimate, FloatArray
-from sprung.service.forked import Forked, ProcessEnded
+from sprung.service.forked import ForkedFunctions, ProcessEnded
 
 
 class IdentifierApart:
@@ -18,7 +18,7 @@ class IdentifierApart:
         self.digest = identifier.digest
         self.times = StageTimes()
         self._here = identifier
-        self.forked = Forked("identifies windows", {"ask": partial(_asked, identifier)})
+        self.forked = ForkedFunctions("identifies windows", {"ask": partial(_asked, identifier)})
 
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """As that of the identifier."""

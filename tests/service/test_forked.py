@@ -20,7 +20,7 @@ from sprung.model.system import System
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine
 from sprung.service.following import FollowingApart, follow
-from sprung.service.forked import Forked, ProcessEnded
+from sprung.service.forked import ForkedFunctions, ProcessEnded
 from sprung.service.identifying import IdentifierApart
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, open_store
@@ -39,17 +39,17 @@ def _double(value: int) -> int:
 
 
 @pytest.fixture
-def doubling() -> Iterator[Forked]:
-    with closing(Forked("doubles", {"double": _double, "pid": os.getpid})) as forked:
+def doubling() -> Iterator[ForkedFunctions]:
+    with closing(ForkedFunctions("doubles", {"double": _double, "pid": os.getpid})) as forked:
         yield forked
 
 
-def test_functions_run_in_another_process(doubling: Forked) -> None:
+def test_functions_run_in_another_process(doubling: ForkedFunctions) -> None:
     assert doubling.call("double", 21) == 42
     assert doubling.call("pid") == doubling.pid != os.getpid()
 
 
-def test_what_a_function_raises_is_raised_here(doubling: Forked) -> None:
+def test_what_a_function_raises_is_raised_here(doubling: ForkedFunctions) -> None:
     with pytest.raises(UnusableWindow, match="a negative one"):
         doubling.call("double", -1)
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
@@ -57,7 +57,7 @@ def test_what_a_function_raises_is_raised_here(doubling: Forked) -> None:
     assert doubling.call("double", 2) == 4
 
 
-def test_a_process_that_was_killed_is_told_once(doubling: Forked, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_process_that_was_killed_is_told_once(doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture) -> None:
     assert doubling.pid is not None
     os.kill(doubling.pid, signal.SIGKILL)
     for _ in range(2):
@@ -71,7 +71,7 @@ def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
     told = tmp_path / "pid"
     maker = os.fork()
     if maker == 0:
-        told.write_text(str(Forked("waits", {}).pid))
+        told.write_text(str(ForkedFunctions("waits", {}).pid))
         os._exit(0)
     os.waitpid(maker, 0)
     pid, deadline = int(told.read_text()), time.monotonic() + 10
@@ -80,7 +80,7 @@ def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
         time.sleep(0.02)
 
 
-def test_calls_of_several_threads_get_their_own_answers(doubling: Forked) -> None:
+def test_calls_of_several_threads_get_their_own_answers(doubling: ForkedFunctions) -> None:
     wrong: list[int] = []
 
     def ask(first: int) -> None:
