@@ -116,6 +116,8 @@ class SelectionRules:
         1.0, "log-ratio to nominal of a parameter, from which a part is tried from nominal, too; chosen", 0.5, 1.5
     )
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
+    gross: float = rule(0.3, "error over the signal, from which scores tell the place alone; chosen", 0.2, 0.5)
+    most_gross: int = rule(14, "candidates that are fitted then; chosen: all laws of an element", 9, 20)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
     finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)

@@ -212,6 +212,8 @@ class ElementLaw(Parametrised):
     corner: int | None = None  # parameter that is the width of a corner over the rate, m/s
     knees: tuple[int, ...] = ()  # parameters that are rates at which the slope changes, m/s
     wider: ElementLaw | None = None  # the same with more parameters after its own: tried beside it where it is found
+    # Of a wider law that is tried in place of the narrower one once that is found: starts, from that one's values
+    widened: Callable[[Values, Observed], Sequence[Values]] | None = None
     formula: str = ""  # the force as text (model.laws.expression), for export; empty: cannot be written down
     memory_formula: str = ""  # the rate of its one state `z`, likewise
     parts: tuple[tuple[str, str], ...] = ()  # both of every part, where the force is a sum of such

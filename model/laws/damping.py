@@ -116,6 +116,7 @@ DAMPER_BLOWOFF = replace(
         knees=(0, 2),
         prior_cost=RARE,
         screened=False,
+        widened=lambda p, seen: ((*p, *p),),
     ),
 )
 
@@ -126,7 +127,7 @@ def _asymmetry(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return found
 
 
-DAMPER_ASYMMETRY = ElementLaw(
+_ASYMMETRY = ElementLaw(
     name="damper_asymmetry",
     title="damper asymmetry",
     parameters=(ParameterSpec("a", "1", -0.99, 0.99, "positive: harder in extension", lambda seen: 0.1),),
@@ -137,6 +138,44 @@ DAMPER_ASYMMETRY = ElementLaw(
     looks_like="even harmonics and a shift of the mean deflection that grows with the rate",
     confused_with=("sensor_bias",),
     sentence="the damper is harder in one direction, a = {a} (positive: extension)",
+)
+
+
+def _asymmetry_of_valves(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    a, knee, ratio = p
+    rate = np.abs(motion.rate)
+    found: FloatArray = a * element.damping * (ratio * rate + (1 - ratio) * np.minimum(rate, knee))
+    return found
+
+
+def _levels_off(p: Values, seen: Observed) -> tuple[tuple[float, ...], ...]:
+    (a,) = p
+    return tuple((a, float(knee), 0.3) for knee in _knees(seen)[:2])
+
+
+# Valves of one knee whose forces in the two directions keep their ratio: beyond it, the difference grows as the forces
+DAMPER_ASYMMETRY = replace(
+    _ASYMMETRY,
+    wider=replace(
+        _ASYMMETRY,
+        parameters=(
+            *_ASYMMETRY.parameters,
+            replace(_BLOWOFF.parameters[0], meaning="rate beyond which the difference grows more slowly"),
+            ParameterSpec("ratio", "1", -2.0, 2.0, "growth beyond the knee over that below it", lambda seen: 0.3),
+        ),
+        force=_asymmetry_of_valves,
+        formula="a * c * (ratio * abs(v) + (1 - ratio) * min(abs(v), knee))",
+        shapes=lambda seen: grid([0.3], _knees(seen), [0.3]),
+        absent=(0.0, 100.0, 1.0),
+        sentence=(
+            "the damper is harder in one direction, a = {a} (positive: extension) up to {knee}; the difference grows "
+            "with {ratio} of that beyond"
+        ),
+        knees=(1,),
+        prior_cost=RARE,
+        screened=False,
+        widened=_levels_off,
+    ),
 )
 
 

@@ -14,8 +14,9 @@ Python is admitted, so that a formula from a file cannot do anything but calcula
 from __future__ import annotations
 
 import ast
+import operator
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,9 +51,9 @@ FUNCTIONS: dict[str, Function] = {
     "max": Function(2, np.maximum, "fmax({0}, {1})", "max({0}, {1})"),
 }
 _BINARY: dict[type[ast.operator], tuple[Callable[[Any, Any], Any], str]] = {
-    ast.Add: (np.add, "+"),
-    ast.Sub: (np.subtract, "-"),
-    ast.Mult: (np.multiply, "*"),
+    ast.Add: (operator.add, "+"),
+    ast.Sub: (operator.sub, "-"),
+    ast.Mult: (operator.mul, "*"),
     ast.Div: (np.divide, "/"),
     ast.Pow: (np.power, "^"),
 }
@@ -65,10 +66,11 @@ class Expression:
     text: str
     names: frozenset[str]  # that it uses
     tree: ast.expr
+    value: Callable[[Mapping[str, Any]], Any] = field(compare=False, repr=False)  # of its names' values
 
     def __call__(self, **values: Any) -> Any:
         """Its value; arrays broadcast."""
-        return _evaluate(self.tree, values)
+        return self.value(values)
 
     def c(self, rename: Mapping[str, str] | None = None) -> str:
         """The same in C (math.h); `rename` gives the names there."""
@@ -91,7 +93,7 @@ def parse(text: str, known: Collection[str]) -> Expression:
     unknown = sorted(names - set(known))
     if unknown:
         raise FormulaError(f"formula {text!r}: {unknown[0]!r} is none of {', '.join(sorted(known))}")
-    return Expression(text.strip(), names, tree)
+    return Expression(text.strip(), names, tree, _calculation(tree))
 
 
 def _names(node: ast.expr, text: str) -> set[str]:
@@ -114,20 +116,33 @@ def _names(node: ast.expr, text: str) -> set[str]:
     )
 
 
-def _evaluate(node: ast.expr, values: Mapping[str, Any]) -> Any:
+def _calculation(node: ast.expr) -> Callable[[Mapping[str, Any]], Any]:
+    """What a checked node calculates: built once, since a simulation asks for it at every step."""
     match node:
         case ast.Constant(value=value):
-            return float(value)  # type: ignore[arg-type]
+            number = float(value)  # type: ignore[arg-type]
+            return lambda values: number
         case ast.Name(id=name):
-            return values[name]
+            return operator.itemgetter(name)
         case ast.UnaryOp(op=op, operand=operand):
-            value = _evaluate(operand, values)
-            return -value if isinstance(op, ast.USub) else value
+            inner = _calculation(operand)
+            return (lambda values: -inner(values)) if isinstance(op, ast.USub) else inner
         case ast.BinOp(left=left, op=op, right=right):
-            return _BINARY[type(op)][0](_evaluate(left, values), _evaluate(right, values))
-        case ast.Call(func=ast.Name(id=name), args=arguments):
-            return FUNCTIONS[name].numpy(*(_evaluate(argument, values) for argument in arguments))
+            return _of_two(_BINARY[type(op)][0], _calculation(left), _calculation(right))
+        case ast.Call(func=ast.Name(id=name), args=[argument]):
+            function, only = FUNCTIONS[name].numpy, _calculation(argument)
+            return lambda values: function(only(values))
+        case ast.Call(func=ast.Name(id=name), args=[first, second]):
+            return _of_two(FUNCTIONS[name].numpy, _calculation(first), _calculation(second))
     raise AssertionError(ast.dump(node))  # `parse` admits nothing else
+
+
+def _of_two(
+    operation: Callable[[Any, Any], Any],
+    left: Callable[[Mapping[str, Any]], Any],
+    right: Callable[[Mapping[str, Any]], Any],
+) -> Callable[[Mapping[str, Any]], Any]:
+    return lambda values: operation(left(values), right(values))
 
 
 def _written(node: ast.expr, language: str, rename: Mapping[str, str]) -> str:

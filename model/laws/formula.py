@@ -67,8 +67,11 @@ def _evaluator(text: Expression, parameters: tuple[str, ...]) -> Callable[[Motio
         values |= {"k": element.stiffness, "c": element.damping}
         if len(motion.memory):
             values["z"] = motion.memory[0]
+        found = text.value(values)
+        if np.shape(motion.deflection) == np.shape(motion.rate) == np.shape(found):
+            return found
         shape = np.broadcast_shapes(np.shape(motion.deflection), np.shape(motion.rate))
-        return text(**values) + np.zeros(shape)  # a formula without motion in it still has the motion's shape
+        return found + np.zeros(shape)  # a formula without motion in it still has the motion's shape
 
     return value
 

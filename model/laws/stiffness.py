@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from sprung.model.laws.base import ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
 from sprung.model.signals import FloatArray
 
 
@@ -39,7 +41,26 @@ def _bump_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return found
 
 
-BUMP_STOP = ElementLaw(
+def _reach(seen: Observed) -> FloatArray:
+    return seen.deflection_quantile([0.75, 0.95])
+
+
+def _either_side(p: Values, seen: Observed) -> tuple[tuple[float, ...], ...]:
+    """Both sides alike, or hardly anything on one of them."""
+    gap, stiffness = p
+    return ((gap, stiffness, gap, stiffness), (gap, stiffness, gap, 0.1 * stiffness), (gap, 0.1 * stiffness, *p))
+
+
+def _two_stops(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    gap, stiffness, gap_compression, stiffness_compression = p
+    d = motion.deflection
+    found: FloatArray = stiffness * np.maximum(d - gap, 0.0) + stiffness_compression * np.minimum(
+        d + gap_compression, 0.0
+    )
+    return found
+
+
+_BUMP_STOP = ElementLaw(
     name="bump_stop",
     title="bump stop",
     parameters=(
@@ -56,6 +77,29 @@ BUMP_STOP = ElementLaw(
     confused_with=("cubic_stiffness", "clearance"),
     sentence="a stop of {stiffness} is touched beyond {gap} of travel",
     strength=1,
+)
+BUMP_STOP = replace(
+    _BUMP_STOP,
+    wider=replace(
+        _BUMP_STOP,
+        parameters=(
+            *_BUMP_STOP.parameters,
+            replace(_BUMP_STOP.parameters[0], name="gap_compression", meaning="free travel in compression"),
+            replace(_BUMP_STOP.parameters[1], name="stiffness_compression", meaning="stiffness beyond that"),
+        ),
+        force=_two_stops,
+        shapes=lambda seen: grid(_reach(seen), [seen.stiffness], _reach(seen), [seen.stiffness]),
+        absent=(1.0, 0.0, 1.0, 0.0),
+        formula="stiffness * max(d - gap, 0) + stiffness_compression * min(d + gap_compression, 0)",
+        sentence=(
+            "a stop of {stiffness} is touched beyond {gap} of extension, one of {stiffness_compression} beyond "
+            "{gap_compression} of compression"
+        ),
+        strength=None,
+        prior_cost=RARE,
+        screened=False,
+        widened=_either_side,
+    ),
 )
 
 

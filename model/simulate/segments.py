@@ -19,6 +19,8 @@ from sprung.model.simulate.etd import ForceSteps, March, Site, march
 _WIDTH = 384  # runs that march together: enough to hide the interpreter, few enough for the cache
 _SHORTEST = 50  # samples of a segment
 _RUNAWAY = 1e3  # growth of the states from the first sweep that tells divergence
+_PATIENCE, _SHRINKS = 8, 0.5  # sweeps in which the change of the first states has to fall, and to which share
+_FEW = 8  # segments that are not worth their sweeps where more of them have not settled
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +59,8 @@ def solve(
         found = _sweeps(steps, transition, sites, known, parts, start, guess, tolerance, segments)
         if found is not None:
             return found
-        segments = max(1, segments // 4)  # hardly damped systems forget too slowly for many segments
+        # hardly damped systems forget too slowly for many segments
+        segments = segments // 4 if segments // 4 > _FEW else 1
 
 
 def _sweeps(
@@ -71,7 +74,7 @@ def _sweeps(
     tolerance: float,
     segments: int,
 ) -> Solution | None:
-    """The iteration with so many segments; None: it grows instead of settling."""
+    """The iteration with so many segments; None: it does not settle."""
     V, samples = known.shape[2], (len(known) - 1) // (2 * parts)
     Q = -(-(samples + 1) // segments)  # one sample more than needed: the last one is inside a segment, too
     segments = -(-(samples + 1) // Q)
@@ -81,6 +84,7 @@ def _sweeps(
     x, z = _first_guess(wide, stacked[0], clocks, guess, (segments, Q, V, len(transition)))
     over = np.linalg.matrix_power(transition, Q)
     largest: FloatArray | None = None
+    changes: list[float] = []
     for sweep in range(1, segments + 1):
         with np.errstate(over="ignore", invalid="ignore"):  # a run away is met below
             done = march(steps, wide, stacked, parts=parts, x0=_flat(x), z0=[_flat(value) for value in z], start=clocks)
@@ -91,10 +95,13 @@ def _sweeps(
         if not np.all(size < _RUNAWAY * np.maximum(largest, 1e-300)):
             return None
         moved = _corrections(done.states[-1].reshape(x.shape), x, over)
-        change = np.max(np.abs(moved) / np.maximum(size, 1e-300))
+        change = float(np.max(np.abs(moved) / np.maximum(size, 1e-300)))
         change = max(change, *(_hand_over(path, memory) for path, memory in zip(done.memories, z, strict=True)))
         if change < tolerance or sweep == segments:
             break
+        if sweep > _PATIENCE and change > _SHRINKS * changes[-_PATIENCE]:
+            return None
+        changes.append(change)
         x = x + moved
     return _join(done, (segments, Q, V, samples), parts, sweep)
 

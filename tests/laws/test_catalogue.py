@@ -257,3 +257,17 @@ def test_phi_functions_are_accurate_where_series_and_recursion_meet():
     np.testing.assert_allclose(x * two + 1, one, rtol=1e-12)
     np.testing.assert_allclose(x * three + 0.5, two, rtol=1e-12)
     assert phi(np.array(-1e-9))[3] == pytest.approx(1 / 6, rel=1e-8)
+
+
+def test_valves_of_a_damper_that_is_harder_in_one_direction_keep_their_forces_ratio():
+    a, knee, ratio, v = 0.3, 0.05, 0.25, np.linspace(-0.2, 0.2, 4001)
+    valves = find_law("damper_blowoff").force(Motion(0 * v, v), (knee, ratio), SPRING)
+    harder = find_law("damper_asymmetry").wider.force(Motion(0 * v, v), (a, knee, ratio), SPRING)
+    one_way = SPRING.damping * np.where(np.abs(v) < knee, v, np.sign(v) * knee + ratio * (v - np.sign(v) * knee))
+    np.testing.assert_allclose(SPRING.damping * v + valves + harder, (1 + a * np.sign(v)) * one_way, atol=1e-9)
+
+
+def test_stops_of_either_side_have_gaps_and_stiffnesses_of_their_own():
+    d = np.array([-0.03, -0.02, -0.01, 0.0, 0.01, 0.02])
+    force = find_law("bump_stop").wider.force(Motion(d, 0 * d), (0.015, 2e5, 0.02, 3e5), SPRING)
+    np.testing.assert_allclose(force, [-3e3, 0.0, 0.0, 0.0, 0.0, 1e3], atol=1e-9)

@@ -26,6 +26,7 @@ from sprung.model.diagnosis.investigation.inputs import best_input_fault, compen
 from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
+from sprung.model.diagnosis.investigation.widened import Widened, act_together, best_widened, left_open
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
@@ -81,6 +82,7 @@ def concluded(state: Investigation, tell: Progress) -> Outcome:
     """The model on the whole recording, its errors on the held-out part, and the verdict."""
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
+    final = replace(final, covariance=final.covariance + left_open(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
     return Outcome(state, final, before, after, noisy, judged(state, before, after, noisy))
@@ -185,9 +187,11 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
             and harmonic(state.problem.part, h.term, plausible) is None
         ]
 
-    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules))
+    gross = not state.problem.process_noise and float(np.sqrt(np.mean(misfit(state.fit)))) > options.rules.selection.gross
+    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
+    wide = best_widened(state) if hits or act_together(state) else None
     if not hits:
-        return state
+        return state if wide is None or not _outdoes(state, wide, []) else _with_wider(state, wide)
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
@@ -196,6 +200,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
     state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials, plausible)))
+    if wide is not None and _outdoes(state, wide, trials):
+        return _next_finding(_with_wider(state, wide), number, tell)
     if not trials:
         return state
     tell(share + 0.08, f"checking {trials[0].term.location}")
@@ -220,6 +226,25 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         last=screen(problem, fit, options.catalogue, options.project),
         notes=(*state.notes, *note),
     )
+
+
+def _outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
+    """Whether the wider form of a law found says more than what would be found next."""
+    if wide.evidence <= 0 or doubt(wide.fit, wide.fit.point.terms[wide.index], state.options.rules.plausible):
+        return False
+    if trials and trials[0].named and trials[0].evidence > wide.evidence:
+        return False
+    if trials and not trials[0].named and trials[0].explains > state.options.rules.selection.unnamed_ratio * wide.gain:
+        return False
+    held_out = state.options.held_out and not state.held.still
+    return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
+
+
+def _with_wider(state: Investigation, wide: Widened) -> Investigation:
+    """The investigation with a law that was found in its wider form."""
+    problem, fit = refreshed(state.problem, wide.fit)
+    last = screen(problem, fit, state.options.catalogue, state.options.project)
+    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 
 
 def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> list[str]:

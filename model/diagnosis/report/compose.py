@@ -135,7 +135,8 @@ def _summary(outcome: Outcome, findings: list[Finding], explained: float | None)
     said = outcome.judgement
     if said.verdict == "consistent":
         return "The nominal structure explains the recording down to the noise."
-    text = "; ".join(f.sentence for f in findings) or "Nothing in the system file fits this recording"
+    where = f": {said.where}" if said.where else ""
+    text = "; ".join(f.sentence for f in findings) or f"Nothing in the system file fits this recording{where}"
     if said.carried and said.strange is None and explained is not None and explained > 0:
         share = "100" if not said.where else f"{min(100 * explained, 99):.0f}"
         text += f"; explains {share} % of the excess error"

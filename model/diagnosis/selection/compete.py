@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.response.point import Point
-from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.rules import RULES, EvidenceRules, Rules, SelectionRules
 from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.diagnosis.selection.evidence import (
@@ -64,8 +64,19 @@ class Trial:
         return bic(self.gain, len(self.term.parameters), self.fit.count)
 
 
-def shortlist(screening: Screening, alpha: float, multiplicity: bool = True, rules: Rules = RULES) -> list[Candidate]:
-    """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere."""
+def shortlist(
+    screening: Screening,
+    alpha: float,
+    multiplicity: bool = True,
+    rules: Rules = RULES,
+    *,
+    gross: bool = False,
+) -> list[Candidate]:
+    """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere.
+
+    gross: whether the motion that they were scored along is far from the measured one.  Then scores tell the place, but
+    not which of an element's laws acts there: what yields all the time is hardly seen along a motion that does not.
+    """
     good = [h for h in screening.candidates if (screening.p_value(h) if multiplicity else h.p_single) <= alpha]
     if not good:
         return []
@@ -77,14 +88,15 @@ def shortlist(screening: Screening, alpha: float, multiplicity: bool = True, rul
     for hit in good:
         s = hit.strength(screened)
         share = chosen_by.close if hit.location == place else chosen_by.close_elsewhere
-        if s < share * top and s < top - chosen_by.near:
+        known = gross and hit.location == place and hit.term.law.named and is_waveform(hit.term)
+        if s < share * top and s < top - chosen_by.near and not known:
             continue
         if not hit.term.law.named:
             unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
             if unnamed[hit.location] > chosen_by.unnamed:
                 continue
         chosen.append(hit)
-        if len(chosen) >= chosen_by.most:
+        if len(chosen) >= (chosen_by.most_gross if gross else chosen_by.most):
             break
     return chosen
 

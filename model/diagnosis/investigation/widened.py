@@ -1,0 +1,133 @@
+"""Laws that were found, in their wider forms: valves and stops that differ in the two directions.
+
+Two laws of one element are fitted as a sum of forces, but act on each other: a damper that is harder in extension and
+blows off does so from a harder slope.  Their sum fits nearly as well and has other values, with deviations that know
+nothing of it.  So a law's wider form competes with what would be found next, and where it cannot be told from the
+narrow one, values are uncertain by what both say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.record.spectra import OVERSAMPLING
+from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.response.terms import WIDER, Term
+from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
+from sprung.model.laws import ElementLaw, Observed, observe
+from sprung.model.signals import FloatArray
+
+_FIRST, _MORE = 3, 10  # iterations of a start, and of the best one
+
+
+@dataclass(frozen=True)
+class Widened:
+    """A fit with one of its laws wider."""
+
+    fit: Fit
+    index: int  # of the term
+    gain: float  # twice the log-likelihood ratio against the narrower one
+    evidence: float  # gain less what the further parameters cost
+
+
+def best_widened(state: Investigation) -> Widened | None:
+    """The law found so far that gains most by its wider form; None: none has one."""
+    if state.problem.process_noise:
+        return None
+    tried = [(index, _widened(state, index)) for index in range(state.given, len(state.fit.point.terms))]
+    fits = [(index, fit) for index, fit in tried if fit is not None]
+    rules = state.problem.rules.evidence
+    least = min((fit.reduced for _, fit in fits), default=1.0)
+    # where one leaves less than the noise that the narrower one's misfit was taken for, by its own
+    quiet = rules.quiet * (least if least < rules.quiet else 1.0)
+    judged = [_judged(state, index, fit, quiet) for index, fit in fits]
+    return max(judged, key=lambda one: one.evidence, default=None)
+
+
+def left_open(state: Investigation) -> FloatArray:
+    """What the shapes of laws that act together leave open of parameters and laws, a covariance, (P + p, P + p).
+
+    The present form is chosen; between it and the best wider one lies what the recording does not tell, by the odds of
+    the two, a commoner form being no likelier than a rarer one here (Bayesian model averaging, Hoeting et al. 1999).
+    """
+    fit = state.fit
+    nothing = np.zeros_like(fit.covariance)
+    wide = best_widened(state) if act_together(state) else None
+    if wide is None:
+        return nothing
+    evidence = wide.evidence + wide.fit.point.terms[wide.index].law.prior_cost
+    odds = float(np.exp(np.clip(evidence / 2, -50.0, 50.0)))
+    share = odds / (1 + odds)
+    pairs = zip(fit.point.terms, wide.fit.point.terms, strict=True)
+    moved = [np.subtract(wider.parameters[: len(own.parameters)], own.parameters) for own, wider in pairs]
+    between = np.concatenate([wide.fit.point.theta - fit.point.theta, *moved])
+    return share * (1 - share) * np.outer(between, between) if np.all(np.isfinite(between)) else nothing
+
+
+def act_together(state: Investigation) -> bool:
+    """Whether several laws were found at one element, whose forces may be no mere sum."""
+    places = [found.trial.term.location for found in state.found if isinstance(found.trial.term.law, ElementLaw)]
+    return len(set(places)) < len(places)
+
+
+def _widened(state: Investigation, index: int) -> Fit | None:
+    """The fit with one of its laws in its wider form, from the best of several starts."""
+    problem, base = state.problem, state.fit
+    tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in _starts(base, index))
+    best = min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
+    if best is None or best.converged:
+        return best
+    on = try_optimise(problem, best.point, _MORE, base.whitener)
+    return on if on is not None and on.chi_square < best.chi_square else best
+
+
+def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> Widened:
+    """What the wider form is worth over the present fit."""
+    base, rules = state.fit, state.problem.rules.evidence
+    gain = profile_gain(base.residual, fit.residual, len(state.problem.sensors), quiet, rules)
+    gain = min(gain, base.chi_square - fit.chi_square)
+    return Widened(fit, index, gain, gain - _cost(state, fit, index))
+
+
+def _cost(state: Investigation, fit: Fit, index: int) -> float:
+    """What the further parameters of a widened law cost in evidence."""
+    term, place = fit.point.terms[index], fit.place(index)
+    more = slice(len(state.fit.point.terms[index].parameters), None)
+    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[place][more], 0)) / np.abs(term.slopes[more])
+    logs = [spec.log for spec in term.law.parameters[more]]
+    return occam_cost(logs, term.scales[more], sigma, state.problem.rules.evidence) + term.law.prior_cost
+
+
+def _starts(base: Fit, index: int) -> Iterator[Point]:
+    """Starts of the wider form of a term: as other laws of the element have it, and as the law itself says."""
+    term = base.point.terms[index]
+    law = term.law
+    wider = law.wider if isinstance(law, ElementLaw) else None
+    if wider is None or wider.widened is None:
+        return
+    seen = _seen(base, term)
+    scales = tuple(max(abs(spec.typical(seen)), 1e-12) for spec in wider.parameters)
+    known: dict[str, float] = {}
+    for other in base.point.terms:
+        if other.location == term.location and other is not term:
+            known |= zip(other.law.names, other.parameters, strict=True)
+    further = wider.names[len(term.parameters) :]
+    starts = [(*term.parameters, *(known[name] for name in further))] if known.keys() >= {*further} else []
+    for values in (*starts, *wider.widened(term.parameters, seen)):
+        clipped = tuple(float(value) for value in wider.clip(values))
+        moved = replace(term, law=wider, parameters=clipped, scales=scales, variant=WIDER, fixed=())
+        terms = (*base.point.terms[:index], moved, *base.point.terms[index + 1 :])
+        yield replace(base.point, terms=terms)
+
+
+def _seen(base: Fit, term: Term) -> Observed:
+    """The motion of a term's element."""
+    port, thin = term.port(base.forward.system), slice(None, None, OVERSAMPLING)
+    d, v = (motion[thin] @ port for motion in base.element_motion)
+    element = base.forward.element_of(term)
+    return observe(d, v, 1 / base.forward.part.grid.step, float(element.stiffness), float(element.damping))
