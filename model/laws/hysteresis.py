@@ -238,6 +238,7 @@ BOUC_WEN = replace(
         parameters=(*_BOUC_WEN.parameters, _FREE),
         shapes=_free_shapes,
         absent=(*_BOUC_WEN.absent, GAMMA),
+        widened=lambda p, seen: ((*p, GAMMA),),
         prior_cost=RARE,
         sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
         memory_formula="v - beta * abs(z)**n * (abs(v) * sign(z) + gamma * v)",

@@ -190,8 +190,11 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     gross = not state.problem.process_noise and float(np.sqrt(np.mean(misfit(state.fit)))) > options.rules.selection.gross
     hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
     wide = best_widened(state) if hits or act_together(state) else None
+    promised = max((hit.score for hit in hits), default=0.0)
+    if wide is not None and wide.fall > promised and _outdoes(state, wide, []):
+        return _next_finding(_with_wider(state, wide), number, tell)
     if not hits:
-        return state if wide is None or not _outdoes(state, wide, []) else _with_wider(state, wide)
+        return state
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]

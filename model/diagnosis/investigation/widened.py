@@ -22,7 +22,7 @@ from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
 from sprung.model.laws import ElementLaw, Observed, observe
 from sprung.model.signals import FloatArray
 
-_FIRST, _MORE = 3, 10  # iterations of a start, and of the best one
+_FIRST, _MORE, _ROUNDS = 3, 10, 3  # iterations of a start, and of the best one in a round; rounds while it falls
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,8 @@ class Widened:
 
     fit: Fit
     index: int  # of the term
-    gain: float  # twice the log-likelihood ratio against the narrower one
+    fall: float  # of chi-square against the narrower one
+    gain: float  # twice the log-likelihood ratio
     evidence: float  # gain less what the further parameters cost
 
 
@@ -80,18 +81,23 @@ def _widened(state: Investigation, index: int) -> Fit | None:
     problem, base = state.problem, state.fit
     tried = (try_optimise(problem, start, _FIRST, base.whitener) for start in _starts(base, index))
     best = min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
-    if best is None or best.converged:
-        return best
-    on = try_optimise(problem, best.point, _MORE, base.whitener)
-    return on if on is not None and on.chi_square < best.chi_square else best
+    for _ in range(_ROUNDS):
+        if best is None or best.converged:
+            break
+        on = try_optimise(problem, best.point, _MORE, base.whitener)
+        if on is None or on.chi_square >= best.chi_square:
+            break
+        best = on
+    return best
 
 
 def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> Widened:
     """What the wider form is worth over the present fit."""
     base, rules = state.fit, state.problem.rules.evidence
     gain = profile_gain(base.residual, fit.residual, len(state.problem.sensors), quiet, rules)
-    gain = min(gain, base.chi_square - fit.chi_square)
-    return Widened(fit, index, gain, gain - _cost(state, fit, index))
+    fall = base.chi_square - fit.chi_square
+    gain = min(gain, fall)
+    return Widened(fit, index, fall, gain, gain - _cost(state, fit, index))
 
 
 def _cost(state: Investigation, fit: Fit, index: int) -> float:

@@ -1,0 +1,24 @@
+"""Which screened candidates are fitted: along a motion far from the measured one, scores tell the place alone."""
+
+import pytest
+
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.families import ELEMENT
+from sprung.model.diagnosis.screening.score import Candidate, Screening
+from sprung.model.diagnosis.selection.compete import shortlist
+from sprung.model.laws import find_law
+
+SCORES = {
+    ("storey", "cubic_stiffness"): 9e4,
+    ("storey", "air_spring"): 3e4,
+    ("storey", "bouc_wen"): 4e3,
+    ("roof", "bouc_wen"): 5e3,
+}
+
+
+@pytest.mark.parametrize("gross", [True, False])
+def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gross):
+    hits = [Candidate(Term(law := find_law(name), at, law.absent), s, ELEMENT) for (at, name), s in SCORES.items()]
+    chosen = shortlist(Screening(tuple(hits), {ELEMENT: 100}), alpha=1e-3, gross=gross)
+    plain = [("storey", "cubic_stiffness"), ("storey", "air_spring")]
+    assert [(one.location, one.effect) for one in chosen] == plain + [("storey", "bouc_wen")] * gross
