@@ -187,7 +187,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
             and harmonic(state.problem.part, h.term, plausible) is None
         ]
 
-    gross = not state.problem.process_noise and float(np.sqrt(np.mean(misfit(state.fit)))) > options.rules.selection.gross
+    error = float(np.sqrt(np.mean(misfit(state.fit))))
+    gross = not state.problem.process_noise and error > options.rules.selection.gross
     hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
     wide = best_widened(state) if hits or act_together(state) else None
     promised = max((hit.score for hit in hits), default=0.0)

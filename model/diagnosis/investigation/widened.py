@@ -61,7 +61,8 @@ def left_open(state: Investigation) -> FloatArray:
     wide = best_widened(state) if act_together(state) else None
     if wide is None:
         return nothing
-    evidence = wide.evidence + wide.fit.point.terms[wide.index].law.prior_cost
+    rules = state.problem.rules.evidence
+    evidence = wide.evidence + rules.rarity * wide.fit.point.terms[wide.index].law.prior_cost
     odds = float(np.exp(np.clip(evidence / 2, -50.0, 50.0)))
     share = odds / (1 + odds)
     pairs = zip(fit.point.terms, wide.fit.point.terms, strict=True)
@@ -106,7 +107,8 @@ def _cost(state: Investigation, fit: Fit, index: int) -> float:
     more = slice(len(state.fit.point.terms[index].parameters), None)
     sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[place][more], 0)) / np.abs(term.slopes[more])
     logs = [spec.log for spec in term.law.parameters[more]]
-    return occam_cost(logs, term.scales[more], sigma, state.problem.rules.evidence) + term.law.prior_cost
+    rules = state.problem.rules.evidence
+    return occam_cost(logs, term.scales[more], sigma, rules) + rules.rarity * term.law.prior_cost
 
 
 def _starts(base: Fit, index: int) -> Iterator[Point]:

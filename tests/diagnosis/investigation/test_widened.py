@@ -13,6 +13,7 @@ from sprung.model.diagnosis.investigation import widened
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.widened import act_together, best_widened, left_open
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.starts import start_of
 from sprung.model.laws import find_law
 from tests.diagnosis_cases import DAMPING, quarter_car, simulate
@@ -54,7 +55,7 @@ def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch):
     wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0)))
     monkeypatch.setattr(widened, "act_together", lambda state: True)
     monkeypatch.setattr(widened, "best_widened", lambda state: wide)
-    state: Any = SimpleNamespace(fit=fit)
+    state: Any = SimpleNamespace(fit=fit, problem=SimpleNamespace(rules=RULES))
     np.testing.assert_allclose(left_open(state), [[0.0, 0.0], [0.0, 0.25 * 0.1**2]])
     wide.evidence = -60.0
     assert np.all(left_open(state) < 1e-12)
