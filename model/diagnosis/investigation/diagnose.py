@@ -21,6 +21,7 @@ from sprung.model.diagnosis.investigation.course import (
 )
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of, left
+from sprung.model.diagnosis.investigation.formula_doubt import missing
 from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
@@ -301,14 +302,15 @@ def _makes_way(state: Investigation, leader: Trial, formula: Trial) -> bool:
     if not leader.named or formula.explains > rules.beyond * leader.explains:
         return True
     settled = left(state.problem, leader.fit) == 0
-    return settled and formula.evidence > leader.evidence + rules.likelier
+    single = formula.term.element_law.strength is not None  # the second of two shapes may be another law's
+    return settled and single and formula.evidence > leader.evidence + rules.likelier
 
 
 def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
     """The trial whose force a formula may be of; None: there is none.
 
     The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much,
-    or says less than that force by more than chance.
+    or says less than that force by more than chance; a named force itself where what it leaves follows its motion.
     """
     leader, rules = plain[0], state.options.rules.formula
     if not leader.named:
@@ -320,7 +322,8 @@ def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
         if not force.named and leader.gain < rules.says * force.gain:
             luck = chance(force.gain - leader.gain, max(1, force.freedom - leader.freedom), 1)
             return force if luck < state.options.alpha else None
-    return None
+    follows = any(leader is one for one in forces) and missing(state.problem, leader.fit) > rules.missing
+    return leader if follows else None
 
 
 def _smoother(state: Investigation, fit: Fit) -> Fit:

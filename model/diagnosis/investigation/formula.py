@@ -38,6 +38,10 @@ def formula_of(problem: Problem, base: Fit, unnamed: Trial, held: HeldOut) -> tu
         if found is None or left(problem, found.fit) > 0:
             trials = graded(problem, base, [*trials, *compete(problem, base, pairs)])
             found, reason = _told(problem, base, trials, unnamed, held)
+            if found is not None:  # a single shape may do along its motion, where it did not along the unnamed force's
+                singles, _ = FormulaSearch.along(problem, found.fit).best()
+                trials = graded(problem, base, [*trials, *compete(problem, base, singles)])
+                found, reason = _told(problem, base, trials, unnamed, held)
         if found is not None:
             return _plain(found), ""
         leader = min((trial.fit for trial in trials if trial.finished), key=lambda fit: fit.deviance, default=leader)
