@@ -11,7 +11,7 @@ from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.diagnose import _led_by
+from sprung.model.diagnosis.investigation import diagnose as course
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.compete import Trial
@@ -64,8 +64,14 @@ def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop(
     assert (finding.location, finding.effect) == ("secondary", "formula")
 
 
-@pytest.mark.parametrize(("gain", "expected"), [(1000.0, False), (1020.0, False), (1100.0, True)])
-def test_a_named_law_is_questioned_where_a_free_force_says_more_by_more_than_chance(gain, expected):
+@pytest.mark.parametrize(
+    ("gain", "left", "expected"),
+    [(1000.0, 0.0, None), (1020.0, 0.0, None), (1100.0, 0.0, "force"), (1020.0, 0.08, "stop")],
+)
+def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_follows_the_motion(
+    monkeypatch, gain, left, expected
+):
+    monkeypatch.setattr(course, "missing", lambda problem, fit: left)
     fit = SimpleNamespace(reduced=0.9, count=10_000)
 
     def trial(law, gain, freedom):
@@ -82,7 +88,7 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_by_more_than_cha
         system=quarter_car(),
     )
     leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
-    assert _led_by(state, [leader, unnamed]) is (unnamed if expected else None)
+    assert course._led_by(state, [leader, unnamed]) is {"force": unnamed, "stop": leader, None: None}[expected]
 
 
 def test_a_law_of_the_catalogue_stays_one():
