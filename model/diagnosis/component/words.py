@@ -8,6 +8,7 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.formula import FormulaPiece
+from sprung.model.diagnosis.component.low_valve import valve_as_well
 from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
@@ -32,7 +33,7 @@ def finding_of(
     if piece.dissipates:
         quoted += (_loop_area(fit),)
     quoted += _forces_at_rates(fit)
-    family = _family(step)
+    family = _family(step, valve_as_well(fit, index))
     rival = step.rivals[0] if step.rivals else None
     freedom = len(piece.signs) + len(piece.shapes)
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
@@ -82,14 +83,15 @@ def _parameters(values: Values, sigma: FloatArray) -> tuple[LawParameter, ...]:
     )
 
 
-def _family(step: Step) -> str | None:
-    """Laws that the recording cannot tell from the chosen one."""
+def _family(step: Step, as_well: str | None = None) -> str | None:
+    """Laws that the recording cannot tell from the chosen one; as_well: one that was held against it alone."""
     best = step.chosen
     near = [
         r.last.effect
         for r in step.rivals
         if r.evidence > best.evidence - best.fit.task.rules.naming_margin and r.last.effect != best.last.effect
     ]
+    near += [as_well] if as_well is not None else []
     return " or ".join([best.last.effect, *dict.fromkeys(near)]) if near else None
 
 

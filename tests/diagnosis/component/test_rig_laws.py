@@ -123,3 +123,15 @@ def test_what_an_unmeasured_current_controls_is_unknown_and_predicted_no_worse_t
     by_hand = force - bouc_wen(D, V, force, split)
     error = np.sqrt(np.mean(by_hand[split:] ** 2)) / np.std(force[split:])
     assert report.augmented_validation.nrmse < 1.01 * error
+
+
+@pytest.mark.parametrize(("smoothing", "told"), [(2e-3, True), (0.08, False)])
+def test_a_friction_that_turns_slowly_is_not_told_from_a_valve(smoothing: float, told: bool) -> None:
+    """Of a rate's deviation: a jump, which no valve imitates, and a knee that noise hides."""
+    rate = smoothing * float(np.std(V))
+    valve = 150 * np.clip(V / (1.5 * rate), -1, 1)
+    report = diagnosed(K * D + C * V + (150 * np.tanh(V / rate) if told else valve), noise=30.0)
+    (friction,) = [f for f in report.findings if f.effect in ("coulomb_friction", "damper_blowoff")]
+    assert (friction.family is None) is told
+    if not told:
+        assert {"coulomb_friction", "damper_blowoff"} <= set(friction.family.split(" or "))
