@@ -212,12 +212,7 @@ def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:
 
 def _packed(record: _Record) -> dict[str, str]:
     """A record of nothing but arrays."""
-    return {name: _pack(getattr(record, name)) for name in _names(type(record))}
-
-
-@cache
-def _names(kind: type[_Record]) -> tuple[str, ...]:
-    return tuple(field.name for field in fields(kind))
+    return {field.name: _pack(getattr(record, field.name)) for field in fields(record)}
 
 
 @cache
@@ -232,7 +227,7 @@ def _unpack_all(packed: Mapping[str, str]) -> dict[str, Any]:
 
 def _pack(array: Any) -> str:
     kind = _little_endian(array.dtype)
-    return kind + ":" + b2a_base64(np.ascontiguousarray(array, kind), newline=False).decode("ascii")
+    return kind + ":" + b2a_base64(np.ascontiguousarray(array, kind).data, newline=False).decode("ascii")
 
 
 @cache
