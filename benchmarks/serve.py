@@ -39,7 +39,7 @@ def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iter
         ports = [free_port(), free_port()]
         servers = [
             context.Process(target=_serve_echo, args=(ports[0],), daemon=True),
-            context.Process(target=serve_sprung, args=(ports[1], folder), daemon=True),
+            context.Process(target=serve_sprung, args=(ports[1], folder)),  # no daemon: it has children
         ]
         for server in servers:
             server.start()

@@ -80,7 +80,7 @@ class Settings(BaseSettings):
     batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction
 
     parameter_series_vehicles: int = Field(default=20, ge=0)  # vehicles with per-parameter metrics
-    vehicles_in_memory: int = Field(default=256, gt=0)  # tracker states held between windows
+    vehicles_in_memory: int = Field(default=1000, gt=0)  # tracker states held between windows
     ring_vehicles: int = Field(default=100, gt=0)  # vehicles whose recent samples are held, 1.3 MB each
     ring_seconds: float = Field(default=60.0, gt=0)
 
