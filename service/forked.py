@@ -5,6 +5,7 @@ Threads of one interpreter do not run beside each other, and slow each other dow
 
 from __future__ import annotations
 
+import atexit
 import gc
 import logging
 import multiprocessing
@@ -55,6 +56,7 @@ class ForkedFunctions:
         process.start()
         theirs.close()
         self._there: tuple[BaseProcess, Connection] | None = (process, mine)
+        atexit.register(self.close)  # before multiprocessing's own, which would wait for it
 
     @property
     def pid(self) -> int | None:
@@ -89,6 +91,7 @@ class ForkedFunctions:
 
     def close(self) -> None:
         """End the process."""
+        atexit.unregister(self.close)
         with self._lock:
             if self._there is not None:
                 process, connection = self._there
@@ -102,8 +105,8 @@ def _work(parent: int, functions: Mapping[str, Callable[..., Any]], not_mine: Co
     """The forked process."""
     tie(parent)
     not_mine.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the whole group; the parent decides
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    for told_all in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and service managers tell the whole group; the parent,
+        signal.signal(told_all, signal.SIG_IGN)  # which finishes what it accepted, decides
     gc.freeze()  # what the parent made is not looked through, so that its memory stays shared
     with suppress(EOFError, OSError):
         while True:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
@@ -78,6 +79,22 @@ def test_it_ends_with_the_process_that_made_it(tmp_path: Path) -> None:
     while Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]:
         assert time.monotonic() < deadline, "it is still there"
         time.sleep(0.02)
+
+
+def test_it_is_not_ended_by_what_tells_its_parent_to_finish(doubling: ForkedFunctions) -> None:
+    assert doubling.pid is not None
+    os.kill(doubling.pid, signal.SIGTERM)
+    assert doubling.call("double", 3) == 6
+
+
+def test_an_interpreter_that_forgets_to_close_it_ends_all_the_same() -> None:
+    code = (
+        "from sprung.service.forked import ForkedFunctions\n"
+        "forked = ForkedFunctions('waits', {'abs': abs})\n"
+        "print(forked.call('abs', -7))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr, done.returncode) == ("7\n", "", 0)
 
 
 def test_calls_of_several_threads_get_their_own_answers(doubling: ForkedFunctions) -> None:
