@@ -27,7 +27,7 @@ from sprung.model.diagnosis.investigation.inputs import best_input_fault, compen
 from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
-from sprung.model.diagnosis.investigation.widened import Widened, act_together, best_widened, left_open
+from sprung.model.diagnosis.investigation.widened import act_together, best_widened, left_open, outdoes, with_wider
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
@@ -40,7 +40,7 @@ from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, 
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.diagnosis.selection.holdout import HeldOut
 from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
-from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw
+from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.system import System
 
 
@@ -193,8 +193,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
     wide = best_widened(state) if hits or act_together(state) else None
     promised = max((hit.score for hit in hits), default=0.0)
-    if wide is not None and wide.fall > promised and _outdoes(state, wide, []):
-        return _next_finding(_with_wider(state, wide), number, tell)
+    if wide is not None and wide.fall > promised and outdoes(state, wide, []):
+        return _next_finding(with_wider(state, wide), number, tell)
     if not hits:
         return state
     share = 0.25 + 0.17 * number
@@ -205,8 +205,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
     state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials, plausible)))
-    if wide is not None and _outdoes(state, wide, trials):
-        return _next_finding(_with_wider(state, wide), number, tell)
+    if wide is not None and outdoes(state, wide, trials):
+        return _next_finding(with_wider(state, wide), number, tell)
     if not trials:
         return state
     tell(share + 0.08, f"checking {trials[0].term.location}")
@@ -231,25 +231,6 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         last=screen(problem, fit, options.catalogue, options.project),
         notes=(*state.notes, *note),
     )
-
-
-def _outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
-    """Whether the wider form of a law found says more than what would be found next."""
-    if wide.evidence <= 0 or doubt(wide.fit, wide.fit.point.terms[wide.index], state.options.rules.plausible):
-        return False
-    if trials and trials[0].named and trials[0].evidence > wide.evidence:
-        return False
-    if trials and not trials[0].named and trials[0].explains > state.options.rules.selection.unnamed_ratio * wide.gain:
-        return False
-    held_out = state.options.held_out and not state.held.still
-    return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
-
-
-def _with_wider(state: Investigation, wide: Widened) -> Investigation:
-    """The investigation with a law that was found in its wider form."""
-    problem, fit = refreshed(state.problem, wide.fit)
-    last = screen(problem, fit, state.options.catalogue, state.options.project)
-    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 
 
 def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> list[str]:
@@ -376,7 +357,7 @@ def _minor(state: Investigation, trial: Trial) -> bool:
             left = float(np.sum(state.fit.noise.force**2))
             if trial.worth < min(rules.minor_beside * found.trial.worth, rules.most_left * left):
                 return True
-        elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index):
+        elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index, found.trial.term.law):
             return True
     return False
 
@@ -391,10 +372,13 @@ def _takes_up(state: Investigation, trial: Trial) -> bool:
     return any(parts & {place, elements[place].upper, elements[place].lower} for place in stronger)
 
 
-def _worth(fit: Fit, index: int) -> float:
-    """By how much chi-square would rise without a term of a fit, by its strength and that one's deviation (Wald)."""
+def _worth(fit: Fit, index: int, found: Law) -> float:
+    """By how much chi-square would rise without a term of a fit, by its strength and that one's deviation (Wald).
+
+    found: its law before it was widened, which may have a strength where the wider one has two.
+    """
     term = fit.point.terms[index]
-    strength = (term.law.strength if isinstance(term.law, ElementLaw) else None) or 0
+    strength = (found.strength if isinstance(found, ElementLaw) else None) or 0
     if not term.parameters:
         return 0.0
     absent = term.law.absent[strength] if isinstance(term.law, ElementLaw) else 0.0

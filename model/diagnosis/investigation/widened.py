@@ -13,12 +13,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
+from sprung.model.diagnosis.selection.plausible import doubt
 from sprung.model.laws import ElementLaw, Observed, observe
 from sprung.model.signals import FloatArray
 
@@ -48,6 +52,25 @@ def best_widened(state: Investigation) -> Widened | None:
     quiet = rules.quiet * (least if least < rules.quiet else 1.0)
     judged = [_judged(state, index, fit, quiet) for index, fit in fits]
     return max(judged, key=lambda one: one.evidence, default=None)
+
+
+def outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
+    """Whether the wider form of a law found says more than what would be found next."""
+    if wide.evidence <= 0 or doubt(wide.fit, wide.fit.point.terms[wide.index], state.options.rules.plausible):
+        return False
+    if trials and trials[0].named and trials[0].evidence > wide.evidence:
+        return False
+    if trials and not trials[0].named and trials[0].explains > state.options.rules.selection.unnamed_ratio * wide.gain:
+        return False
+    held_out = state.options.held_out and not state.held.still
+    return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
+
+
+def with_wider(state: Investigation, wide: Widened) -> Investigation:
+    """The investigation with a law that was found in its wider form."""
+    problem, fit = refreshed(state.problem, wide.fit)
+    last = screen(problem, fit, state.options.catalogue, state.options.project)
+    return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 
 
 def left_open(state: Investigation) -> FloatArray:
