@@ -18,7 +18,7 @@ class HealthyRecord:
 
     sample_rate, lost = RATE, 0
 
-    def __init__(self, seed: int, seconds: float = 27.0) -> None:
+    def __init__(self, seed: int, seconds: float = 16.0) -> None:
         vehicle = read_vehicle(MANCHESTER)
         made = next(make_recordings(vehicle, draw_cases(vehicle, 1, seed, ["clean"]), seconds))
         names = [f"{w}.{q}" for q in ("displacement", "velocity") for w in vehicle.inputs] + list(vehicle.sensors)

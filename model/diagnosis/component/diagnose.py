@@ -9,7 +9,6 @@ import numpy as np
 
 from sprung.model.diagnosis.component.fit import (
     ComponentFit,
-    ComponentTask,
     covariance,
     fitted,
     left_open,
@@ -18,7 +17,7 @@ from sprung.model.diagnosis.component.fit import (
 )
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
-from sprung.model.diagnosis.component.measured import ComponentRecord, component_records
+from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
 from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Lag
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.search import (
@@ -114,7 +113,7 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
 
 
 def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
-    turned = _turned(one.task)
+    turned = turned_round(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
     found = search(one.task, (*PIECES, *one.own), tell, one.given)
@@ -169,20 +168,6 @@ def _established(judged: Judged) -> Judged:
     one = replace(judged, found=replace(judged.found, steps=steps[:1]), final=final, floor=final.floor)
     alone = one.errors.explained()
     return one if alone is not None and alone >= task.rules.named else judged
-
-
-def _turned(task: ComponentTask) -> bool:
-    """Whether the component would feed energy into the rig, or push away from where it is: a wrong sign.
-
-    Springs and dampers take the other sign with the force; a nominal value that the file fixes says nothing here.
-    """
-    d = task.motion.deflection - np.mean(task.motion.deflection)
-    columns = np.column_stack([np.ones(len(d)), d, task.motion.rate])[: task.split]
-    force = task.force[: task.split]
-    solved = np.linalg.lstsq(columns, force, rcond=None)[0]
-    with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
-    found: bool = sum(with_sign) < 0 and abs(min(with_sign)) > task.rules.turned * max(*with_sign, 0.0)
-    return found
 
 
 def _with_formula(judged: Judged) -> Judged | None:

@@ -26,6 +26,7 @@ from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
+_ENOUGH = 1e-6  # change of the squares, or of the shapes, at which it ends: far below any deviation
 _RELATIVE = 1e-4  # steps of finite differences
 _KEPT = 2_500_000  # samples of columns that a task remembers: rounds of trials and refinements ask for them again
 
@@ -269,7 +270,9 @@ def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     def residual(x: FloatArray) -> FloatArray:
         return fitted(task, at(x)).residual[: task.split] / size
 
-    found = least_squares(residual, inner, bounds=(low, high), diff_step=1e-3, max_nfev=_STEPS, x_scale=0.3)
+    found = least_squares(
+        residual, inner, bounds=(low, high), diff_step=1e-3, max_nfev=_STEPS, x_scale=0.3, ftol=_ENOUGH, xtol=_ENOUGH
+    )
     best, first = fitted(task, at(found.x)), fitted(task, model)
     return best if best.error <= first.error else first
 

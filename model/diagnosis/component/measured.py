@@ -167,13 +167,7 @@ def _record(
     stated = system.file.elements[element]
     sizes = observed(motion, SpringDamper(stated.stiffness.value, stated.damping.value))
     given, held = given_model(system, element, sizes, notes)
-    own, others = own_pieces(laws, element, sizes)
-    if others:
-        notes.append(
-            f"{element}: not searched here: {', '.join(others)}: a component test tries laws of an element whose force "
-            "is linear in `strength`, and follows from the motion alone or with the element's stiffness or damping as "
-            "a factor"
-        )
+    own = own_pieces(laws, element, sizes, notes)
     task = ComponentTask(
         motion=motion.with_noise(left.deflection, left.rate),
         force=f[run],
@@ -300,3 +294,17 @@ def _longest(good: np.ndarray, gap: int) -> tuple[int, int]:
     starts, ends = np.concatenate([[0], breaks + 1]), np.concatenate([breaks, [len(at) - 1]])
     best = int(np.argmax(at[ends] - at[starts]))
     return int(at[starts[best]]), int(at[ends[best]]) + 1
+
+
+def turned_round(task: ComponentTask) -> bool:
+    """Whether the component would feed energy into the rig, or push away from where it is: a wrong sign.
+
+    Springs and dampers take the other sign with the force; a nominal value that the file fixes says nothing here.
+    """
+    d = task.motion.deflection - np.mean(task.motion.deflection)
+    columns = np.column_stack([np.ones(len(d)), d, task.motion.rate])[: task.split]
+    force = task.force[: task.split]
+    solved = np.linalg.lstsq(columns, force, rcond=None)[0]
+    with_sign = solved[1] * float(np.std(d)), solved[2] * float(np.std(task.motion.rate))
+    found: bool = sum(with_sign) < 0 and abs(min(with_sign)) > task.rules.turned * max(*with_sign, 0.0)
+    return found

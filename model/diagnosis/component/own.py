@@ -29,8 +29,8 @@ def observed(motion: ElementMotion, element: SpringDamper) -> Observed:
     return observe(d, motion.rate, 1 / motion.step, element.stiffness, element.damping)
 
 
-def own_pieces(laws: Sequence[Law], element: str, seen: Observed) -> tuple[tuple[Piece, ...], tuple[str, ...]]:
-    """Pieces of the laws that can act at an element and be searched, and the names of the others."""
+def own_pieces(laws: Sequence[Law], element: str, seen: Observed, notes: list[str]) -> tuple[Piece, ...]:
+    """Pieces of the laws that can act at an element and be searched; notes: gets a line that names the others."""
     pieces, others = [], []
     for law in laws:
         if isinstance(law, ElementLaw) and law.at and element not in law.at:
@@ -38,7 +38,13 @@ def own_pieces(laws: Sequence[Law], element: str, seen: Observed) -> tuple[tuple
         piece = own_piece(law, seen) if isinstance(law, ElementLaw) and law.where == "element" else None
         others += [law.name] if piece is None else []
         pieces += [] if piece is None else [piece]
-    return tuple(pieces), tuple(others)
+    if others:
+        notes.append(
+            f"{element}: not searched here: {', '.join(others)}: a component test tries laws of an element whose force "
+            "is linear in `strength`, and follows from the motion alone or with the element's stiffness or damping as "
+            "a factor"
+        )
+    return tuple(pieces)
 
 
 def own_piece(law: ElementLaw, seen: Observed) -> Piece | None:
