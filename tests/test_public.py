@@ -41,7 +41,7 @@ def documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_recording(tmp_path / "ride.mcap", system.channels, values, 100.0, 1_790_000_000 * 10**9)
     (tmp_path / "rig.yaml").write_text(RIG)
     rig_system = sprung.parse_system(RIG)
-    write_recording(tmp_path / "rig.csv", rig_system.channels, rig(6.0, rng).values, 100.0, 10**18)
+    write_recording(tmp_path / "rig.csv", rig_system.channels, rig(rng, 6.0).values, 100.0, 10**18)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
