@@ -120,6 +120,7 @@ def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear):
         assert slopes[i] == pytest.approx((up - down) / 2e-4, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
     gap, stop = 1.2e-3, 2e5
     report = diagnose(
@@ -150,6 +151,7 @@ def test_friction_shows_in_a_free_decay_without_any_input():
     assert any("hardly moves" in note for note in report.advice)
 
 
+@pytest.mark.slow
 def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family():
     """The loop of the Bouc-Wen benchmark (Noel and Schoukens 2016): gamma -1.375, where the common form has 0.5."""
     alpha, beta, gamma = 2e4, 800.0, -1.375

@@ -51,6 +51,7 @@ def test_a_flat_on_one_wheel_is_found_named_and_sized():
     assert abs(phase.value - 0.3) < 0.02
 
 
+@pytest.mark.slow
 def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
     record = HealthyRecord(32)
     for wheel in ("wheel_21l", "wheel_21r"):
@@ -61,6 +62,7 @@ def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
     assert abs(depth.value - 3e-4) < 4 * depth.std
 
 
+@pytest.mark.slow
 def test_a_late_axle_is_a_fault_of_the_measurement():
     record = HealthyRecord(33)
     for wheel in ("wheel_21l", "wheel_21r"):

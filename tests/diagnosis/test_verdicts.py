@@ -43,6 +43,7 @@ def test_what_a_recording_does_not_tell_apart_is_called_a_family():
     assert finding.advice is not None and "would tell them apart" in finding.advice
 
 
+@pytest.mark.slow
 def test_friction_whose_corner_is_sharper_than_sampling_shows_says_so():
     sharp = 0.0003
     report = _diagnose(simulate(lambda d, v: 300 * np.tanh(v / sharp), seed=26))

@@ -86,11 +86,11 @@ def wrong(values: FloatArray, kind: str) -> FloatArray:
     ("kind", "effect", "place", "value"),
     [
         ("late node", "node_delay", "a1|a2|a3", 0.08),
-        ("late force", "node_delay", "shaker", 0.08),
+        pytest.param("late force", "node_delay", "shaker", 0.08, marks=pytest.mark.slow),
         pytest.param("reversed sensor", "sign_reversed", "a2", None, marks=pytest.mark.slow),
         pytest.param("exchanged", "channels_swapped", "a1|a3", None, marks=pytest.mark.slow),
         ("kN", "wrong_scale", "shaker", 1e-3),
-        ("g", "wrong_scale", "a1|a2|a3", 1 / 9.80665),
+        pytest.param("g", "wrong_scale", "a1|a2|a3", 1 / 9.80665, marks=pytest.mark.slow),
     ],
 )
 def test_a_wrong_set_up_under_a_measured_force_is_named(
