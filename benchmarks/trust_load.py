@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sprung.benchmarks.serve import window_body
-from sprung.benchmarks.trust_service import Served
+from sprung.benchmarks.trust_service import Served, children
 from sprung.model.system import MANCHESTER, load_system
 
 VEHICLES, MOST_CONNECTIONS = 100, 100
@@ -113,11 +113,15 @@ def _post(connection: http.client.HTTPConnection, body: bytes) -> int:
 
 
 def resident(pid: int) -> int:
-    """Bytes."""
-    try:
-        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * 4096
-    except OSError:
-        return 0
+    """Bytes of a process and its children; what several share counts once."""
+    total = 0
+    for one in (pid, *children(pid)):
+        try:
+            lines = Path(f"/proc/{one}/smaps_rollup").read_text().splitlines()
+        except OSError:
+            continue
+        total += next((int(line.split()[1]) * 1024 for line in lines if line.startswith("Pss:")), 0)
+    return total
 
 
 def figures(

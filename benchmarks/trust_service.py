@@ -64,18 +64,19 @@ class Served:
 
     def kill(self) -> int:
         """SIGKILL; the number of its children that are still there ten seconds later."""
-        children = _children(self.process.pid)
-        if self._traced and children:  # the service is the tracer's child, and would outlive it
-            Forked(children[0]).kill()
+        made = children(self.process.pid)
+        if self._traced and made:  # the service is the tracer's child, and would outlive it
+            Forked(made[0]).kill()
             self.process.wait(30.0)
         self.process.kill()
         deadline = time.monotonic() + 10
-        while (left := [pid for pid in children if alive(pid)]) and time.monotonic() < deadline:
+        while (left := [pid for pid in made if alive(pid)]) and time.monotonic() < deadline:
             time.sleep(0.05)
         return len(left)
 
 
-def _children(pid: int) -> list[int]:
+def children(pid: int) -> list[int]:
+    """Processes that a process has made."""
     found: list[int] = []
     for path in Path(f"/proc/{pid}/task").glob("*/children"):
         with suppress(OSError):

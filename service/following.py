@@ -129,6 +129,10 @@ class FollowingApart:
                 found: list[FollowedWindows] = self.forked.call("follow", sent, self._too_many(keys), now)
             except ProcessEnded:
                 return follow(asked, now)
+            except BaseException:  # of one vehicle; what the process has made of those before it, nobody knows here
+                for key in keys:
+                    self._there.pop(key, None)
+                raise
             for key, passed in zip(keys, found, strict=True):
                 self._there[key] = passed.followed.state
                 self._there.move_to_end(key)

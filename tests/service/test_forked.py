@@ -24,6 +24,7 @@ from sprung.service.following import FollowingApart, follow
 from sprung.service.forked import ForkedFunctions, ProcessEnded
 from sprung.service.identifying import IdentifierApart
 from sprung.service.pipeline import Pipeline
+from sprung.service.processed import ToFold
 from sprung.service.store import Store, open_store
 from tests.service_fakes import make_window
 
@@ -156,3 +157,28 @@ def _relearn(pipeline: Pipeline, store: Store) -> None:
     with store.write() as connection:
         batch = pipeline.relearn("a", None, connection)
     pipeline.tell(batch)
+
+
+def test_a_vehicle_that_fails_leaves_the_others_as_they_were(engine: Engine, system: System, tmp_path: Path) -> None:
+    """Of a batch that failed nothing is stored, so that nothing of it may be remembered."""
+    windows = [make_window(system, n) for n in range(6)]
+    following = FollowingApart(engine, 10)
+    store, compute = open_store(f"sqlite:///{tmp_path}/store.db"), Compute(4)
+    pipeline = Pipeline(engine, store, compute, clock=lambda: 0, follow=following)
+    with closing(following.forked), closing(store), closing(compute):
+        pipeline.process("a", windows[:3])
+        with store.write() as connection:
+            at = pipeline.hold_all(connection, ["a"])["a"]
+        (estimate,), _ = engine.identify(windows[3].values[None])
+        told = ToFold("a", windows[3:4], [estimate], at)
+        wrong = ToFold(
+            "b",
+            windows[:1],
+            [replace(estimate, log_ratio=np.zeros(1))],
+            replace(at, state=engine.tracker.initial_state()),
+        )
+        with pytest.raises(ValueError, match="an estimate of .1,. parameters came"):
+            following([told, wrong], 0)
+        (again,) = following([told], 0)
+        (here,) = follow([told], 0)
+        assert again.followed.state.to_dict() == here.followed.state.to_dict()
