@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sprung.model.signals import FaultKind, FloatArray, IntArray
+from sprung.model.signals import FaultKind, IntArray
 from sprung.model.tracking import deviations
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.changes import Changes
@@ -113,7 +113,7 @@ class TrackerState:
             "rejected": self.rejected,
             "idle": self.idle,
             "outliers": self.outliers,
-            "belief": _pack_all({"mean": self.belief.mean, "covariance": self.belief.covariance[upper]}),
+            "belief": {"mean": _pack(self.belief.mean), "covariance": _pack(self.belief.covariance[upper])},
             "scatter": _packed(self.inflation),  # keys are those of format 1
             "surprise": _packed(self.innovation),
             "changes": _packed(self.changes),
@@ -204,10 +204,6 @@ def _inflation(data: Mapping[str, Any]) -> VarianceInflation:
     if data["format"] == 1:
         arrays["anchored"] = np.full(arrays["anchor"].shape, data["anchored"] or 0, dtype=np.int64)
     return VarianceInflation(**arrays)
-
-
-def _pack_all(arrays: Mapping[str, FloatArray | IntArray]) -> dict[str, str]:
-    return {name: _pack(array) for name, array in arrays.items()}
 
 
 def _packed(record: _Record) -> dict[str, str]:
