@@ -107,6 +107,7 @@ class Piece:
     acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
     acting_parameters: Parameters | None = None
     believed: Believed = lambda fitted: True  # whether the record can have shown these values
+    at_low_rates: str = ""  # law that is not sought at low rates, since it acts as this one does there
 
     @property
     def dissipates(self) -> bool:

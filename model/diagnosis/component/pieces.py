@@ -112,6 +112,7 @@ _COULOMB = Piece(
     lambda p: (p[1],),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind=FRICTION,
+    at_low_rates="damper_blowoff",
 )
 _STRIBECK = Piece(
     _law("stribeck"),
