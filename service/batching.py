@@ -1,7 +1,9 @@
 """Windows of several clients, read, identified, tracked and stored together.
 
 The numerics cost per call more than per window, and so does a transaction.  While one batch is being worked on the next
-one gathers: a single client waits for nobody, and many share the cost.
+one gathers: a single client waits for nobody, and many share the cost.  A batch for which the tracker is not ready yet
+goes on gathering as well: identified early in small parts it would wait all the same, and take the tracker's processor
+time.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ class Batcher:
         self._waiting: deque[_Request] = deque()
         self._to_track: deque[_Request] = deque()
         self._lock = threading.Lock()
-        self._called = False  # a batch is in the compute's queue and has not begun
+        self._called = False  # a batch is in the compute's queue, or being identified
         self._tracking = False  # as well, in the tracking thread's
         self._readers = ThreadPoolExecutor(READERS, "sprung-read")
         self._tracker = ThreadPoolExecutor(1, "sprung-track")
@@ -138,14 +140,22 @@ class Batcher:
             self._reading -= 1
             if request.asked is not None:
                 self._waiting.append(request)
-            refused = [] if self._called or self._more_to_come() else self._call()
+            refused = self._call_in_time()
         _deliver([request, *refused] if request.asked is None else refused)
+
+    def _call_in_time(self) -> list[_Request]:
+        """As `_call`, unless that is done or better done later; whoever ends the wait calls this again."""
+        return [] if self._called or self._more_to_come() or self._tracker_is_behind() else self._call()
 
     def _more_to_come(self) -> bool:
         """Whether a batch is better off with windows that are being read just now; the last of them calls."""
         if not self._reading or len(self._waiting) >= ENOUGH:
             return False
         return not self._waiting or time.perf_counter() - self._waiting[0].since < PATIENCE
+
+    def _tracker_is_behind(self) -> bool:
+        """Whether a batch would wait behind another one for the tracker; that calls when it takes the other one."""
+        return bool(self._to_track) and len(self._waiting) < TOGETHER and all(map(_is_followed, self._waiting))
 
     def _call(self) -> list[_Request]:
         """Ask the numerics for a batch of what waits; those refused, as their queue is full of others' work."""
@@ -165,9 +175,7 @@ class Batcher:
     def _identify(self) -> None:
         """One batch; runs in the numerics' thread."""
         with self._lock:
-            self._called = False
             batch = [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
-            refused = self._call()
         now = time.perf_counter()
         alike: dict[tuple[int, bool, bool], list[_Request]] = {}
         for request in batch:
@@ -178,6 +186,9 @@ class Batcher:
         for together in alike.values():
             self._estimate(together)
         self._track([request for request in batch if _to_be_tracked(request)])
+        with self._lock:
+            self._called = False
+            refused = self._call_in_time()
         _deliver([*refused, *(request for request in batch if not _to_be_tracked(request))])
 
     def _estimate(self, batch: Sequence[_Request]) -> None:
@@ -214,6 +225,8 @@ class Batcher:
             self._tracking = False
             batch = list(self._to_track)
             self._to_track.clear()
+            refused = self._call_in_time()
+        _deliver(refused)
         self._keep_together(batch)
         _deliver(batch)
 
@@ -235,8 +248,14 @@ class Batcher:
             request.answer = AnsweredWindow(request.sent, request.estimate, record)
 
 
+def _is_followed(request: _Request) -> bool:
+    """Whether it is asked to be tracked and stored."""
+    return request.asked is not None and request.asked.start is not None
+
+
 def _to_be_tracked(request: _Request) -> bool:
-    return request.asked is not None and request.asked.start is not None and isinstance(request.answer, AnsweredWindow)
+    """Whether it was identified, too."""
+    return _is_followed(request) and isinstance(request.answer, AnsweredWindow)
 
 
 def _found(asked: AskedWindow, estimate: Estimate) -> FoundWindow:

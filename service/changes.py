@@ -21,12 +21,24 @@ OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
 
 @dataclass(frozen=True, slots=True)
 class TrackerChange:
-    """A vehicle whose tracker is another one now."""
+    """A vehicle whose tracker is another one now, made ready for the store."""
 
     vehicle: str
     after: HeldVehicle
-    records: Sequence[WindowRecord] = ()  # that are not stored yet
-    ran: Sequence[Ran] = ()  # how the vehicle ran in them
+    records: Sequence[WindowRecord]  # that are not stored yet
+    ran: Sequence[Ran]  # how the vehicle ran in them
+    row: fleet.TrackerRow
+    view: VehicleView  # how the vehicle is seen after them
+
+
+def tracker_change(
+    vehicle: str, after: HeldVehicle, records: Sequence[WindowRecord] = (), ran: Sequence[Ran] = ()
+) -> TrackerChange:
+    """The change with all of it that can be made without the store."""
+    told = (r for r in reversed(records) if r.solved is not None and r.outcome != UNINFORMATIVE)
+    view = vehicle_view(after.served.engine, vehicle, after.state, next(told, None))
+    row = fleet.TrackerRow(after.last_window_ns, after.revision, after.state.to_dict())
+    return TrackerChange(vehicle, after, records, ran, row, view)
 
 
 def keep_changes(
@@ -47,7 +59,7 @@ def keep_changes(
         history.add_to_rollups(connection, stored, now)
     if on_alarms is not None:
         add_circumstances(connection, {one.vehicle: one.ran for one in changes}, now)
-    fleet.save_trackers(connection, {(one.vehicle, one.after.served.model_id): _row(one.after) for one in changes}, now)
+    fleet.save_trackers(connection, {(one.vehicle, one.after.served.model_id): one.row for one in changes}, now)
     for one in changes:
         found = fleet.save_alarms(connection, one.vehicle, one.after.served.model_id, one.after.state.alarms)
         if found and on_alarms is not None:
@@ -66,10 +78,8 @@ def keep_statuses(connection: Connection, changes: Sequence[TrackerChange], now:
         ]
         counts = Counter(record.outcome for record in one.records)
         counts["unfitting"] = len(unfitting)
-        told = (r for r in reversed(one.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
-        view = vehicle_view(one.after.served.engine, one.vehicle, one.after.state, next(told, None))
-        views[one.vehicle] = view
-        statuses.append(new_status(one.after, view, counts))
+        views[one.vehicle] = one.view
+        statuses.append(new_status(one.after, one.view, counts))
         reasons = [(record.outcome, record.reason, record.start) for record in one.records if record.reason]
         reasons += [("unfitting", "does not fit the model", record.start) for record in unfitting]
         status.add_reasons(connection, one.vehicle, one.after.served.model_id, reasons)
@@ -81,7 +91,3 @@ def new_status(at: HeldVehicle, view: VehicleView, counts: Counter[str]) -> NewS
     """A vehicle's line."""
     found = view.status(at.served.engine.system.elements)
     return NewStatus(view.vehicle, at.served.model_id, at.revision, found, counts)
-
-
-def _row(at: HeldVehicle) -> fleet.TrackerRow:
-    return fleet.TrackerRow(at.last_window_ns, at.revision, at.state.to_dict())

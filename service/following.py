@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -63,15 +64,14 @@ class FollowedWindows:
     ran: list[Ran]
 
 
-Following = Callable[[Sequence[ToFold], int], list[FollowedWindows]]
+Following = Callable[[Sequence[ToFold], int], Generator[FollowedWindows, None, None]]
 
 
-def follow(asked: Sequence[ToFold], now: int) -> list[FollowedWindows]:
-    """Feed each vehicle's windows to its tracker.  now: ns, the clock of this host."""
-    return [
-        _pass(one.at.served.engine, one.at.served.model_id, _reached(one.at), one.windows, one.estimates, now)
-        for one in asked
-    ]
+def follow(asked: Iterable[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+    """Feed each vehicle's windows to its tracker, one vehicle after the other.  now: ns, the clock of this host."""
+    for one in asked:
+        served = one.at.served
+        yield _pass(served.engine, served.model_id, _reached(one.at), one.windows, one.estimates, now)
 
 
 def _reached(at: HeldVehicle) -> Followed:
@@ -117,28 +117,31 @@ class FollowingApart:
         self._lock = threading.Lock()
         self.forked = ForkedFunctions("tracks vehicles", {"follow": _Follower(engine).follow})
 
-    def __call__(self, asked: Sequence[ToFold], now: int) -> list[FollowedWindows]:
-        """As `follow`."""
-        mine = [one for one in asked if self._is_mine(one)]
-        if not mine:
-            return follow(asked, now)
-        with self._lock:
-            keys = [(one.vehicle, one.at.served.model_id) for one in mine]
-            sent = [self._sent(key, one) for key, one in zip(keys, mine, strict=True)]
-            try:
-                found: list[FollowedWindows] = self.forked.call("follow", sent, self._too_many(keys), now)
-            except ProcessEnded:
-                return follow(asked, now)
-            except BaseException:  # of one vehicle; what the process has made of those before it, nobody knows here
-                for key in keys:
-                    self._there.pop(key, None)
-                raise
-            for key, passed in zip(keys, found, strict=True):
-                self._there[key] = passed.followed.state
-                self._there.move_to_end(key)
-        passed_there = iter(found)
-        others = iter(follow([one for one in asked if not self._is_mine(one)], now))
-        return [next(passed_there if self._is_mine(one) else others) for one in asked]
+    def __call__(self, asked: Sequence[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+        """As `follow`; the process works on the next vehicle while the caller does something with one."""
+        with self._lock, closing(self._apart([one for one in asked if self._is_mine(one)], now)) as apart:
+            for one in asked:
+                yield next(apart if self._is_mine(one) else follow([one], now))
+
+    def _apart(self, asked: Sequence[ToFold], now: int) -> Generator[FollowedWindows, None, None]:
+        """Of vehicles that the process follows."""
+        if not asked:
+            return
+        left = [((one.vehicle, one.at.served.model_id), one) for one in asked]
+        sent, gone = [self._sent(key, one) for key, one in left], self._too_many([key for key, _ in left])
+        try:
+            with closing(self.forked.each("follow", sent, gone, now)) as each:
+                for passed in each:
+                    key, _ = left.pop(0)
+                    self._there[key] = passed.followed.state
+                    self._there.move_to_end(key)
+                    yield passed
+        except ProcessEnded:
+            yield from follow([one for _, one in left], now)
+        except BaseException:  # nobody knows here what the process has made of those that are left
+            for key, _ in left:
+                self._there.pop(key, None)
+            raise
 
     def _is_mine(self, one: ToFold) -> bool:
         return one.at.served.engine.tracker is self._tracker
@@ -164,16 +167,14 @@ class _Follower:
         self._engine = engine
         self._states: dict[_Key, TrackerState] = {}
 
-    def follow(self, sent: Sequence[_Sent], gone: Sequence[_Key], now: int) -> list[FollowedWindows]:
+    def follow(self, sent: Sequence[_Sent], gone: Sequence[_Key], now: int) -> Iterator[FollowedWindows]:
         for key in gone:
             self._states.pop(key, None)
-        found = []
         for key, state, last, windows, estimates in sent:
             at = Followed(self._states[key] if state is None else state, last)
             passed = _pass(self._engine, key[1], at, windows, estimates, now)
             self._states[key] = passed.followed.state
-            found.append(passed)
-        return found
+            yield passed
 
 
 _Key = tuple[str, int]  # vehicle, row of `models`

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import OrderedDict
 from collections.abc import Callable, Collection, Sequence
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +14,11 @@ from sqlalchemy import Connection
 
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
-from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status
+from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status, tracker_change
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
-from sprung.service.following import Following, follow
+from sprung.service.following import FollowedWindows, Following, follow
 from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold
 from sprung.service.store import Store, fleet, status
 from sprung.service.store.partitions import prepare
@@ -180,23 +181,23 @@ class Pipeline:
         if not asked:
             return []
         now, started = self._clock(), time.perf_counter()
-        followed = [
-            (one, passed, replace(one.at, state=passed.followed.state, last_window_ns=passed.followed.last))
-            for one, passed in zip(asked, self._follow(asked, now), strict=True)
-        ]
+        followed: list[tuple[ToFold, FollowedWindows, HeldVehicle, TrackerChange | None]] = []
+        with closing(self._follow(asked, now)) as each:
+            for one, passed in zip(asked, each, strict=True):
+                after = replace(one.at, state=passed.followed.state, last_window_ns=passed.followed.last)
+                change = None
+                if passed.records:
+                    after = after.with_stored(r.start for r in passed.records)
+                    change = tracker_change(one.vehicle, after, passed.records, passed.ran)
+                followed.append((one, passed, after, change))
         tracked = time.perf_counter()
-        changes = [
-            TrackerChange(one.vehicle, after.with_stored(r.start for r in passed.records), passed.records, passed.ran)
-            for one, passed, after in followed
-            if passed.records
-        ]
+        changes = [change for *_, change in followed if change is not None]
         on_alarms = self._on_alarms if self._shown else None
         views = keep_changes(connection, changes, now, on_alarms, recording_id) if changes else {}
-        held = {one.vehicle: one.after for one in changes}
         share = {"track": (tracked - started) / len(asked), "store": (time.perf_counter() - tracked) / len(asked)}
         return [
-            self._folded(one, passed.records, held.get(one.vehicle, after), dict(share), views.get(one.vehicle))
-            for one, passed, after in followed
+            self._folded(one, passed.records, after, dict(share), views.get(one.vehicle))
+            for one, passed, after, _ in followed
         ]
 
     def _folded(
@@ -270,7 +271,7 @@ class Pipeline:
         at = self._current(connection, [vehicle])[vehicle]
         after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
         on_alarms = self._on_alarms if self._shown else None
-        views = keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
+        views = keep_changes(connection, [tracker_change(vehicle, after)], now, on_alarms)
         return Batch(vehicle, [], [], 0, after.state, at.served, view=views.get(vehicle))
 
     def tell(self, batch: Batch) -> None:
@@ -286,7 +287,7 @@ class Pipeline:
             with self.store.write() as connection:
                 fleet.hold_vehicle(connection, vehicle)
                 at = self._current(connection, [vehicle])[vehicle]
-                keep_statuses(connection, [TrackerChange(vehicle, at)], self._clock())
+                keep_statuses(connection, [tracker_change(vehicle, at)], self._clock())
         return len(missing)
 
     def show(self, connection: Connection, vehicle: str) -> None:

@@ -92,6 +92,41 @@ def test_a_window_that_comes_twice_at_once_or_again_is_stored_once_and_answered_
     assert running.pipeline.state("v").used == 2
 
 
+def test_windows_gather_while_the_tracker_is_busy_and_those_for_no_tracker_do_not_wait(
+    running: Core, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    windows: list[int] = []
+    identified = running.batcher._estimate
+    monkeypatch.setattr(running.batcher, "_estimate", lambda batch: (windows.append(len(batch)), identified(batch)))
+
+    async def ask() -> list[AnsweredWindow]:
+        def sent(second: int) -> asyncio.Future[AnsweredWindow]:
+            return asyncio.ensure_future(running.batcher.ask(lambda: asked(running, system, "v", second)))
+
+        with running.store.write():  # nobody else stores meanwhile
+            first = [sent(0)]
+            while len(windows) < 1:
+                await asyncio.sleep(0.005)
+            first.append(sent(1))
+            while len(windows) < 2:
+                await asyncio.sleep(0.005)
+            later = [sent(second) for second in range(2, 7)]
+            while running.batcher.waiting < len(later):
+                await asyncio.sleep(0.005)
+            await asyncio.sleep(0.05)
+            assert windows == [1, 1]
+            only = asked(running, system, "v", 9)
+            only = AskedWindow(only.values, only.served)
+            answered = await asyncio.wait_for(running.batcher.ask(lambda: only), 30)
+            assert answered.record is None
+            later += [sent(7), sent(8)]
+        return await asyncio.gather(*first, *later)
+
+    answers = asyncio.run(ask())
+    assert [answer.record is not None and answer.record.tracked for answer in answers] == [True] * 9
+    assert stored(running, "v", range(9)) == set(range(9))
+
+
 def test_a_body_that_is_refused_costs_only_itself(running: Core, system: System) -> None:
     def wrong() -> AskedWindow:
         raise ApiProblem(422, "no window")

@@ -40,9 +40,15 @@ def _double(value: int) -> int:
     return 2 * value if value else 1 // value
 
 
+def _doubles(values: list[int]) -> Iterator[int]:
+    for value in values:
+        yield _double(value)
+
+
 @pytest.fixture
 def doubling() -> Iterator[ForkedFunctions]:
-    with closing(ForkedFunctions("doubles", {"double": _double, "pid": os.getpid})) as forked:
+    functions = {"double": _double, "pid": os.getpid, "doubles": _doubles}
+    with closing(ForkedFunctions("doubles", functions)) as forked:
         yield forked
 
 
@@ -57,6 +63,31 @@ def test_what_a_function_raises_is_raised_here(doubling: ForkedFunctions) -> Non
     with pytest.raises(RuntimeError, match="ZeroDivisionError"):
         doubling.call("double", 0)
     assert doubling.call("double", 2) == 4
+
+
+def test_what_a_generator_yields_comes_one_by_one(doubling: ForkedFunctions) -> None:
+    assert list(doubling.each("doubles", [1, 2, 3])) == [2, 4, 6]
+    assert list(doubling.each("doubles", [])) == []
+    each = doubling.each("doubles", [4, -1, 5])
+    assert next(each) == 8
+    with pytest.raises(UnusableWindow, match="a negative one"):
+        next(each)
+    assert doubling.call("double", 6) == 12
+
+
+def test_parts_that_nobody_takes_are_no_answer_to_the_next_call(doubling: ForkedFunctions) -> None:
+    with closing(doubling.each("doubles", list(range(1, 50)))) as each:
+        assert next(each) == 2
+    assert doubling.call("double", 100) == 200
+
+
+def test_a_process_that_is_killed_between_parts(doubling: ForkedFunctions) -> None:
+    assert doubling.pid is not None
+    with closing(doubling.each("doubles", list(range(1, 100_000)))) as each:
+        assert next(each) == 2
+        os.kill(doubling.pid, signal.SIGKILL)
+        with pytest.raises(ProcessEnded):
+            list(each)
 
 
 def test_a_process_that_was_killed_is_told_once(doubling: ForkedFunctions, caplog: pytest.LogCaptureFixture) -> None:
@@ -179,7 +210,7 @@ def test_a_vehicle_that_fails_leaves_the_others_as_they_were(engine: Engine, sys
         )
         later = replace(told, windows=windows[5:6])
         with pytest.raises(ValueError, match="the tracker has 24"):
-            following([later, wrong], 0)
+            list(following([later, wrong], 0))
         (again,) = following([told], 0)
         (here,) = follow([told], 0)
         assert again.followed.state.to_dict() == here.followed.state.to_dict()
