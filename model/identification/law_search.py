@@ -16,6 +16,7 @@ from torch import Tensor
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
+from sprung.model.identification.law_opening import opened
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import PRIOR_STD
@@ -24,7 +25,6 @@ from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WE
 from sprung.model.signals import FloatArray
 
 ITERATIONS = 6
-_OPENING = 1  # rounds of forces and first state before the first iteration
 _CONVERGED = 0.3  # a second step this small, in standard deviations, leaves an error far below it
 _STILL = 0.3  # a first step this small: the window stands at its minimum, whatever the second one says
 _SLACK = 2.0  # of squares of residuals, by which a step may be worse: forces and smoothed inputs settle no closer
@@ -108,44 +108,22 @@ class LawSearch:
 
     def run(self, states: bool, near: bool = False, iterations: int = ITERATIONS) -> Refined:
         """Iterate until every window has converged, or `iterations` times; near: the start is no guess."""
-        self._open(near)
-        active = torch.arange(len(self.cost))
-        for left in reversed(range(iterations)):
-            self._iterate(active, last=left == 0)
-            active = active[~self.converged[active]]
+        active = self._opened(torch.arange(len(self.cost)), last=iterations == 1)
+        if not near and len(active) and iterations > 1:  # once more, where that has led
+            self.point.unknowns[active] = self.point.unknowns.median(dim=0).values
+            active = self._opened(active, last=False)
+        for left in reversed(range(iterations - 1)):
             if len(active) == 0:
                 break
+            self._iterate(active, last=left == 0)
+            active = active[~self.converged[active]]
         return self._result(states)
 
-    def _open(self, near: bool) -> None:
-        """Linear fits with the laws' forces as given, and forces along their motion, which follows the sensors.
-
-        near: the values go back to the start then, and only the first states and forces stay.
-        """
-        w, data = self.windows, self.data
-        start = self.point
-        at = w.model.linearise(start.unknowns[:, w.linear], data)
-        step = self._limited(at.step)
-        point = self._linear_step(start, step, at.state_after(step))
-        for last in (False,) * _OPENING + (True,) * near:
-            point = replace(point, unknowns=start.unknowns) if last else point
-            steps = w.steps(point, data)
-            if not last:
-                states, _ = w.simulate(steps, point.force, point.x0, data)
-                point = replace(point, force=w.forces(point, steps, states, data, self.smooth))
-            residual = w.residual(Moved(*w.simulate(steps, point.force, point.x0, data)), data, at.whiten)
-            along = at.free @ residual
-            alone = torch.cholesky_solve(along, at.factor)
-            gradient = at.sensitivities @ residual - at.across.mT @ along
-            step = self._limited((at.covariance @ gradient).squeeze(2)) * (not last)
-            dx0 = (alone - at.across @ step.unsqueeze(2)).squeeze(2) / at.free_scale
-            point = self._linear_step(point, step, point.x0 + dx0)
-        self.point = point
-
-    def _linear_step(self, point: WindowPoint, step: Tensor, x0: Tensor) -> WindowPoint:
-        unknowns = point.unknowns.clone()
-        unknowns[:, self.windows.linear] += step
-        return replace(point, unknowns=unknowns, x0=x0)
+    def _opened(self, rows: Tensor, last: bool) -> Tensor:
+        """Begin with the windows `rows` where they stand, and iterate once; those that have not converged."""
+        self.point.put(rows, opened(self.windows, self.point.take(rows), self.data.take(rows)))
+        self._iterate(rows, last)
+        return rows[~self.converged[rows]]
 
     def _iterate(self, rows: Tensor, last: bool) -> None:
         """A linearisation and two steps of the windows `rows`; a point that is worse is taken back to a third."""

@@ -35,6 +35,7 @@ from sprung.model.system import System
 
 _SWEEPS = 4  # of Newton's method on the forces, at most
 _SETTLED = 0.05  # rms change of the outputs by a sweep, in the sensors' noise
+_WILD = 1e4  # times what was measured: Newton's method has lost the motion
 _RIDGE = 1e-11  # relative, on the normalised free responses
 _MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
 
@@ -145,22 +146,36 @@ class LawWindows:
         """Bring forces and motion together; flow: of a motion nearby, by default of the one that they begin with."""
         force, moving = point.force.clone(), torch.arange(len(point.force))
         for _ in range(_SWEEPS):
+            if not len(moving):
+                break
             everything = len(moving) == len(force)
             some = replace(point if everything else point.take(moving), force=force[moving])
             their_steps, theirs = (steps, data) if everything else (steps.take(moving), data.take(moving))
             their_smooth = smooth if everything else smooth[:, moving.numpy()]
-            states, _ = self.simulate(their_steps, some.force, some.x0, theirs)
+            states, outputs = self.simulate(their_steps, some.force, some.x0, theirs)
+            if bool((wild := self._wild(outputs, theirs)).any()):
+                force[moving[wild]] = point.force[moving[wild]]
+                moving = moving[~wild]
+                continue
             along = self.along(states, theirs, their_smooth, some, their_steps)
             flow = self.flow(along, some, their_steps) if flow is None else flow
             near = flow if everything else flow.take(moving)
-            change = near.answer(self._forces(along, some, their_steps) - some.force)
+            change = near.answer(self.forces_along(along, some, their_steps) - some.force)
             force[moving] += change
             moving = moving[self._shown_at_once(change, their_steps, theirs) >= _SETTLED]
-            if not len(moving):
-                break
-        assert flow is not None
         states, outputs = self.simulate(steps, force, point.x0, data)
-        return replace(point, force=force), Moved(states, outputs), flow
+        if bool((wild := self._wild(outputs, data)).any()):
+            force[wild] = point.force[wild]
+            states, outputs = self.simulate(steps, force, point.x0, data)
+        point = replace(point, force=force)
+        if flow is None:
+            flow = self.flow(self.along(states, data, smooth, point, steps), point, steps)
+        return point, Moved(states, outputs), flow
+
+    def _wild(self, outputs: Tensor, data: WindowBatch) -> Tensor:
+        """Windows whose simulated outputs (B, T, S') have left all bounds, (B,)."""
+        usual = (data.measured.abs() + self.noise[torch.as_tensor(data.present)]).amax(dim=(1, 2))
+        return ~(outputs.abs().amax(dim=(1, 2)) <= _WILD * usual)
 
     def _shown_at_once(self, change: Tensor, steps: Steps, data: WindowBatch) -> Tensor:
         """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
@@ -183,14 +198,17 @@ class LawWindows:
             shake(*shaken, mobility)
         return along
 
-    def forces(self, point: WindowPoint, steps: Steps, states: Tensor, data: WindowBatch, smooth: FloatArray) -> Tensor:
-        """The laws' forces along given states, (B, T, L)."""
-        return self._forces(self.along(states, data, smooth, point, steps), point, steps)
-
-    def _forces(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
+    def forces_along(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
+        """The laws' forces, (B, T, L)."""
         shape = point.force.shape[:2]
         found = [path.force(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return torch.as_tensor(np.stack([np.broadcast_to(f, shape) for f in found], axis=2))
+
+    def slopes_along(self, along: list[Along], point: WindowPoint, steps: Steps) -> tuple[Tensor, Tensor]:
+        """Slopes of the laws' forces by deflection and by rate, each (B, T, L)."""
+        found = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
+        by_d, by_v = ([getattr(s, of) for s in found] for of in ("by_deflection", "by_rate"))
+        return torch.as_tensor(np.stack(by_d, axis=2)), torch.as_tensor(np.stack(by_v, axis=2))
 
     def _at(self, law: int, point: WindowPoint, steps: Steps) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
         """Values of a law and of its element, that broadcast with (B, fine), and its memory at the first sample."""

@@ -1,0 +1,94 @@
+"""Where windows of a system with laws begin."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.law_opening import opened
+from sprung.model.identification.law_point import WindowPoint
+from sprung.model.identification.law_window import LawWindows
+from sprung.model.identification.linearise import WindowModel
+from sprung.model.identification.with_laws import acting_laws, without_laws
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.ride import simulate_ride
+from sprung.model.system import System, parse_system
+
+VEHICLE = """
+name: quarter-car
+sample_rate: 100
+window: 100
+bodies:
+  car: {mass: 8000}
+  bogie: {mass: 1300}
+inputs:
+  wheel:
+    kind: support
+    displacement: {csv: d, noise: 1.0e-5}
+    velocity: {csv: v, noise: 5.0e-4}
+elements:
+  primary: {upper: bogie, lower: wheel, stiffness: 2.4e+6, damping: 1.0e+4}
+  secondary:
+    upper: car
+    lower: bogie
+    stiffness: 4.3e+5
+    damping: 2.0e+4
+    laws: LAWS
+sensors:
+  car_a: {kind: acceleration, body: car, noise: 0.004, csv: a}
+  bogie_a: {kind: acceleration, body: bogie, noise: 0.03, csv: e}
+"""
+STOP = "[{bump_stop: {gap: 0.004, stiffness: 3.0e+6}}]"
+CUBIC = "[{cubic_stiffness: {k3: 1.0e+12}}]"
+
+
+def ride(laws: str, seconds: float = 6.0) -> tuple[System, FloatArray]:
+    """The vehicle and its channels (T, C) over a rough track."""
+    system = parse_system(VEHICLE.replace("LAWS", laws))
+    random = np.random.default_rng(5)
+    time = np.arange(round(seconds * 100)) / 100
+    w, phase = random.uniform(3, 40, 12), random.uniform(0, 2 * np.pi, 12)
+    size = 0.012 / w
+    displacement = (size * np.sin(w * time[:, None] + phase)).sum(axis=1)
+    velocity = (size * w * np.cos(w * time[:, None] + phase)).sum(axis=1)
+    driven = np.stack([displacement, velocity], axis=1)
+    sensors = simulate_ride(system, driven, noise=random).sensors
+    return system, np.concatenate([driven, sensors], axis=1)
+
+
+def windows_of(values: FloatArray) -> FloatArray:
+    return np.stack([values[i : i + 100] for i in range(100, len(values) - 99, 50)])
+
+
+def test_the_opening_has_the_stop_where_it_is_met() -> None:
+    """Forces of the opening are near those along its own motion, where those of the linear motion are far too large."""
+    system, values = ride(STOP)
+    windows = windows_of(values)
+    w = LawWindows(without_laws(system), acting_laws(system), WindowModel(without_laws(system), 100))
+    data = w.model.batch(w.model.knots(windows), windows, np.ones(2, dtype=bool))
+    B = len(windows)
+    start = WindowPoint(torch.zeros(B, w.unknowns), torch.zeros(B, 4), torch.zeros(B, 100, 1))
+    start = WindowPoint(*(part.double() for part in (start.unknowns, start.x0, start.force)))
+    point = opened(w, start, data)
+    still = np.zeros((2, B, 100, 2))
+    steps = w.steps(point, data)
+    states, _ = w.simulate(steps, point.force, point.x0, data)
+    law = w.forces_along(w.along(states, data, still, point, steps), point, steps)
+    assert law.square().mean() > 100.0**2  # N: the stop is met at all
+    assert (law - point.force).square().mean().sqrt() < 0.2 * law.square().mean().sqrt()
+
+
+def test_windows_within_a_hard_stop_converge_at_once() -> None:
+    system, values = ride(STOP)
+    found = load_identifier(system).identify(windows_of(values))
+    assert all(estimate.adequate for estimate in found)
+    assert np.mean([estimate.iterations for estimate in found]) < 2.5
+
+
+def test_a_law_that_throws_the_motion_out_of_bounds_is_no_end_of_the_batch() -> None:
+    """The file's cubic is far too strong for these windows: they do not fit, and say so."""
+    system, _ = ride(CUBIC)
+    _, values = ride("[]")
+    found = load_identifier(system).identify(1.5 * windows_of(values))
+    assert all(np.isfinite(estimate.log_ratio).all() and np.isfinite(estimate.covariance).all() for estimate in found)
