@@ -14,9 +14,10 @@ import numpy as np
 from sprung.model.identification.deviations import deviations
 from sprung.model.identifier import Identifies
 from sprung.model.signals import Estimate, FloatArray
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system
 from sprung.model.tracking.alarms import LoadLimit
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
+from sprung.service.can_database import database_of
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
 
@@ -96,7 +97,6 @@ def load_engine(settings: Settings) -> Engine:
 
     path = settings.system or MANCHESTER
     system = load_system(path)
-    dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
     if not system.bodies:
         raise UserError(
             f"{path}: a component test has no bodies, so nothing to follow from window to window; "
@@ -105,7 +105,10 @@ def load_engine(settings: Settings) -> Engine:
     if not system.tracked:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
     return Engine(
-        system, load_identifier(system, settings.weights, workers=os.cpu_count() or 1), make_tracker(system), dbc
+        system,
+        load_identifier(system, settings.weights, workers=os.cpu_count() or 1),
+        make_tracker(system),
+        database_of(system, settings.dbc),
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.system import System
 from sprung.replay.record import Record, load_record
 from sprung.replay.recording import Recording, open_recording
 
@@ -28,8 +28,3 @@ def open_record(
     """
     channels = (*system.channels, *system.signals) if signals else system.channels
     return load_record(path, channels, system.sample_rate, dbc=dbc, time=system.time, start=start)
-
-
-def bundled_dbc(system: System) -> Path | None:
-    """The CAN database that comes with the bundled system."""
-    return MANCHESTER_DBC if system.digest == load_system(MANCHESTER).digest else None

@@ -36,7 +36,7 @@ class Settings(BaseSettings):
     data_dir: Path = Field(default_factory=default_data_dir)  # uploads, reports and the embedded store
     store: str | None = None  # SQLAlchemy URL; None: sprung.db in data_dir
     system: Path | None = None  # None: the bundled Manchester vehicle
-    dbc: Path | None = None  # None: the bundled DBC, when the system is the bundled one
+    dbc: Path | None = None  # None: the bundled one, where it has the system's CAN signals
     weights: Path | None = None  # directory of a trained estimator; None: the bundled one
 
     host: str = "127.0.0.1"

@@ -22,9 +22,10 @@ from sprung.model.tracking.tracker import Alarm, ParameterReport
 from sprung.replay.beside import Beside
 from sprung.replay.record import Record
 from sprung.replay.recording import Recording
+from sprung.service.can_database import database_of
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.following import Followed
-from sprung.service.opening import bundled_dbc, open_record, open_stream
+from sprung.service.opening import open_record, open_stream
 from sprung.service.reading import windower_of
 from sprung.service.report import write_report
 from sprung.service.times import now_ns
@@ -111,7 +112,7 @@ def open_recording(
 ) -> Recording:
     """A recording as a stream of samples of the system's channels; `.blocks()` reads it, once.
 
-    dbc: the CAN database of a BLF, ASC, candump or MF4 file; the bundled one for the bundled system.
+    dbc: the CAN database of a BLF, ASC, candump or MF4 file; the bundled one where the system's CAN signals are of it.
     start: ns since 1970, when it began if its times count from 0; the file's own time otherwise.  The unit of a time
     column and where it stands are as the system file's `time` says.
     Errors: `UnreadableRecording`, one line, now or while reading.
@@ -121,7 +122,7 @@ def open_recording(
     >>> sum(len(block.time) for block in ride.blocks())
     56000
     """
-    return open_stream(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start)
+    return open_stream(Path(path), system, database_of(system, Path(dbc) if dbc else None), start)
 
 
 def load_record(path: str | Path, system: System, dbc: str | Path | None = None, start: int | None = None) -> Record:
@@ -134,7 +135,7 @@ def load_record(path: str | Path, system: System, dbc: str | Path | None = None,
     >>> record.values.shape, record.sample_rate, record.lost
     ((2000, 28), 100.0, 0)
     """
-    return open_record(Path(path), system, Path(dbc) if dbc else bundled_dbc(system), start, signals=True)
+    return open_record(Path(path), system, database_of(system, Path(dbc) if dbc else None), start, signals=True)
 
 
 def simulate(

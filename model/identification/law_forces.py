@@ -93,11 +93,7 @@ class Along:
 
     def ripple(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
         """The part of the force's impulse that samples do not show, N s, (B, fine)."""
-        force = np.broadcast_to(self.fine(p, element, first), self.d.shape)
-        impulse = np.zeros(force.shape)
-        np.cumsum(0.5 * self.step * (force[:, 1:] + force[:, :-1]), axis=1, out=impulse[:, 1:])
-        shown, per_sample = (band_limited(x, self.parts) for x in (impulse, force * self.step * self.parts))
-        return impulse - _continued(shown, per_sample, self.parts)[0]
+        return _hidden(np.broadcast_to(self.fine(p, element, first), self.d.shape), self.step, self.parts)
 
     def changes(self, p: FloatArray, free: Sequence[int], element: SpringDamper, first: FloatArray) -> FloatArray:
         """What the force changes per log of the free values, then of stiffness and damping, (X, B, T).
@@ -212,23 +208,18 @@ class Along:
         return keep, *found
 
 
-def follows_rate(law: ElementLaw, p: Sequence[float]) -> bool:
-    """Whether the force of a law without memory is another one at another rate."""
-    motion = Motion(np.full(3, 1e-3), np.array([-1e-2, 0.0, 1e-2]))
-    return bool(np.ptp(law.force(motion, p, SpringDamper(1.0, 1.0)) * np.ones(3)) > 0)
-
-
 def shake(along: Sequence[Along], at: Sequence[tuple[Any, ...]], mobility: FloatArray) -> None:
-    """Add to the rates along which laws act what their own forces do above half the sample rate.
+    """Add to the motion along which laws act what their own forces do above half the sample rate.
 
     Samples do not show it, but it is what friction meets while its force changes sign, within less than a sample: the
     bodies are shaken, which rounds the corner.  Springs and dampers are nothing to a body's inertia there, and what the
-    change of the rate makes of the forces is small beside them.  at: each one's values, element and first memory;
+    change of the motion makes of the forces is small beside them.  at: each one's values, element and first memory;
     mobility: accelerations of the sites by forces at them, 1/kg, (B, L, L).
     """
     ripples = np.stack([path.ripple(*given) for path, given in zip(along, at, strict=True)])  # (L, B, fine)
     for path, moved in zip(along, np.einsum("bml,lbt->mbt", mobility, ripples), strict=True):
         path.v = path.v - moved
+        path.d = path.d - _hidden(moved, path.step, path.parts)
 
 
 def _moved(p: Sequence[FloatArray], element: SpringDamper, at: int) -> tuple[_At, _At]:
@@ -251,6 +242,30 @@ def slopes_of(samples: int) -> FloatArray:
     """Matrix (T, T) from samples to the slopes, per sample, of the cubic spline through them."""
     time = np.arange(samples)
     matrix = np.asarray(CubicSpline(time, np.eye(samples))(time, 1))
+    matrix.setflags(write=False)
+    return matrix
+
+
+@lru_cache(maxsize=8)
+def sharpened(samples: int) -> FloatArray:
+    """Matrix (T, T) that makes good what the cubic spline through samples loses of a force.
+
+    Of a tone at the share f of the sample rate a spline keeps sinc(f)^4 / sum over k of sinc(f - k)^4, and the images
+    f - k come beside it; what both make of a motion, which answers by 1/f^2, is 0.4 % too small at f = 0.2 and 3 % at
+    0.3.  Fourth and sixth differences, fitted up to 0.35, bring that back; the ends are left as they are.
+    """
+    f = np.linspace(0.05, 0.35, 31)
+    k = np.arange(-6, 7)[:, None]
+    images = np.sinc(f - k) ** 4
+    answered = (images / (f - k) ** 2).sum(axis=0) * f**2 / images.sum(axis=0)
+    twice = 2 - 2 * np.cos(2 * np.pi * f)
+    gains = np.linalg.lstsq(np.stack([twice**2, twice**3], axis=1), 1 / answered - 1, rcond=None)[0]
+    second = np.array([-1.0, 2.0, -1.0])
+    fourth = np.convolve(second, second)
+    taps = gains[0] * np.pad(fourth, 1) + gains[1] * np.convolve(fourth, second)
+    matrix = np.eye(samples)
+    for row in range(3, samples - 3):
+        matrix[row, row - 3 : row + 4] += taps
     matrix.setflags(write=False)
     return matrix
 
@@ -284,6 +299,14 @@ def _continued(value: FloatArray, slope: FloatArray, parts: int) -> tuple[FloatA
         inner = np.concatenate(pieces, axis=1).reshape(len(value), (samples - 1) * parts)
         found.append(np.concatenate([inner, last[:, -1:]], axis=1))
     return found[0], found[1]
+
+
+def _hidden(rate: FloatArray, step: float, parts: int) -> FloatArray:
+    """The part of the integral over time of `rate` that its samples do not show, (B, fine)."""
+    whole = np.zeros(rate.shape)
+    np.cumsum(0.5 * step * (rate[:, 1:] + rate[:, :-1]), axis=1, out=whole[:, 1:])
+    shown, per_sample = (band_limited(x, parts) for x in (whole, rate * step * parts))
+    return whole - _continued(shown, per_sample, parts)[0]
 
 
 @lru_cache(maxsize=4)

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
-from sprung.model.identification.law_forces import Acting, Along, follows_rate, shake, slopes_of
+from sprung.model.identification.law_forces import Acting, Along, shake, sharpened, slopes_of
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra
 from sprung.model.laws import SpringDamper
@@ -54,12 +54,13 @@ class LawWindows:
         self.weights = torch.as_tensor(np.array([a.weights for a in acting]))  # (L, E)
         self.free = [(law, i) for law, a in enumerate(acting) for i in a.free]
         self.memories = [i for i, a in enumerate(acting) if a.law.memory]
-        self.quick = [i for i, a in enumerate(acting) if not a.law.memory and follows_rate(a.law, a.placed.values)]
+        self.quick = [i for i, a in enumerate(acting) if not a.law.memory]
         noise = bare.sensor_noise
         self.noise = torch.as_tensor(noise)
         moving = m.sensor_kind == ACCELERATION
         # of a rate over one sample, by the least noise of an accelerometer; where there is none by that of a sensor
         self.rate_noise = float(noise[moving].min() if moving.any() else noise.min()) / bare.sample_rate
+        self.sharpened = torch.tensor(sharpened(model.samples))
         self.slope = torch.tensor(slopes_of(model.samples)) / model.simulator.dt
         self.loads = len(model.simulator.loading) if loads else 0
         P = len(bare.parameters)
@@ -107,14 +108,15 @@ class LawWindows:
     def simulate(self, steps: Steps, force: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
         """States (B, T, N) and outputs (B, T, S') under given forces of the laws (B, T, L)."""
         s, q = self.model.simulator, -force @ self.pull
-        slope = self.slope @ q
+        sharp = self.sharpened @ q
+        slope = self.slope @ sharp
         P0, S0, P1, S1 = steps.push
         discrete = replace(
             steps.discrete,
             G0=torch.cat([steps.discrete.G0, P0, S0], dim=2),
             G1=torch.cat([steps.discrete.G1, P1, S1], dim=2),
         )
-        states = s.states(discrete, torch.cat([data.w, q, slope], dim=2), x0)
+        states = s.states(discrete, torch.cat([data.w, sharp, slope], dim=2), x0)
         outputs = states @ steps.discrete.C.mT + data.w @ steps.discrete.D.mT + q @ steps.direct.mT
         return states, outputs + force @ (self.weights @ steps.shown.T)
 

@@ -12,8 +12,9 @@ from sprung.model.diagnosis.record.channels import TooLittleError
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.own import load_laws
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system
 from sprung.replay.record import Record
+from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
@@ -42,9 +43,8 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
     if asked.laws is not None:
         catalogue += load_laws(asked.laws, tuple(law.name for law in CATALOGUE))
     system = load_system(system_file or MANCHESTER, catalogue)
-    known = dbc or (MANCHESTER_DBC if system_file is None else None)
     with ExitStack() as stack:
-        record = load(spooled(file, stack), system, known, start_time(asked.start, [file]))
+        record = load(spooled(file, stack), system, database_of(system, dbc), start_time(asked.start, [file]))
     if str(file) == "-":
         file = Path("standard input")
     for problem in record.problems:

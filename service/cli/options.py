@@ -10,7 +10,12 @@ import typer
 System = Annotated[
     Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
 ]
-Dbc = Annotated[Path | None, typer.Option("--dbc", metavar="FILE", help="CAN database; default: the bundled system's.")]
+Dbc = Annotated[
+    Path | None,
+    typer.Option(
+        "--dbc", metavar="FILE", help="CAN database; default: the bundled one, where it has the system's signals."
+    ),
+]
 Weights = Annotated[
     Path | None,
     typer.Option("--weights", metavar="FOLDER", help="Trained estimator; default: the bundled one."),

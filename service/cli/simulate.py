@@ -10,9 +10,10 @@ import numpy as np
 
 from sprung.model.laws import CATALOGUE, Law
 from sprung.model.simulate.ride import simulate_ride
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
+from sprung.model.system import MANCHESTER, load_system
 from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
+from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.comparison import Comparison, compare
 from sprung.service.errors import UserError
@@ -35,7 +36,7 @@ def simulate(
     if out.exists() and out.resolve() == inputs.resolve():
         raise UserError(f"{out}: is the file that the inputs come from")
     system = load_system(system_file, catalogue)
-    database = dbc or (MANCHESTER_DBC if system_file == MANCHESTER else None)
+    database = database_of(system, dbc)
     record = apart.load(RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
     driven = record.values[:, : len(system.inputs)]
     ride = simulate_ride(
@@ -69,7 +70,7 @@ def show(
 ) -> int:
     """Print the errors of every sensor; with a folder, draw them."""
     system = load_system(system_file or MANCHESTER, catalogue)
-    database = dbc or (MANCHESTER_DBC if system_file is None else None)
+    database = database_of(system, dbc)
 
     def load(path: Path) -> Record:
         return apart.load(RecordRequest(path, system.channels, system.sample_rate, database, system.time, None))

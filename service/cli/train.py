@@ -13,7 +13,8 @@ import numpy as np
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from sprung.model.signals import FloatArray
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system
+from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors
 from sprung.service.errors import UserError
@@ -33,7 +34,7 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     system = load_system(system_file or MANCHESTER)
     if not system.bodies:
         raise UserError(f"{system_file}: a component test has no bodies, so no estimator to train; use sprung diagnose")
-    database = dbc or (MANCHESTER_DBC if system_file is None else None)
+    database = database_of(system, dbc)
     windows = whole_windows(system, recordings, database) if recordings else None
     given = {name: value for name, value in changes.items() if value is not None}
     settings = replace(TrainingSettings(), **given)

@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from sprung import __version__
-from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
+from sprung.model.system import MANCHESTER, load_system
+from sprung.service.can_database import database_of
 from sprung.service.diagnosing import run
 from sprung.service.diagnosis_task import DiagnosisRequest
 from sprung.service.durable import sync_file
@@ -76,7 +77,7 @@ def diagnose_file(order: DiagnosisOrder) -> DiagnosedFile:
     settings, file, out = order.settings, order.file, order.out
     try:
         system = load_system(settings.system or MANCHESTER)
-        dbc = settings.dbc or (MANCHESTER_DBC if settings.system is None else None)
+        dbc = database_of(system, settings.dbc)
         with local_copy(file) as path:
             out.mkdir(parents=True, exist_ok=True)
             found = run(DiagnosisRequest(path, Path(file.path).name, system, dbc, out), lambda stage: None)

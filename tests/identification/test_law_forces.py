@@ -6,8 +6,9 @@ import math
 
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
-from sprung.model.identification.law_forces import Along, band_limited, follows_rate, shake
+from sprung.model.identification.law_forces import Along, band_limited, shake, sharpened
 from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper
 from sprung.model.signals import FloatArray
 
@@ -74,8 +75,17 @@ def test_friction_rounds_its_own_corner_by_shaking_the_body_between_samples() ->
     assert error() < 0.35 * before
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "expected"), [("coulomb_friction", (300.0, 0.01), True), ("bump_stop", (0.01, 1e6), False)]
-)
-def test_which_laws_follow_the_rate(name: str, values: tuple[float, ...], expected: bool) -> None:
-    assert follows_rate(law(name), values) is expected
+@pytest.mark.parametrize("share", [0.1, 0.2, 0.3])
+def test_the_motion_that_a_sharpened_spline_makes_of_a_tone_is_right_at_the_samples(share: float) -> None:
+    """A mass under the force: the second integral of the spline, against that of the tone itself."""
+    time = np.arange(200.0)
+    w = 2 * np.pi * share
+    tone = np.sin(w * time + 0.4)
+
+    def off(force: FloatArray) -> float:
+        moved = CubicSpline(time, force).antiderivative(2)(time)
+        drift = np.polynomial.Polynomial.fit(time, left := (moved + tone / w**2), 1)(time)
+        return float(np.abs(left - drift)[20:-20].max() * w**2)
+
+    assert off(sharpened(200) @ tone) < 3e-3
+    assert share < 0.2 or off(sharpened(200) @ tone) < 0.35 * off(tone)
