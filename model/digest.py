@@ -35,6 +35,7 @@ def digest_of(file: SystemFile, on_track: bool) -> str:
     added = [(source, "acceleration") for source in keep["inputs"].values()]  # keys that older files do not have
     for body in keep["bodies"].values():
         body.pop("load", None)  # what varies from ride to ride does not make another vehicle
+        body["mass"].pop("std")  # nor does how well a mass is known
     if not on_track:
         keep["speed"] = None
     for part, key in [*added, (keep, "speed")]:
@@ -52,6 +53,7 @@ def structure_of(file: SystemFile) -> str:
     keep = file.model_dump(mode="json", include={"bodies", "elements", "inputs", "sensors", "estimate", "speed"})
     for body in keep["bodies"].values():
         body.pop("load", None)
+        body["mass"].pop("std")
     for signal in _with_parts([*keep["inputs"].values(), *keep["sensors"].values(), keep["speed"] or {}]):
         for key in ("noise", *_WHERE):
             signal.pop(key, None)

@@ -38,6 +38,15 @@ def _as_value(raw: Any) -> Any:
 
 
 Quantity = Annotated[Value, BeforeValidator(_as_value, json_schema_input_type=float | Value)]
+
+
+class MassValue(Value):
+    """A mass, and how well it is known where nothing in a window tells it."""
+
+    std: float | None = Field(default=None, ge=0)  # kg, standard deviation; inertias go along
+
+
+Mass = Annotated[MassValue, BeforeValidator(_as_value, json_schema_input_type=float | MassValue)]
 Point = tuple[float, float]
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
@@ -63,7 +72,7 @@ def _as_load(raw: Any) -> Any:
 class Body(Strict):
     """A rigid body: heaves; with inertias it also rolls and pitches about `position`."""
 
-    mass: Quantity  # kg
+    mass: Mass  # kg
     roll_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     pitch_inertia: float | None = Field(default=None, gt=0)  # kg m^2
     position: Point = (0.0, 0.0)  # m

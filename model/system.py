@@ -38,6 +38,7 @@ MANCHESTER_DBC = BUNDLED / "bogie.dbc"
 
 GAIN_STD = 0.015  # of a channel whose data sheet is not quoted: 1 to 2 % for accelerometers with their electronics
 DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
+AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: wheels wear, and new ones are put on
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
@@ -265,6 +266,30 @@ class System:
         std = LOAD_STD if most is None else max(0.5 * np.log1p(most / mass), 0.05)
         least = None if body.load is None else body.load.min
         return LoadState(f"{name}.load", name, mass, declared, float(std), least, most)
+
+    @cached_property
+    def doubtful_masses(self) -> dict[str, float]:
+        """Bodies whose mass is not quite what the file says, with its relative standard deviation.
+
+        Those for which the file states one, and axles: they stand on a support, carry another body and do not pitch;
+        new wheels are heavier by several per cent than worn ones.  A mass that is a load, estimated or fixed is none.
+        """
+        told = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
+        found = {}
+        for name, body in self.file.bodies.items():
+            mass = body.mass
+            std = mass.std / mass.value if mass.std is not None else (AXLE_STD if self._is_axle(name) else 0.0)
+            if std > 0 and not mass.fixed and name not in told:
+                found[name] = float(std)
+        return found
+
+    def _is_axle(self, name: str) -> bool:
+        if self.file.bodies[name].pitch_inertia is not None:
+            return False
+        supports = {n for n, source in self.file.inputs.items() if not isinstance(source, ForceInput)}
+        ends = [{element.upper, element.lower} for element in self.file.elements.values()]
+        beside = set().union(*(pair for pair in ends if name in pair)) - {name}
+        return bool(beside & supports and beside & self.file.bodies.keys())
 
     @cached_property
     def tolerances(self) -> tuple[Tolerance, ...]:

@@ -128,4 +128,14 @@ def make_tracker(system: System) -> Tracker:
     rate = system.sample_rate
     settings = TrackerSettings(window=system.window / rate, hop=system.hop / rate)
     limits = {load.body: LoadLimit(load.empty, load.least, load.most) for load in system.loads if load.declared}
-    return Tracker(system.tracked, settings, deviations(system), limits=limits)
+    return Tracker(system.tracked, settings, deviations(system), limits=limits, doubt=_mass_doubt(system))
+
+
+def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:
+    """Variances of parameters and loads that doubtful masses leave open; None: there are none."""
+    if not system.doubtful_masses:
+        return None
+    from sprung.model.identification.doubt import mass_doubt  # brings torch
+
+    doubt = mass_doubt(system, loads=True)
+    return np.diag(doubt.parameters), doubt.loads

@@ -11,6 +11,7 @@ import numpy as np
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
 from sprung.model.identification.deviations import deviations
+from sprung.model.identification.doubt import MassDoubt, mass_doubt
 from sprung.model.identification.estimates import estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
@@ -38,6 +39,7 @@ class Identifier:
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refines] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
+    _doubt: MassDoubt | None = None
 
     @property
     def digest(self) -> str:
@@ -72,6 +74,7 @@ class Identifier:
         refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
         found = self._estimates(refined, states)
         if not explain:
+            found = [self._doubted(estimate) for estimate in found]
             self.times = StageTimes(between - begin, time.perf_counter() - between)
             return found
         bad = np.array([b for b, e in enumerate(found) if self._asks(e, windows.shape[1])], dtype=np.int64)
@@ -87,6 +90,15 @@ class Identifier:
         P = len(self.system.tracked)
         deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
         return estimates(refined, P, states, deviating)
+
+    def _doubted(self, estimate: Estimate) -> Estimate:
+        """With what masses that are not quite those of the file leave open."""
+        if self._doubt is None:
+            self._doubt = mass_doubt(self.system, loads=any(load.declared for load in self.system.loads))
+        if self._doubt.none:
+            return estimate
+        told = np.outer(estimate.identifiable, estimate.identifiable)
+        return replace(estimate, covariance=estimate.covariance + np.where(told, self._doubt.parameters, 0.0))
 
     def examine(self, windows: FloatArray, weigh: BoolArray) -> list[Estimate]:
         """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and

@@ -46,13 +46,19 @@ class ParameterReport:
 
 
 def reported(
-    parameters: Sequence[ParameterLike], state: TrackerState, settings: TrackerSettings, base: FloatArray, drift: Drift
+    parameters: Sequence[ParameterLike],
+    state: TrackerState,
+    settings: TrackerSettings,
+    base: FloatArray,
+    drift: Drift,
+    doubt: FloatArray,
 ) -> tuple[ParameterReport, ...]:
     """Every parameter in physical units, against nominal and against the vehicle's own baseline.
 
-    base: log-ratios to nominal of the healthy state, (P,).
+    base: log-ratios to nominal of the healthy state, (P,); doubt: variance of all log-ratios (P,) that is the same in
+    all windows, and so no part of changes.
     """
-    log_std = np.sqrt(state.belief.level_variance)
+    log_std = np.sqrt(state.belief.level_variance + doubt)
     nominal = np.array([parameter.nominal for parameter in parameters])
     value, healthy = nominal * np.exp(state.belief.level), nominal * np.exp(base)
     now = (value, value * log_std, value / nominal, state.belief.level, log_std, log_std < KNOWN * settings.prior)

@@ -52,8 +52,13 @@ class Tracker:
         deviations: Sequence[Deviation] = (),
         weather: WeatherModel | None = None,
         limits: Mapping[str, LoadLimit] = MappingProxyType({}),
+        doubt: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
-        """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body."""
+        """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body.
+
+        doubt: variance of the log-ratios (P,), and of the loads' (L,), that no window will ever take away, since all
+        have it alike: masses that are not quite those of the file.  It is part of what is stated, not of changes.
+        """
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
         self.parameters = tuple(parameters)
@@ -63,6 +68,7 @@ class Tracker:
         self.model = dev.model_of(self.deviations)
         nominal = [parameter.nominal for parameter in self.parameters]
         self.weather = weather or weathers.model_of(self.names, nominal)
+        self._doubt = doubt or (np.zeros(len(self.names)), np.zeros(int(self.model.loads.sum())))
         self._attribution = Attribution(
             self.names, self.settings, self.deviations, self.model, self.weather, dict(limits)
         )
@@ -213,12 +219,13 @@ class Tracker:
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""
-        return state.belief.level.copy(), np.sqrt(state.belief.level_variance)
+        return state.belief.level.copy(), np.sqrt(state.belief.level_variance + self._doubt[0])
 
     def report(self, state: TrackerState) -> tuple[ParameterReport, ...]:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
         base = self._fusion.baseline(state)
-        return reported(self.parameters, state, self.settings, base, self._fusion.drift(state, base))
+        drift = self._fusion.drift(state, base)
+        return reported(self.parameters, state, self.settings, base, drift, self._doubt[0])
 
     def health(self, state: TrackerState) -> Health:
         """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M."""
@@ -256,8 +263,8 @@ class Tracker:
         """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
         H = self.model.size
         found = {}
-        for h in self.model.loads_at:
-            value, std = state.belief.mean[-H:][h], float(np.sqrt(state.belief.covariance.diagonal()[-H:][h]))
-            if std < KNOWN * self._fusion.limit[h]:
-                found[self.deviations[h].name] = (float(value), std)
+        for h, doubt in zip(self.model.loads_at, self._doubt[1], strict=True):
+            value, variance = state.belief.mean[-H:][h], float(state.belief.covariance.diagonal()[-H:][h])
+            if np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
+                found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + doubt)))
         return found

@@ -1,0 +1,72 @@
+"""Masses that are not quite those of the system file: what is stated contains them."""
+
+import numpy as np
+import pytest
+
+from sprung.model.identification.doubt import mass_doubt
+from sprung.model.identification.excitation import simulate_runs
+from sprung.model.identification.identify import Identifier
+from sprung.model.system import load_system, parse_system
+from sprung.service.engine import make_tracker
+
+QUARTER_CAR = """
+name: quarter car
+sample_rate: 100
+window: 100
+bodies:
+  sprung: {{mass: 300.0}}
+  unsprung: {{mass: {mass}}}
+inputs:
+  road: {{kind: support, displacement: {{csv: z, noise: 1.0e-5}}, velocity: {{csv: v, noise: 1.0e-3}}}}
+elements:
+  tyre: {{upper: unsprung, lower: road, stiffness: 1.8e+5}}
+  strut: {{upper: sprung, lower: unsprung, stiffness: 2.0e+4, damping: 1500.0}}
+sensors:
+  body: {{kind: acceleration, body: sprung, csv: a1, noise: 0.01}}
+  wheel: {{kind: acceleration, body: unsprung, csv: a2, noise: 0.05}}
+"""
+
+
+def quarter_car(mass):
+    return parse_system(QUARTER_CAR.format(mass=mass))
+
+
+def test_with_an_unknown_load_all_forces_scale_with_the_axle():
+    system = quarter_car(40.0)
+    assert system.doubtful_masses == {"unsprung": 0.03}
+    doubt = mass_doubt(system, loads=True)
+    assert np.sqrt(np.diag(doubt.parameters)) == pytest.approx(0.03, rel=0.02)
+    assert np.sqrt(doubt.loads) == pytest.approx([0.03], rel=0.05)
+
+
+def test_windows_of_a_heavier_axle_are_within_what_is_stated():
+    runs = simulate_runs(quarter_car(41.6), np.zeros((12, 3)), 100, np.random.default_rng(5))
+    estimates = Identifier(quarter_car(40.0)).identify(runs.values)
+    told = Identifier(quarter_car("{value: 40.0, fixed: true}")).identify(runs.values)
+    score = np.array([e.log_ratio / np.sqrt(np.diag(e.covariance)) for e in estimates])
+    plain = np.array([e.log_ratio / np.sqrt(np.diag(e.covariance)) for e in told])
+    assert np.abs(score).max() < 3
+    assert np.abs(plain).max() > 6  # the mass is taken for certain
+
+
+def test_a_tracker_states_it_but_not_in_changes():
+    system = quarter_car(40.0)
+    certain = make_tracker(quarter_car("{value: 40.0, fixed: true}"))
+    doubtful = make_tracker(system)
+    runs = simulate_runs(system, np.zeros((80, 3)), 100, np.random.default_rng(6))
+    estimates = Identifier(system).examine(runs.values, np.arange(80) % 4 == 0)
+    windows = [(e, 10**18 + k * 10**9) for k, e in enumerate(estimates)]
+    state = doubtful.update_many(doubtful.initial_state(), windows)
+    assert (doubtful.posterior(state)[1] > 0.029).all()
+    assert (certain.posterior(state)[1] < 0.01).all()
+    assert all(p.drift_std is not None and p.drift_std < 0.01 for p in doubtful.report(state))
+    (_, std), (_, sure) = doubtful.loads(state)["sprung"], certain.loads(state)["sprung"]
+    assert std > 0.029 > 0.01 > sure
+
+
+def test_stated_doubt_makes_no_other_vehicle():
+    stated = quarter_car("{value: 40.0, std: 2.0}")
+    assert stated.doubtful_masses == {"unsprung": pytest.approx(0.05)}
+    assert stated.digest == quarter_car(40.0).digest
+    assert quarter_car("{value: 40.0, std: 0}").doubtful_masses == {}
+    assert load_system().doubtful_masses == {}  # wheels are measured, bogies pitch
