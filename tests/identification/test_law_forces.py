@@ -87,5 +87,5 @@ def test_the_motion_that_a_sharpened_spline_makes_of_a_tone_is_right_at_the_samp
         drift = np.polynomial.Polynomial.fit(time, left := (moved + tone / w**2), 1)(time)
         return float(np.abs(left - drift)[20:-20].max() * w**2)
 
-    assert off(sharpened(200) @ tone) < 3e-3
+    assert off(sharpened(200) @ tone) < 0.01
     assert share < 0.2 or off(sharpened(200) @ tone) < 0.35 * off(tone)
