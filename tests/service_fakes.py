@@ -101,8 +101,9 @@ def diagnose(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
 
 def eventually(check: Callable[[], Any], seconds: float = 30.0) -> Any:
     """The first true value of `check`; fails after a while."""
-    deadline = time.monotonic() + seconds
+    deadline, wait = time.monotonic() + seconds, 0.01
     while not (found := check()):
         assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.02)
+        time.sleep(wait)
+        wait = min(1.5 * wait, 0.2)  # asking takes the time of what is waited for
     return found

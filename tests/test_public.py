@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import doctest
 import os
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -29,19 +30,27 @@ from tests.service_fakes import make_window
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.fixture
-def documented(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the examples read: twenty seconds of the bundled vehicle, and a test of a damper."""
+    folder = tmp_path_factory.mktemp("recorded")
     rng, system = np.random.default_rng(2), sprung.load_system()
     speed = rng.normal(0, 0.02, (2000, 8)).cumsum(axis=0) * 0.1
     speed -= np.linspace(0, 1, 2000)[:, None] * speed[-1]
     inputs = np.stack([speed.cumsum(axis=0) / 100, speed], axis=2).reshape(2000, 16)
     values = np.hstack([inputs, simulate_ride(system, inputs, noise=rng).sensors])
     values[:, :16] += rng.normal(0, [c.noise for c in system.inputs], (2000, 16))
-    write_recording(tmp_path / "ride.mcap", system.channels, values, 100.0, 1_790_000_000 * 10**9)
-    (tmp_path / "rig.yaml").write_text(RIG)
+    write_recording(folder / "ride.mcap", system.channels, values, 100.0, 1_790_000_000 * 10**9)
+    (folder / "rig.yaml").write_text(RIG)
     rig_system = sprung.parse_system(RIG)
-    write_recording(tmp_path / "rig.csv", rig_system.channels, rig(rng, 6.0).values, 100.0, 10**18)
+    write_recording(folder / "rig.csv", rig_system.channels, rig(rng, 6.0).values, 100.0, 10**18)
+    return folder
+
+
+@pytest.fixture
+def documented(recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One's own copy of it, in which the examples run."""
+    shutil.copytree(recorded, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

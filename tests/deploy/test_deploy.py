@@ -49,7 +49,8 @@ def test_panels_do_not_lie_on_each_other_and_the_fleet_leads_to_vehicles() -> No
 
 
 def test_every_rule_is_tested_firing_and_not_firing() -> None:
-    tests = yaml.safe_load((DEPLOY / "prometheus" / "sprung.rules.test.yml").read_text())["tests"]
+    files = (DEPLOY / "prometheus").glob("*.test.yml")
+    tests = [test for path in files for test in yaml.safe_load(path.read_text())["tests"]]
     cases = [case for test in tests for case in test["alert_rule_test"]]
     for rule in RULES:
         fired = {bool(case["exp_alerts"]) for case in cases if case["alertname"] == rule["alert"]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from sprung.service.engine import load_engine
 from sprung.service.settings import Settings
 from sprung.service.store.schema import audit
 from sprung.service.worker import Emit
-from tests.service_fakes import REPORT
+from tests.service_fakes import REPORT, eventually
 
 RATE = 200.0
 FILE = """
@@ -119,10 +118,13 @@ def client(core: Core) -> Iterator[TestClient]:
 def sent(client: TestClient, ride: Path, where: str) -> dict[str, Any]:
     """Upload the ride of vehicle a and wait for what became of it."""
     with open(ride, "rb") as stream:
-        job = client.post(where, files={"file": ("ride.csv", stream)}, data={"vehicle": "a"}).json()
-    while job["state"] not in ("done", "failed"):
-        time.sleep(0.02)
-        job = client.get(f"/jobs/{job['id']}").json()
+        number = client.post(where, files={"file": ("ride.csv", stream)}, data={"vehicle": "a"}).json()["id"]
+
+    def ended() -> Any:
+        job = client.get(f"/jobs/{number}").json()
+        return job if job["state"] in ("done", "failed") else None
+
+    job = eventually(ended, 120.0)
     assert job["state"] == "done", job
     result: dict[str, Any] = job["result"]
     return result
@@ -133,7 +135,7 @@ def misfits(client: TestClient) -> list[dict[str, Any]]:
 
 
 def test_what_a_diagnosis_found_is_used_and_taken_back(
-    client: TestClient, core: Core, settings: Settings, ride: Path
+    client: TestClient, core: Core, settings: Settings, ride: Path, reading_here: None
 ) -> None:
     before = sent(client, ride, "/recordings")
     assert before["fitting"]["adequate"] < 0.2 * before["windows"]["used"] and len(misfits(client)) == 1
