@@ -12,7 +12,7 @@ broadcast, so that one call serves a whole record, a batch of candidates or one 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -234,6 +234,11 @@ class ElementLaw(Parametrised):
             zero = self.absent[self.strength]
             values[self.strength] = zero + factor * (values[self.strength] - zero)
         return values
+
+
+def with_wider_form(law: ElementLaw, *further: ParameterSpec, **changes: Any) -> ElementLaw:
+    """A law that has a wider form: the same with `further` parameters after its own, and other `changes`."""
+    return replace(law, wider=replace(law, parameters=(*law.parameters, *further), **changes))
 
 
 def grid(*columns: Sequence[float] | FloatArray) -> FloatArray:

@@ -6,7 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import (
+    RARE,
+    ElementLaw,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SpringDamper,
+    Values,
+    grid,
+    with_wider_form,
+)
 from sprung.model.signals import FloatArray
 
 
@@ -95,29 +105,23 @@ _BLOWOFF = ElementLaw(
     strength=1,
     knees=(0,),
 )
-DAMPER_BLOWOFF = replace(
+DAMPER_BLOWOFF = with_wider_form(
     _BLOWOFF,
-    wider=replace(
-        _BLOWOFF,
-        parameters=(
-            *_BLOWOFF.parameters,
-            replace(_BLOWOFF.parameters[0], name="knee_compression"),
-            replace(_BLOWOFF.parameters[1], name="ratio_compression"),
-        ),
-        force=_two_knees,
-        formula=("c * ((ratio - 1) * max(v - knee, 0) + (ratio_compression - 1) * min(v + knee_compression, 0))"),
-        shapes=lambda seen: grid(_knees(seen), [0.3], _knees(seen), [0.3]),
-        absent=(100.0, 1.0, 100.0, 1.0),
-        sentence=(
-            "the damper blows off beyond {knee} in extension and {knee_compression} in compression; its slope falls to "
-            "{ratio} and {ratio_compression} of the nominal one"
-        ),
-        strength=None,
-        knees=(0, 2),
-        prior_cost=RARE,
-        screened=False,
-        widened=lambda p, seen: ((*p, *p),),
+    replace(_BLOWOFF.parameters[0], name="knee_compression"),
+    replace(_BLOWOFF.parameters[1], name="ratio_compression"),
+    force=_two_knees,
+    formula=("c * ((ratio - 1) * max(v - knee, 0) + (ratio_compression - 1) * min(v + knee_compression, 0))"),
+    shapes=lambda seen: grid(_knees(seen), [0.3], _knees(seen), [0.3]),
+    absent=(100.0, 1.0, 100.0, 1.0),
+    sentence=(
+        "the damper blows off beyond {knee} in extension and {knee_compression} in compression; its slope falls to "
+        "{ratio} and {ratio_compression} of the nominal one"
     ),
+    strength=None,
+    knees=(0, 2),
+    prior_cost=RARE,
+    screened=False,
+    widened=lambda p, seen: ((*p, *p),),
 )
 
 
@@ -154,28 +158,22 @@ def _levels_off(p: Values, seen: Observed) -> tuple[tuple[float, ...], ...]:
 
 
 # Valves of one knee whose forces in the two directions keep their ratio: beyond it, the difference grows as the forces
-DAMPER_ASYMMETRY = replace(
+DAMPER_ASYMMETRY = with_wider_form(
     _ASYMMETRY,
-    wider=replace(
-        _ASYMMETRY,
-        parameters=(
-            *_ASYMMETRY.parameters,
-            replace(_BLOWOFF.parameters[0], meaning="rate beyond which the difference grows more slowly"),
-            ParameterSpec("ratio", "1", -2.0, 2.0, "growth beyond the knee over that below it", lambda seen: 0.3),
-        ),
-        force=_asymmetry_of_valves,
-        formula="a * c * (ratio * abs(v) + (1 - ratio) * min(abs(v), knee))",
-        shapes=lambda seen: grid([0.3], _knees(seen), [0.3]),
-        absent=(0.0, 100.0, 1.0),
-        sentence=(
-            "the damper is harder in one direction, a = {a} (positive: extension) up to {knee}; the difference grows "
-            "with {ratio} of that beyond"
-        ),
-        knees=(1,),
-        prior_cost=RARE,
-        screened=False,
-        widened=_levels_off,
+    replace(_BLOWOFF.parameters[0], meaning="rate beyond which the difference grows more slowly"),
+    ParameterSpec("ratio", "1", -2.0, 2.0, "growth beyond the knee over that below it", lambda seen: 0.3),
+    force=_asymmetry_of_valves,
+    formula="a * c * (ratio * abs(v) + (1 - ratio) * min(abs(v), knee))",
+    shapes=lambda seen: grid([0.3], _knees(seen), [0.3]),
+    absent=(0.0, 100.0, 1.0),
+    sentence=(
+        "the damper is harder in one direction, a = {a} (positive: extension) up to {knee}; the difference grows "
+        "with {ratio} of that beyond"
     ),
+    knees=(1,),
+    prior_cost=RARE,
+    screened=False,
+    widened=_levels_off,
 )
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from sprung.model.laws.base import (
     SpringDamper,
     Values,
     grid,
+    with_wider_form,
 )
 from sprung.model.laws.paths import maxwell_path
 from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
@@ -231,16 +231,13 @@ _BOUC_WEN = ElementLaw(
 )
 # The loop's shape free: gamma below -1 stiffens while it is loaded, above 1 it hardly yields while it is unloaded
 _FREE = ParameterSpec("gamma", "1", -4.0, 4.0, "in z' = v - beta (abs(v) z + gamma v abs(z))", lambda seen: GAMMA)
-BOUC_WEN = replace(
+BOUC_WEN = with_wider_form(
     _BOUC_WEN,
-    wider=replace(
-        _BOUC_WEN,
-        parameters=(*_BOUC_WEN.parameters, _FREE),
-        shapes=_free_shapes,
-        absent=(*_BOUC_WEN.absent, GAMMA),
-        widened=lambda p, seen: ((*p, GAMMA),),
-        prior_cost=RARE,
-        sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
-        memory_formula="v - beta * abs(z)**n * (abs(v) * sign(z) + gamma * v)",
-    ),
+    _FREE,
+    shapes=_free_shapes,
+    absent=(*_BOUC_WEN.absent, GAMMA),
+    widened=lambda p, seen: ((*p, GAMMA),),
+    prior_cost=RARE,
+    sentence="a hysteretic part of {alpha} that yields (beta = {beta}, n = {n}, gamma = {gamma})",
+    memory_formula="v - beta * abs(z)**n * (abs(v) * sign(z) + gamma * v)",
 )

@@ -2,11 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import (
+    RARE,
+    ElementLaw,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SpringDamper,
+    Values,
+    grid,
+    with_wider_form,
+)
 from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA, bouc_wen_memory
 from sprung.model.signals import FloatArray
@@ -82,24 +90,18 @@ _FRICTION_BACKLASH = ElementLaw(
     prior_cost=RARE,
     screened=False,
 )
-FRICTION_BACKLASH = replace(
+FRICTION_BACKLASH = with_wider_form(
     _FRICTION_BACKLASH,
-    wider=replace(
-        _FRICTION_BACKLASH,
-        parameters=(
-            *_FRICTION_BACKLASH.parameters,
-            ParameterSpec("inner_stiffness", "N/m", 0.0, 1e12, "what still holds within the gap", lambda s: 0.0),
-        ),
-        formula=("inner_stiffness * z + (stiffness - inner_stiffness) * sign(z) * max(abs(z) - 0.5 * gap, 0)"),
-        memory_formula=_SLIPS.format(reach="(force - 0.5 * inner_stiffness * gap) / stiffness", corner=_INNER_REACH),
-        shapes=lambda seen: grid(
-            [_size(seen)], _travel(seen) * np.array([0.3, 1.0]), [max(seen.stiffness, 1e-6)], [0.1 * seen.stiffness]
-        ),
-        absent=(0.0, 0.0, 1.0, 0.0),
-        sentence=(
-            "it slips at {force} after a lost motion of {gap}, within which {inner_stiffness} still holds, and sticks "
-            "with {stiffness}"
-        ),
+    ParameterSpec("inner_stiffness", "N/m", 0.0, 1e12, "what still holds within the gap", lambda s: 0.0),
+    formula=("inner_stiffness * z + (stiffness - inner_stiffness) * sign(z) * max(abs(z) - 0.5 * gap, 0)"),
+    memory_formula=_SLIPS.format(reach="(force - 0.5 * inner_stiffness * gap) / stiffness", corner=_INNER_REACH),
+    shapes=lambda seen: grid(
+        [_size(seen)], _travel(seen) * np.array([0.3, 1.0]), [max(seen.stiffness, 1e-6)], [0.1 * seen.stiffness]
+    ),
+    absent=(0.0, 0.0, 1.0, 0.0),
+    sentence=(
+        "it slips at {force} after a lost motion of {gap}, within which {inner_stiffness} still holds, and sticks "
+        "with {stiffness}"
     ),
 )
 

@@ -6,7 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import (
+    RARE,
+    ElementLaw,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SpringDamper,
+    Values,
+    grid,
+    with_wider_form,
+)
 from sprung.model.signals import FloatArray
 
 
@@ -78,28 +88,22 @@ _BUMP_STOP = ElementLaw(
     sentence="a stop of {stiffness} is touched beyond {gap} of travel",
     strength=1,
 )
-BUMP_STOP = replace(
+BUMP_STOP = with_wider_form(
     _BUMP_STOP,
-    wider=replace(
-        _BUMP_STOP,
-        parameters=(
-            *_BUMP_STOP.parameters,
-            replace(_BUMP_STOP.parameters[0], name="gap_compression", meaning="free travel in compression"),
-            replace(_BUMP_STOP.parameters[1], name="stiffness_compression", meaning="stiffness beyond that"),
-        ),
-        force=_two_stops,
-        shapes=lambda seen: grid(_reach(seen), [seen.stiffness], _reach(seen), [seen.stiffness]),
-        absent=(1.0, 0.0, 1.0, 0.0),
-        formula="stiffness * max(d - gap, 0) + stiffness_compression * min(d + gap_compression, 0)",
-        sentence=(
-            "a stop of {stiffness} is touched beyond {gap} of extension, one of {stiffness_compression} beyond "
-            "{gap_compression} of compression"
-        ),
-        strength=None,
-        prior_cost=RARE,
-        screened=False,
-        widened=_either_side,
+    replace(_BUMP_STOP.parameters[0], name="gap_compression", meaning="free travel in compression"),
+    replace(_BUMP_STOP.parameters[1], name="stiffness_compression", meaning="stiffness beyond that"),
+    force=_two_stops,
+    shapes=lambda seen: grid(_reach(seen), [seen.stiffness], _reach(seen), [seen.stiffness]),
+    absent=(1.0, 0.0, 1.0, 0.0),
+    formula="stiffness * max(d - gap, 0) + stiffness_compression * min(d + gap_compression, 0)",
+    sentence=(
+        "a stop of {stiffness} is touched beyond {gap} of extension, one of {stiffness_compression} beyond "
+        "{gap_compression} of compression"
     ),
+    strength=None,
+    prior_cost=RARE,
+    screened=False,
+    widened=_either_side,
 )
 
 

@@ -101,6 +101,25 @@ class Found:
 
 
 @dataclass(frozen=True)
+class Widened:
+    """A fit with one of its laws wider."""
+
+    fit: Fit
+    index: int  # of the term
+    fall: float  # of chi-square against the narrower one
+    gain: float  # twice the log-likelihood ratio
+    evidence: float  # gain less what the further parameters cost
+
+
+@dataclass(frozen=True)
+class TriedWider:
+    """What the wider forms of a fit's laws come to."""
+
+    of: Fit
+    best: Widened | None  # None: no law has one
+
+
+@dataclass(frozen=True)
 class Investigation:
     """Everything known between two findings."""
 
@@ -119,6 +138,7 @@ class Investigation:
     input_faults: tuple[InputFault, ...] = ()
     setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()
+    wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet
 
     @property
     def given(self) -> int:

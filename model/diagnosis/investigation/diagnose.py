@@ -27,7 +27,14 @@ from sprung.model.diagnosis.investigation.inputs import best_input_fault, compen
 from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
-from sprung.model.diagnosis.investigation.widened import act_together, best_widened, left_open, outdoes, with_wider
+from sprung.model.diagnosis.investigation.widened import (
+    act_together,
+    left_open,
+    outdoes,
+    tried_wider,
+    widest,
+    with_wider,
+)
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
@@ -191,7 +198,9 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     error = float(np.sqrt(np.mean(misfit(state.fit))))
     gross = not state.problem.process_noise and error > options.rules.selection.gross
     hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
-    wide = best_widened(state) if hits or act_together(state) else None
+    if hits or act_together(state):
+        state = tried_wider(state)
+    wide = widest(state)
     promised = max((hit.score for hit in hits), default=0.0)
     if wide is not None and wide.fall > promised and outdoes(state, wide, []):
         return _next_finding(with_wider(state, wide), number, tell)

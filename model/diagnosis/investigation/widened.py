@@ -9,13 +9,13 @@ narrow one, values are uncertain by what both say.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.investigation.course import Investigation, TriedWider, Widened
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term
@@ -29,18 +29,20 @@ from sprung.model.signals import FloatArray
 _FIRST, _MORE, _ROUNDS = 3, 10, 3  # iterations of a start, and of the best one in a round; rounds while it falls
 
 
-@dataclass(frozen=True)
-class Widened:
-    """A fit with one of its laws wider."""
-
-    fit: Fit
-    index: int  # of the term
-    fall: float  # of chi-square against the narrower one
-    gain: float  # twice the log-likelihood ratio
-    evidence: float  # gain less what the further parameters cost
+def tried_wider(state: Investigation) -> Investigation:
+    """The investigation with the laws found so far tried in their wider forms, if that has not been done."""
+    if state.wider is not None and state.wider.of is state.fit:
+        return state
+    return replace(state, wider=TriedWider(state.fit, _best_widened(state)))
 
 
-def best_widened(state: Investigation) -> Widened | None:
+def widest(state: Investigation) -> Widened | None:
+    """The wider form of a law of the present fit that gains most, where it was tried and has one."""
+    known = state.wider
+    return known.best if known is not None and known.of is state.fit else None
+
+
+def _best_widened(state: Investigation) -> Widened | None:
     """The law found so far that gains most by its wider form; None: none has one."""
     if state.problem.process_noise:
         return None
@@ -81,7 +83,7 @@ def left_open(state: Investigation) -> FloatArray:
     """
     fit = state.fit
     nothing = np.zeros_like(fit.covariance)
-    wide = best_widened(state) if act_together(state) else None
+    wide = widest(tried_wider(state)) if act_together(state) else None
     if wide is None:
         return nothing
     rules = state.problem.rules.evidence

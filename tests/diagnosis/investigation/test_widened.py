@@ -11,7 +11,7 @@ from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.investigation import widened
 from sprung.model.diagnosis.investigation.diagnose import begun
-from sprung.model.diagnosis.investigation.widened import act_together, best_widened, left_open
+from sprung.model.diagnosis.investigation.widened import act_together, left_open, tried_wider, widest
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.starts import start_of
@@ -41,7 +41,9 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together):
     found: Any = tuple(SimpleNamespace(trial=SimpleNamespace(term=term)) for term in fit.point.terms)
     state = replace(state, fit=fit, found=found)
     assert act_together(state)
-    wide = best_widened(state)
+    state = tried_wider(state)
+    wide = widest(state)
+    assert tried_wider(state) is state  # made once
     assert wide is not None and (wide.evidence > 20 if together else wide.evidence < 0)
     if together:
         term, place = wide.fit.point.terms[wide.index], wide.fit.place(wide.index)
@@ -54,7 +56,8 @@ def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch):
     fit: Any = SimpleNamespace(covariance=np.zeros((2, 2)), point=_point([0.1], (0.2,), 0.0))
     wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0)))
     monkeypatch.setattr(widened, "act_together", lambda state: True)
-    monkeypatch.setattr(widened, "best_widened", lambda state: wide)
+    monkeypatch.setattr(widened, "tried_wider", lambda state: state)
+    monkeypatch.setattr(widened, "widest", lambda state: wide)
     state: Any = SimpleNamespace(fit=fit, problem=SimpleNamespace(rules=RULES))
     np.testing.assert_allclose(left_open(state), [[0.0, 0.0], [0.0, 0.25 * 0.1**2]])
     wide.evidence = -60.0
