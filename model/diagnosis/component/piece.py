@@ -27,6 +27,7 @@ Values = dict[str, tuple[float, str]]  # value and unit by name
 Shape = Sequence[float]
 
 _UNIT = SpringDamper(1.0, 1.0)
+_MEDIAN_OF_NORMAL = 0.6745  # of the magnitude, over the deviation
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Seen:
         quantiles = np.quantile(np.abs(motion.rate), np.linspace(0, 1, 101))
         travel = 0.5 * float(np.ptp(motion.deflection))
         rate, seconds = np.maximum(quantiles, 1e-12), len(motion.time) * motion.step
-        knee = rules.lowest_knee * float(rate[50])
+        usual = max(float(rate[50]), _MEDIAN_OF_NORMAL * float(np.sqrt(np.mean(rate**2))))  # whatever rests there are
+        knee = rules.lowest_knee * usual
         return cls(max(travel, 1e-12), rate, seconds, motion.step, knee, rules.formula_reach, rules.latest)
 
     @property

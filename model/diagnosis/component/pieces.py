@@ -51,6 +51,10 @@ def _damping(element: SpringDamper) -> float:
     return max(float(element.damping), 1e-300)
 
 
+def _apart_from_zero(value: float) -> float:
+    return value if value != 0 else 1e-300
+
+
 def _opens_late_enough(fitted: FittedPiece) -> bool:
     """A valve: less force beyond the knee, and knees that the sampling resolves."""
     ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
@@ -256,6 +260,17 @@ _ASYMMETRY = Piece(
     lambda p: (),
     believed=lambda fitted: abs(fitted.values["a"]) <= 1.0,
 )
+_ASYMMETRY_OF_VALVES = Piece(
+    _wider("damper_asymmetry"),
+    ("knee",),
+    lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7])),
+    lambda seen: [_knee_limits(seen)],
+    (0, 0),  # of the rate's magnitude, and of the part below the knee
+    lambda a, s, e: ((a[0] + a[1]) / _damping(e), s[0], a[0] / _apart_from_zero(a[0] + a[1])),
+    lambda p: (p[1],),
+    plain=1,
+    believed=lambda fitted: _opens_late_enough(fitted) and abs(fitted.values["a"]) <= 1.0,
+)
 _SERIES = Piece(
     _law("series_stiffness"),
     ("tau",),
@@ -333,6 +348,7 @@ PIECES: tuple[Piece, ...] = (
     _BLOWOFF,
     _TWO_KNEES,
     _ASYMMETRY,
+    _ASYMMETRY_OF_VALVES,
     _SERIES,
     _CUBIC,
     _BUMP_STOP,

@@ -8,7 +8,7 @@ test by one sine repeats itself, and a thousand repetitions of one error tell no
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -87,29 +87,59 @@ def search(
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)
-    count = effective_count(base.residual[: quick.split])
-    current = Ranked(base, 0.0, 0.0, count)
-    steps: list[Step] = []
+    grown = _grown(base, pieces, tests, tell)
+    composite = {piece.key for piece in grown.current.fit.model.pieces[len(given.pieces) :] if piece.plain > 0}
+    if composite:  # one law of many numbers does at once what several common ones do, one after the other
+        tell(f"without {', '.join(sorted(composite))}")
+        plainer = _grown(base, tuple(p for p in pieces if p.key not in composite), tests, tell)
+        grown = replace(_plainer_of(grown, plainer, rules), first=grown.first)
+    final = refined(fine, grown.current.fit.model)
     screened: dict[str, float] = {}
-    alone: tuple[Ranked, ...] = ()
+    for trial in grown.first:
+        screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
+    return Search(refined(fine, base.model), final, grown.steps, screened, grown.first, tests)
+
+
+@dataclass(frozen=True)
+class _Grown:
+    """A model with the steps that led to it."""
+
+    current: Ranked
+    steps: tuple[Step, ...]
+    first: tuple[Ranked, ...]  # models with one law, best first
+
+
+def _grown(base: ComponentFit, pieces: tuple[LawPiece, ...], tests: int, tell: Progress) -> _Grown:
+    """A model that gets one law after the other, until the rest is noise or nothing explains enough of it."""
+    task, rules, given = base.task, base.task.rules, len(base.model.pieces)
+    current = Ranked(base, 0.0, 0.0, effective_count(base.residual[: task.split]))
+    steps: list[Step] = []
+    first: tuple[Ranked, ...] = ()
     for number in range(rules.most + rules.per_signal * len(task.signals)):
         if current.fit.at_noise:
             break
         tell(f"laws beside {', '.join(p.effect for p in current.fit.model.pieces) or 'spring and damper'}")
-        ranked = next_laws(current.fit, _beside(pieces, current.fit.model, len(given.pieces)), rules)
+        ranked = next_laws(current.fit, _beside(pieces, current.fit.model, given), rules)
         if number == 0:
-            alone = tuple(ranked)
-            for trial in ranked:
-                screened[trial.last.effect] = max(screened.get(trial.last.effect, 0.0), trial.gain)
+            first = tuple(ranked)
         step = _accepted(current, ranked, base, rules, tests)
         if step is None:
             break
         steps.append(step)
-        current = _swapped(step.chosen, pieces, rules, len(given.pieces))
+        current = _swapped(step.chosen, pieces, rules, given)
         if current is not step.chosen:  # an earlier law gives way to one that suits the later better
-            steps = _renamed(steps, current, len(given.pieces), tests)
-    final = refined(fine, current.fit.model)
-    return Search(refined(fine, base.model), final, tuple(steps), screened, alone, tests)
+            steps = _renamed(steps, current, given, tests)
+    return _Grown(current, tuple(steps), first)
+
+
+def _plainer_of(one: _Grown, other: _Grown, rules: ComponentRules) -> _Grown:
+    """The one that serves the held-out part better; of two that serve it as well, that of commoner laws."""
+    fits = [grown.current.fit for grown in (one, other)]
+    best = min(fit.held_out for fit in fits)
+    alike = [
+        g for g, fit in zip((one, other), fits, strict=True) if fit.held_out <= rules.as_well * best or fit.at_noise
+    ]
+    return min(alike, key=lambda g: (sum(p.plain for p in g.current.fit.model.pieces), g.current.fit.model.count))
 
 
 def _beside(pieces: tuple[LawPiece, ...], model: ComponentModel, given: int) -> tuple[LawPiece, ...]:
