@@ -88,6 +88,7 @@ def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> Mutan
             _one(path, dbc, honest, outcome)
             outcome.slowest = max(outcome.slowest, time.process_time() - started)
             if keep is not None and sum(outcome.faults.values()) + outcome.silent > found:
+                keep.mkdir(parents=True, exist_ok=True)
                 (keep / f"{name}-{outcome.mutants}{path.suffix}").write_bytes(path.read_bytes())
                 found = sum(outcome.faults.values()) + outcome.silent
     outcome.grown = _peak() - before
