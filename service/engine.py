@@ -132,10 +132,11 @@ def make_tracker(system: System) -> Tracker:
 
 
 def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:
-    """Variances of parameters and loads that doubtful masses leave open; None: there are none."""
+    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses leave open; None: there
+    are none."""
     if not system.doubtful_masses:
         return None
     from sprung.model.identification.doubt import mass_doubt  # brings torch
 
-    doubt = mass_doubt(system, loads=True)
-    return np.diag(doubt.parameters), doubt.loads
+    doubt = mass_doubt(system, loads=True, channels=True)
+    return np.diag(doubt.parameters), doubt.deviations

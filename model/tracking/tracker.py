@@ -56,8 +56,9 @@ class Tracker:
     ) -> None:
         """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body.
 
-        doubt: variance of the log-ratios (P,), and of the loads' (L,), that no window will ever take away, since all
-        have it alike: masses that are not quite those of the file.  It is part of what is stated, not of changes.
+        doubt: variance of the log-ratios (P,), and covariance of the deviations (H, H), that no window will ever take
+        away, since all have it alike: masses that are not quite those of the file.  It is part of what is stated, not
+        of changes.
         """
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
@@ -68,7 +69,7 @@ class Tracker:
         self.model = dev.model_of(self.deviations)
         nominal = [parameter.nominal for parameter in self.parameters]
         self.weather = weather or weathers.model_of(self.names, nominal)
-        self._doubt = doubt or (np.zeros(len(self.names)), np.zeros(int(self.model.loads.sum())))
+        self._doubt = doubt or (np.zeros(len(self.names)), np.zeros((self.model.size, self.model.size)))
         self._attribution = Attribution(
             self.names, self.settings, self.deviations, self.model, self.weather, dict(limits)
         )
@@ -253,7 +254,7 @@ class Tracker:
         far = np.abs(off) > self.model.named
         if not far.any():
             return tuple(stuck)
-        std = self.model.relative_std(state.belief.covariance[-H:, -H:])
+        std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._doubt[1])
         bent = np.where(self.model.gains, dev.bending(off), 0.0)
         std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + bent**2)
         chosen = far & (np.abs(off) > 3 * std)
@@ -263,8 +264,8 @@ class Tracker:
         """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
         H = self.model.size
         found = {}
-        for h, doubt in zip(self.model.loads_at, self._doubt[1], strict=True):
+        for h in self.model.loads_at:
             value, variance = state.belief.mean[-H:][h], float(state.belief.covariance.diagonal()[-H:][h])
             if np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
-                found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + doubt)))
+                found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + self._doubt[1][h, h])))
         return found
