@@ -298,9 +298,15 @@ class ComponentRules:
         0.1, "samples, from which a channel is late; derived: sampling at a time is no better", 0.05, 0.3
     )
     latest: float = rule(0.04, "s, of a late channel; chosen: filters and nodes of test benches", 0.02, 0.08)
+    refined_latest: float = rule(
+        1.4, "times that, up to which a refined delay is one; chosen: not its limit", 1.2, 1.49
+    )
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
     lowest_knee: float = rule(0.3, "of the median rate; chosen: a valve that opens below acts as friction", 0.2, 0.5)
+    valve_least: float = rule(-0.02, "of the damping, left beyond a knee; derived: none, and its error", -0.1, 0.0)
+    valve_most: float = rule(0.98, "of the damping, left beyond a knee; chosen: more is no valve", 0.95, 0.99)
+    no_longer: float = rule(10.0, "times, by which a damping was read too high without a law; chosen", 5.0, 20.0)
     frame: float = rule(0.01, "of the rod's motion; chosen: a body that moves less is ground", 0.005, 0.02)
     moves: float = rule(2.0, "noise deviations by which a rod has to move; chosen: 1 is noise alone", 1.5, 3.0)
     rests: float = rule(0.004, "of the motion's deviation; chosen: less is standstill", 0.002, 0.008)

@@ -274,7 +274,7 @@ class Lag:
     kind: PieceKind = STATIC
     dissipates: bool = False
     believed: Believed = lambda fitted: (
-        fitted.rules.late * fitted.step < abs(fitted.shape[0]) < 1.4 * fitted.rules.latest
+        fitted.rules.late * fitted.step < abs(fitted.shape[0]) < fitted.rules.refined_latest * fitted.rules.latest
     )
     plain: int = 0
     shapes: tuple[str, ...] = ("time",)

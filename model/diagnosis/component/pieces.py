@@ -59,7 +59,8 @@ def _opens_late_enough(fitted: FittedPiece) -> bool:
     """A valve: less force beyond the knee, and knees that the sampling resolves."""
     ratios = [fitted.values[name] for name in ("ratio", "ratio_compression") if name in fitted.values]
     knees = [fitted.values[name] for name in ("knee", "knee_compression") if name in fitted.values]
-    return all(-0.02 <= r < 0.98 for r in ratios) and all(k > fitted.corner for k in knees)
+    least, most = fitted.rules.valve_least, fitted.rules.valve_most
+    return all(least <= r < most for r in ratios) and all(k > fitted.corner for k in knees)
 
 
 def _falls(fitted: FittedPiece) -> bool:

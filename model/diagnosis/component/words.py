@@ -44,7 +44,7 @@ def finding_of(
         sentence += f", z' = {memory}"
     if family is not None:
         sentence += f" ({family.replace('_', ' ')} fit almost equally well)"
-    if base.element.damping > 0 and fit.element.damping < 0.1 * base.element.damping:
+    if base.element.damping > 0 and fit.element.damping * fit.task.rules.no_longer < base.element.damping:
         sentence += f"; {element}.damping is then no longer needed"
     return Finding(
         location=element,
