@@ -145,8 +145,15 @@ def learned(windows):
     return tracker, state, rng
 
 
-@pytest.mark.parametrize("begins", [60, 900])  # while the gains of the baseline are being refined, and after
-@pytest.mark.parametrize("to", [0.01, 0.06])
+@pytest.mark.parametrize(
+    ("to", "begins"),  # from 60, the gains of the baseline are being refined; by 900 they have been
+    [
+        (0.06, 60),
+        (0.01, 900),
+        pytest.param(0.06, 900, marks=pytest.mark.slow),
+        pytest.param(0.01, 60, marks=pytest.mark.slow),
+    ],
+)
 def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begins, to):
     tracker, state, rng = copy.deepcopy(learned(begins))
     for k in range(begins, begins + 900):

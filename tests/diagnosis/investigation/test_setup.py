@@ -34,7 +34,14 @@ def test_a_right_set_up_is_left_alone(vehicle: tuple[System, np.ndarray]) -> Non
 
 
 @pytest.mark.parametrize(
-    "kind", ["upside down", "left and right", "late inputs", "scale of a node", "element at another body"]
+    "kind",
+    [
+        "left and right",
+        "late inputs",
+        "element at another body",
+        pytest.param("upside down", marks=pytest.mark.slow),
+        pytest.param("scale of a node", marks=pytest.mark.slow),
+    ],
 )
 def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[System, np.ndarray]) -> None:
     system, values = vehicle
