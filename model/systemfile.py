@@ -237,6 +237,13 @@ def _line_of(node: yaml.Node | None, keys: list[str]) -> int:
     return line + 1
 
 
+def written(file: SystemFile) -> str:
+    """The text of a system file; read again it is the same file."""
+    return yaml.safe_dump(
+        file.model_dump(mode="json", exclude_unset=True, exclude_none=True), sort_keys=False, width=110
+    )
+
+
 def json_schema() -> dict[str, Any]:
     """JSON Schema of the format, for editors that complete and check while typing."""
     return {

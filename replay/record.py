@@ -13,6 +13,7 @@ from sprung.model.signals import ANY_TIME, BoolArray, Channel, FloatArray, Sampl
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import REACH, place, resample, taken_at_stamps, uneven
 from sprung.replay.recording import Recording, open_recording
+from sprung.replay.slower import slower_than
 from sprung.replay.stream import ClockJump, Order
 
 MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
@@ -132,7 +133,8 @@ def _grid(block: SampleBlock, recording: Recording, sample_rate: float) -> tuple
     placed = place(offset, block.channel, block.value, rows, len(channels))
     values = placed.value
     told = [recording.stamped and _taken_at_stamps(block, offset, channel) for channel in range(len(channels))]
-    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | np.array(told)):
+    slower = [slower_than(offset[block.channel == channel], 1.0) for channel in range(len(channels))]
+    for channel in np.flatnonzero(placed.off_grid.any(axis=0) | np.array(told) | np.array(slower)):
         own = block.channel == channel
         values[:, channel], between = _resample_long(
             offset[own], block.value[own], rows, recording.stamped, told[channel]

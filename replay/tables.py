@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sprung.model.signals import Channel, FloatArray, IntArray, SampleBlock, TimeColumn
+from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, TimeColumn
 from sprung.model.units import FACTORS, known
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.csvlayout import unit_in
+from sprung.replay.slower import SlowerColumns
 from sprung.replay.stamps import SECOND, Stamps
 
 ROWS = 16_384  # that are handed out together
@@ -172,6 +173,7 @@ class Rows:
         unit = None if self.time is None else seconds_of(units[self.time])
         self._stamps = Stamps(time, unit, account)
         self._rows = 0
+        self._slower = SlowerColumns()
         if self.time is None:
             account.relative = True
 
@@ -190,9 +192,9 @@ class Rows:
         empty = np.isnan(values)
         self.account.drop(int(empty.all(axis=1).sum()), "no valid value")
         self.account.tally.used += int((~empty.all(axis=1)).sum())
-        self.account.values["empty or NaN"] += int(empty.sum())
-        index = np.tile(self._index, len(values))
-        return SampleBlock(np.repeat(stamps, len(self._index)), index, values.reshape(-1).copy())
+        kept, missing = self._slower.kept(stamps, empty)
+        self.account.values["empty or NaN"] += missing
+        return _samples(stamps, self._index, values, kept)
 
 
 def column_blocks(
@@ -263,6 +265,7 @@ class _Series:
         if isinstance(time, Column):
             unit = seconds_of(time.unit) or seconds_of(unit_in(time.name.rsplit("/", 1)[-1])[1])
         self._stamps = Stamps(key, unit, account)
+        self._slower = SlowerColumns()
         self._epoch = key.epoch or 0
         self._at = 0
         self._held: list[SampleBlock] = []
@@ -306,6 +309,16 @@ class _Series:
         empty = np.isnan(values)
         self.account.drop(int(empty.all(axis=1).sum()), "no valid value")
         self.account.tally.used += int((~empty.all(axis=1)).sum())
-        self.account.values["empty or NaN"] += int(empty.sum())
-        index = np.array([place for place, _ in self.members], dtype=np.int32)
-        return SampleBlock(np.repeat(stamps[good], len(index)), np.tile(index, len(values)), values.reshape(-1).copy())
+        kept, missing = self._slower.kept(stamps[good], empty)
+        self.account.values["empty or NaN"] += missing
+        return _samples(stamps[good], np.array([place for place, _ in self.members], dtype=np.int32), values, kept)
+
+
+def _samples(time: IntArray, index: NDArray[np.int32], values: FloatArray, kept: BoolArray) -> SampleBlock:
+    """Values (n, columns) row by row; index: of their channels; kept: which of them are samples."""
+    one_by_one = kept.reshape(-1)
+    return SampleBlock(
+        np.repeat(time, len(index))[one_by_one],
+        np.tile(index, len(values))[one_by_one],
+        values.reshape(-1)[one_by_one],
+    )

@@ -25,7 +25,8 @@ from sprung.model.sensor_kinds import KINDS, USUAL_NOISE, Kind
 from sprung.model.signals import FloatArray
 from sprung.model.system import System, parse_system
 
-_KEYS = ("M", "C", "K", "Kb", "Cb", "S", "A", "B", "mass", "sample_rate")
+_KEYS = ("M", "C", "K", "Kb", "Cb", "S", "A", "B", "D", "mass", "sample_rate")
+FASTEST = 1e6  # Hz
 _SAME = 1e-8  # relative to the largest entry of a matrix
 _DIFFERENCES = 1e-6  # the same of derivatives that an FMU may take by differences
 
@@ -57,16 +58,21 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     rate: Hz, of the recordings; else `sample_rate` of the file.
     Errors: `ExchangeError`, OSError.
     """
+    if not path.is_file():
+        raise ExchangeError(f"{path}: {'is a folder' if path.is_dir() else 'there is no such file'}")
     if path.suffix.lower() == ".fmu":
         return _from_fmu(path, name, rate)
     try:
         data = scipy.io.loadmat(path)
+    except OSError as error:
+        raise ExchangeError(f"{path}: cannot be read: damaged, cut short or not permitted ({error})") from error
     except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
         raise ExchangeError(f"{path}: no .mat file of version 4 to 7: {' '.join(str(error).split())[:150]}") from error
     given = {key: _matrix(path, key, data[key]) for key in _KEYS if key in data}
     sampled = rate if rate is not None else _number(given, "sample_rate")
-    if sampled is None or not sampled > 0:
+    if sampled is None:
         raise ExchangeError(f"{path}: no sample_rate; say at how many Hz the recordings are by --rate")
+    _check_rate(path, sampled)
     found = _from_state_space(path, given) if "A" in given else _from_mck(path, given)
     text = _text(found, name or path.stem, sampled)
     _same_again(path, found, parse_system(text, str(path)))
@@ -75,14 +81,20 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
 
 def _from_fmu(path: Path, name: str | None, rate: float | None) -> str:
     """The text of a system file from an FMU's A, B, C."""
-    if rate is None or not rate > 0:
+    if rate is None:
         raise ExchangeError(f"{path}: say at how many Hz the recordings are by --rate")
+    _check_rate(path, rate)
     linear = read_fmu(path)
     network = _from_state_space(path, {"A": linear.A, "B": linear.B, "C": linear.C}, _DIFFERENCES)
     names = _Names(linear.states, linear.supports, linear.outputs)
     text = _text(network, name or path.stem, rate, names)
     _same_again(path, network, parse_system(text, str(path)), _DIFFERENCES)
     return text
+
+
+def _check_rate(path: Path, rate: float) -> None:
+    if not 0 < rate <= FASTEST:
+        raise ExchangeError(f"{path}: sample_rate {rate:g} Hz: it must be above 0 and at most {FASTEST:g}")
 
 
 def _matrix(path: Path, name: str, value: Any) -> FloatArray:
@@ -157,6 +169,8 @@ def _from_state_space(path: Path, given: Mapping[str, FloatArray], same: float =
     mass = _masses(path, X, given.get("mass"))
     scale = mass[:, None]
     sensors = tuple(_sensor_of_output(path, i, row, A, same) for i, row in enumerate(rows))
+    if "D" in given:
+        _check_feedthrough(path, given["D"], sensors, B, same)
     return _checked(path, SpringNetwork(mass, scale * X, scale * Y, scale * Kb, scale * Cb, sensors), same)
 
 
@@ -205,7 +219,26 @@ def _sensor_of_output(path: Path, number: int, row: FloatArray, A: FloatArray, s
     raise ExchangeError(f"{path}: C: row {number + 1} is no displacement, velocity, acceleration or deflection")
 
 
+def _check_feedthrough(
+    path: Path, D: FloatArray, sensors: Sequence[tuple[Kind, int, int]], B: FloatArray, same: float
+) -> None:
+    """D says nothing new: what supports do at once to an acceleration is in B, and to no other output is anything."""
+    n = len(B) // 2
+    wanted = np.array([B[n + i] if kind == "acceleration" else np.zeros(B.shape[1]) for kind, i, _ in sensors])
+    if D.shape != wanted.shape:
+        raise ExchangeError(f"{path}: D {D.shape}: a row for each row of C and a column for each of B are needed")
+    wrong = np.abs(D - wanted).max(axis=1) > max(same, 1e-9) * (np.abs(wanted).max() or 1.0)
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ExchangeError(
+            f"{path}: D: row {row + 1} is not what A, B and C say of this {sensors[row][0]}: the rows of an "
+            "acceleration are those of B, all others 0"
+        )
+
+
 def _checked(path: Path, found: SpringNetwork, same: float = _SAME) -> SpringNetwork:
+    if not any(np.abs(matrix).max(initial=0.0) > 0 for matrix in (found.K, found.C)):
+        raise ExchangeError(f"{path}: K and C are 0: nothing couples the coordinates")
     if not (found.mass > 0).all():
         raise ExchangeError(f"{path}: a mass is not greater than 0")
     for name, matrix in (("K", found.K), ("C", found.C)):
@@ -259,7 +292,12 @@ def _text(found: SpringNetwork, name: str, rate: float, names: _Names | None = N
             _add(elements, body[i], body[j], -found.K[i, j], -found.C[i, j])
         for j in range(supports):
             _add(elements, body[i], support[j], found.Kb[i, j], found.Cb[i, j])
-    sensors = dict(_sensor(kind, i, j, body, elements) for kind, i, j in found.sensors)
+    sensors: dict[str, dict[str, Any]] = {}
+    for kind, i, j in found.sensors:
+        key, entry = _sensor(kind, i, j, body, elements)
+        told = sum(one == key or one.startswith(f"{key}_") for one in sensors)  # two sensors may measure the same
+        key = f"{key}_{told + 1}" if told else key
+        sensors[key] = entry | {"csv": key}
     if names is not None:
         called = zip(_plain(names.outputs), names.outputs, found.sensors, strict=True)
         sensors = {key: _sensor(*sensor, body, elements)[1] | {"csv": column} for key, column, sensor in called}

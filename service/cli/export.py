@@ -8,13 +8,20 @@ from sprung.model.exchange.fmu import write_fmu
 from sprung.model.exchange.modelica import write_modelica
 from sprung.model.exchange.statespace import ExchangeError, state_space, write_mat, write_npz
 from sprung.model.exchange.tables import write_tables
+from sprung.model.laws import SensorLaw
+from sprung.model.laws.in_place import is_linear
 from sprung.model.system import System
+from sprung.model.systemfile import written
 
 REACH = 0.05, 1.0  # m and m/s up to which tables go
 
 
 def export(system: System, out: Path) -> list[Path]:
-    """Write one model; a path without a suffix is a folder of force tables.  Errors: `ExchangeError`."""
+    """Write one model; a path without a suffix is a folder of force tables.  Errors: `ExchangeError`, OSError."""
+    if not out.parent.is_dir():
+        raise ExchangeError(f"{out}: there is no folder {out.parent} to write it to")
+    if out.suffix and out.is_dir():
+        raise ExchangeError(f"{out}: is a folder; a file is to be written")
     match out.suffix.lower():
         case ".mat":
             write_mat(out, state_space(system))
@@ -24,8 +31,23 @@ def export(system: System, out: Path) -> list[Path]:
             write_modelica(out, system)
         case ".fmu":
             write_fmu(out, system)
+        case ".yaml" | ".yml":
+            out.write_text(written(system.file), encoding="utf-8")
         case "":
             return write_tables(out, system, *REACH)
         case other:
-            raise ExchangeError(f"{out}: no format is called {other}; known are .mat .npz .mo .fmu, or a folder")
+            raise ExchangeError(f"{out}: no format is called {other}; known are .mat .npz .mo .fmu .yaml, or a folder")
     return [out]
+
+
+def left_out(system: System, out: Path) -> list[str]:
+    """What of the system's laws a format cannot hold, `secondary_2r.coulomb_friction`: nothing may go in silence."""
+    suffix = out.suffix.lower()
+    if suffix in (".yaml", ".yml"):
+        return []
+    of_forces = suffix in (".mat", ".npz")
+    return [
+        f"{placed.location}.{placed.law.name}"
+        for placed in system.laws
+        if isinstance(placed.law, SensorLaw) or (of_forces and not is_linear(placed))
+    ]

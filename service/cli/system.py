@@ -17,7 +17,7 @@ from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.schema import SystemFileError
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
-from sprung.service.cli.export import export
+from sprung.service.cli.export import export, left_out
 from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
@@ -50,6 +50,9 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
     if out is not None:
         for path in export(system, out):
             print(path)
+        left = left_out(system, out)
+        if left:
+            print(f"sprung: {out}: a linear model; it does not hold {', '.join(left)}", file=sys.stderr)
         return 0
     told = identifiability(system) if system.bodies else np.full(len(system.parameters), np.nan)
     if json_lines:

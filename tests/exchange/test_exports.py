@@ -288,3 +288,26 @@ def test_the_command_writes_every_format(name: str, tmp_path: Path, capsys: pyte
     assert all(Path(line).exists() for line in capsys.readouterr().out.split())
     assert main(["system", str(tmp_path / "car.yaml"), "--export", str(tmp_path / "car.xml")]) == 2
     assert "known are .mat" in capsys.readouterr().err
+
+
+def test_a_system_file_written_again_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = load_system()
+    assert main(["system", "--export", str(tmp_path / "again.yaml")]) == 0
+    assert load_system(tmp_path / "again.yaml").file == first.file
+    assert main(["system", "--export", str(tmp_path / "no" / "a.mat")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
+
+
+def test_what_a_format_cannot_hold_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    law = "laws: [{coulomb_friction: {force: {value: 58, std: 1}, smoothing: {value: 0.02, fixed: true}}}]"
+    path = tmp_path / "car.yaml"
+    path.write_text(
+        "{name: a, sample_rate: 100, window: 100, bodies: {car: {mass: 400}},"
+        " inputs: {road: {kind: displacement, displacement: {csv: r, noise: 1e-5}, velocity: {csv: v, noise: 1e-3}}},"
+        f" elements: {{strut: {{upper: car, lower: road, stiffness: 22000, damping: 1400, {law}}}}},"
+        " sensors: {a: {kind: acceleration, body: car, csv: a, noise: 0.01}}}"
+    )
+    assert main(["system", str(path), "--export", str(tmp_path / "a.mat")]) == 0
+    assert "does not hold strut.coulomb_friction" in capsys.readouterr().err
+    assert main(["system", str(path), "--export", str(tmp_path / "b.yaml")]) == 0
+    assert capsys.readouterr().err == "" and load_system(tmp_path / "b.yaml").file == load_system(path).file

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -43,6 +44,51 @@ def test_state_space_of_an_export_comes_back(tmp_path: Path) -> None:
     again = parse_system(read_matrices(written(tmp_path / "c.mat", mass=45.0, **{k: data[k] for k in "ABCD"})))
     for ours, theirs in zip(again.mechanics.matrices(), first.mechanics.matrices(), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
+
+
+def test_sensors_that_measure_the_same_stay_apart(tmp_path: Path) -> None:
+    rows = np.vstack([ROWS, ROWS[0], -ROWS[2]])
+    text = read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=rows))
+    sensors = parse_system(text).file.sensors
+    assert [*sensors][3:] == ["body2_acceleration_2", "body1_body2_deflection_2"]
+    assert [sensors[name].sign for name in ("body1_body2_deflection", "body1_body2_deflection_2")] == [-1, 1]
+
+
+def test_a_feedthrough_that_contradicts_the_other_matrices_is_refused(tmp_path: Path) -> None:
+    first = parse_system(read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=np.eye(3))))
+    write_mat(tmp_path / "b.mat", state_space(first))
+    data = {key: scipy.io.loadmat(tmp_path / "b.mat")[key] for key in "ABCD"}
+    for D, said in ((3 * data["D"], "row 1 is not what A, B and C say"), (data["D"][:2], "a row for each row of C")):
+        with pytest.raises(ExchangeError, match=said):
+            read_matrices(written(tmp_path / "c.mat", mass=45.0, **data | {"D": D}))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["none.mat"], "there is no such file"),
+        (["."], "is a folder"),
+        (["cut.mat"], "damaged, cut short"),
+        (["a.mat", "--rate", "inf"], "sample_rate inf Hz"),
+        (["a.mat", "--rate", "1e9"], "at most 1e\\+06"),
+        (["loose.mat"], "nothing couples"),
+    ],
+)
+def test_files_that_cannot_be_used_are_one_line(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    said: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    whole = written(Path("a.mat"), M=MASS, C=C, K=K).read_bytes()
+    Path("cut.mat").write_bytes(whole[: len(whole) // 2])
+    written(Path("loose.mat"), M=MASS, C=0 * C, K=0 * K)
+    assert main(["import", *arguments, "--out", "car.yaml"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert re.search(said, line) and "unexpected" not in line, line
+    assert not Path("car.yaml").exists()
 
 
 def test_the_command_writes_a_file_that_the_others_take(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,6 +8,7 @@ from sprung.replay import UnreadableRecording
 from sprung.replay.account import Account
 from sprung.replay.record import load_record
 from sprung.replay.sampling import at_rate, low_pass, pace
+from sprung.replay.slower import SlowerColumns
 from sprung.replay.windowing import Windower
 from tests.replay.test_record import CSV_CHANNELS, write_table
 
@@ -181,6 +182,42 @@ def test_what_is_missing_from_a_record_is_said_with_its_longest_gap(tmp_path):
     record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
     assert record.lost == 410
     assert record.problems == ("force: 20 % of its samples are missing; the longest of 2 gaps has 4 s, from 5.00 s on",)
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_a_slower_column_of_a_table_has_the_clock_of_its_rows(tmp_path, first):
+    time = np.arange(3000) / 100.0
+    position = np.cos(2 * np.pi * 1.5 * time)
+    position[1 - first :: 2] = np.nan
+    position[1000 + first] = np.nan  # one sample that is missing indeed
+    write_table(tmp_path / "a.csv", time, [np.sin(time), position])
+    record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
+    assert 1 <= record.lost <= 4
+    known = slice(20, 980)
+    assert np.abs(record.values[known, 1] - np.cos(2 * np.pi * 1.5 * time[known])).max() < 0.02
+    assert not np.isnan(record.values[:, 0]).any()
+
+
+def test_nodes_whose_rows_lie_between_each_others_each_have_their_clock(tmp_path):
+    fast, slow = np.arange(3000) / 100.0, np.arange(2400) / 80.0 + 0.003
+    time = np.r_[fast, slow]
+    order = np.argsort(time, kind="stable")
+    force, position = np.full((2, len(time)), np.nan)
+    force[: len(fast)], position[len(fast) :] = np.sin(6 * fast), np.cos(6 * slow)
+    write_table(tmp_path / "a.csv", time[order], [force[order], position[order]])
+    record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
+    at = np.arange(20, 2900)
+    assert np.abs(record.values[at, 0] - np.sin(6 * at / 100)).max() < 0.01
+    assert np.abs(record.values[at, 1] - np.cos(6 * at / 100)).max() < 0.01
+
+
+def test_a_sensor_that_drops_out_at_random_or_dies_has_no_clock_of_its_own():
+    time, random = np.arange(1000) * 10_000_000, np.random.default_rng(3)
+    empty = np.zeros((1000, 3), dtype=bool)
+    empty[:, 0] = random.uniform(size=1000) < 0.4
+    empty[300:, 1] = True
+    kept, missing = SlowerColumns().kept(time, empty)
+    assert kept.all() and missing == empty.sum()
 
 
 def test_a_gap_of_many_minutes_in_a_channel_off_the_grid_is_a_gap(tmp_path):
