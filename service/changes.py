@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from sqlalchemy import Connection
 
@@ -19,26 +20,30 @@ from sprung.service.views import VehicleView, vehicle_view
 OnAlarms = Callable[[Connection, str, Sequence[fleet.AlarmChange]], None]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TrackerChange:
-    """A vehicle whose tracker is another one now, made ready for the store."""
+    """A vehicle whose tracker is another one now."""
 
     vehicle: str
     after: HeldVehicle
-    records: Sequence[WindowRecord]  # that are not stored yet
-    ran: Sequence[Ran]  # how the vehicle ran in them
-    row: fleet.TrackerRow
-    view: VehicleView  # how the vehicle is seen after them
+    records: Sequence[WindowRecord] = ()  # that are not stored yet
+    ran: Sequence[Ran] = ()  # how the vehicle ran in them
 
+    @cached_property
+    def row(self) -> fleet.TrackerRow:
+        """The tracker as it is stored."""
+        return fleet.TrackerRow(self.after.last_window_ns, self.after.revision, self.after.state.to_dict())
 
-def tracker_change(
-    vehicle: str, after: HeldVehicle, records: Sequence[WindowRecord] = (), ran: Sequence[Ran] = ()
-) -> TrackerChange:
-    """The change with all of it that can be made without the store."""
-    told = (r for r in reversed(records) if r.solved is not None and r.outcome != UNINFORMATIVE)
-    view = vehicle_view(after.served.engine, vehicle, after.state, next(told, None))
-    row = fleet.TrackerRow(after.last_window_ns, after.revision, after.state.to_dict())
-    return TrackerChange(vehicle, after, records, ran, row, view)
+    @cached_property
+    def view(self) -> VehicleView:
+        """How the vehicle is seen after its windows."""
+        told = (r for r in reversed(self.records) if r.solved is not None and r.outcome != UNINFORMATIVE)
+        return vehicle_view(self.after.served.engine, self.vehicle, self.after.state, next(told, None))
+
+    def made_ready(self, shown: bool) -> TrackerChange:
+        """Itself, with what `keep_changes` takes made before the store waits for it; shown: with the view."""
+        _ = (self.row, self.view) if shown else self.row
+        return self
 
 
 def keep_changes(

@@ -14,7 +14,7 @@ from sqlalchemy import Connection
 
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
-from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status, tracker_change
+from sprung.service.changes import OnAlarms, TrackerChange, keep_changes, keep_statuses, new_status
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
 from sprung.service.engines import Engines, ServedModel
@@ -188,7 +188,7 @@ class Pipeline:
                 change = None
                 if passed.records:
                     after = after.with_stored(r.start for r in passed.records)
-                    change = tracker_change(one.vehicle, after, passed.records, passed.ran)
+                    change = TrackerChange(one.vehicle, after, passed.records, passed.ran).made_ready(self._shown)
                 followed.append((one, passed, after, change))
         tracked = time.perf_counter()
         changes = [change for *_, change in followed if change is not None]
@@ -271,7 +271,7 @@ class Pipeline:
         at = self._current(connection, [vehicle])[vehicle]
         after = replace(at, state=at.served.engine.tracker.relearn(at.state, names), revision=at.revision + 1)
         on_alarms = self._on_alarms if self._shown else None
-        views = keep_changes(connection, [tracker_change(vehicle, after)], now, on_alarms)
+        views = keep_changes(connection, [TrackerChange(vehicle, after)], now, on_alarms)
         return Batch(vehicle, [], [], 0, after.state, at.served, view=views.get(vehicle))
 
     def tell(self, batch: Batch) -> None:
@@ -287,7 +287,7 @@ class Pipeline:
             with self.store.write() as connection:
                 fleet.hold_vehicle(connection, vehicle)
                 at = self._current(connection, [vehicle])[vehicle]
-                keep_statuses(connection, [tracker_change(vehicle, at)], self._clock())
+                keep_statuses(connection, [TrackerChange(vehicle, at)], self._clock())
         return len(missing)
 
     def show(self, connection: Connection, vehicle: str) -> None:
