@@ -15,5 +15,7 @@ def database_of(system: System, named: Path | None = None) -> Path | None:
     if named is not None:
         return named
     ours = {channel.can for channel in system.channels if channel.can is not None}
+    if not ours:
+        return None
     bundled = {channel.can for channel in load_system(MANCHESTER).channels}
-    return MANCHESTER_DBC if ours and ours <= bundled else None
+    return MANCHESTER_DBC if ours <= bundled else None

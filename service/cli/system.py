@@ -52,7 +52,7 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
             print(path)
         left = left_out(system, out)
         if left:
-            print(f"sprung: {out}: a linear model; it does not hold {', '.join(left)}", file=sys.stderr)
+            print(f"sprung: {out}: it does not hold {', '.join(left)}", file=sys.stderr)
         return 0
     told = identifiability(system) if system.bodies else np.full(len(system.parameters), np.nan)
     if json_lines:
