@@ -53,8 +53,9 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
     deflection between two; left out: every acceleration.
     A, B, C, D: states are displacements, then velocities; columns of B are displacement and velocity of one support
     after the other, as `--export` writes them; rows of C are displacements, velocities, accelerations or deflections.
-    `mass` (n,) says the scale, or its first
-    entry; left out: the first coordinate weighs 1 kg, which no sensor of motion can tell.
+    `mass` (n,) says the scale, or its first entry; left out: the first coordinate weighs 1 kg, which no sensor of
+    motion can tell.
+    states, inputs, outputs: names, where they are given, for bodies, supports and sensors.
     rate: Hz, of the recordings; else `sample_rate` of the file.
     Errors: `ExchangeError`, OSError.
     """
@@ -74,9 +75,34 @@ def read_matrices(path: Path, name: str | None = None, rate: float | None = None
         raise ExchangeError(f"{path}: no sample_rate; say at how many Hz the recordings are by --rate")
     _check_rate(path, sampled)
     found = _from_state_space(path, given) if "A" in given else _from_mck(path, given)
-    text = _text(found, name or path.stem, sampled)
+    text = _text(found, name or path.stem, sampled, _given_names(path, data, found))
     _same_again(path, found, parse_system(text, str(path)))
     return text
+
+
+def _given_names(path: Path, data: Mapping[str, Any], found: SpringNetwork) -> _Names:
+    """What `states`, `inputs` and `outputs` of a .mat file say, as `--export` writes them; empty where they do not."""
+    n, supports = found.Kb.shape
+    states, inputs, outputs = (_texts(data.get(name)) for name in ("states", "inputs", "outputs"))
+    if inputs is not None and len(inputs) == 2 * supports:  # displacement and velocity of one support after the other
+        inputs = inputs[::2]
+    wanted = (
+        ("states", states, (n, 2 * n)),
+        ("inputs", inputs, (supports,)),
+        ("outputs", outputs, (len(found.sensors),)),
+    )
+    for name, given, counts in wanted:
+        if given is not None and len(given) not in counts:
+            raise ExchangeError(f"{path}: {name}: {len(given)} names for {counts[0]}")
+    return _Names((states or ())[:n], inputs or (), outputs or ())
+
+
+def _texts(value: Any) -> tuple[str, ...] | None:
+    """Names of a cell array or of rows of characters; None: there are none."""
+    try:
+        return None if value is None else tuple(str(np.squeeze(one)).strip() for one in np.ravel(value))
+    except ValueError:
+        return None
 
 
 def _from_fmu(path: Path, name: str | None, rate: float | None) -> str:
@@ -264,11 +290,11 @@ def _checked(path: Path, found: SpringNetwork, same: float = _SAME) -> SpringNet
 
 @dataclass(frozen=True, slots=True)
 class _Names:
-    """What a model calls its displacements, supports and outputs."""
+    """What a model calls its displacements, supports and outputs; empty where it has no names for them."""
 
-    states: tuple[str, ...]
-    supports: tuple[str, ...]
-    outputs: tuple[str, ...]
+    states: tuple[str, ...] = ()
+    supports: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
 
 
 def _plain(names: Sequence[str], tails: tuple[str, ...] = ()) -> list[str]:
@@ -282,10 +308,10 @@ def _plain(names: Sequence[str], tails: tuple[str, ...] = ()) -> list[str]:
     return found
 
 
-def _text(found: SpringNetwork, name: str, rate: float, names: _Names | None = None) -> str:
+def _text(found: SpringNetwork, name: str, rate: float, names: _Names) -> str:
     n, supports = len(found.mass), found.Kb.shape[1]
-    body = [f"body{i + 1}" for i in range(n)] if names is None else _plain(names.states, (".z", "_z", ".s"))
-    support = [f"support{i + 1}" for i in range(supports)] if names is None else _plain(names.supports)
+    body = _plain(names.states, (".z", "_z", ".s")) or [f"body{i + 1}" for i in range(n)]
+    support = _plain(names.supports, (".displacement",)) or [f"support{i + 1}" for i in range(supports)]
     elements: dict[str, Any] = {}
     for i in range(n):
         for j in range(i + 1, n):
@@ -298,7 +324,7 @@ def _text(found: SpringNetwork, name: str, rate: float, names: _Names | None = N
         told = sum(one == key or one.startswith(f"{key}_") for one in sensors)  # two sensors may measure the same
         key = f"{key}_{told + 1}" if told else key
         sensors[key] = entry | {"csv": key}
-    if names is not None:
+    if names.outputs:
         called = zip(_plain(names.outputs), names.outputs, found.sensors, strict=True)
         sensors = {key: _sensor(*sensor, body, elements)[1] | {"csv": column} for key, column, sensor in called}
     inputs = {

@@ -19,8 +19,9 @@ POINTS = 201
 def write_tables(folder: Path, system: System, deflection: float, rate: float) -> list[Path]:
     """One CSV per element and axis up to `deflection` (m) and `rate` (m/s): motion, force of spring or damper and laws.
 
-    A law with memory has no such curve and is refused: `ExchangeError`.
+    A law with memory has no such curve and is refused before anything is written: `ExchangeError`.
     """
+    _refuse_memory(system)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for index, element in enumerate(system.elements):
@@ -40,12 +41,17 @@ def write_tables(folder: Path, system: System, deflection: float, rate: float) -
     return written
 
 
+def _refuse_memory(system: System) -> None:
+    for placed in system.laws:
+        if isinstance(placed.law, ElementLaw) and placed.law.memory:
+            name = placed.law.name
+            raise ExchangeError(f"{placed.location}: {name} has memory, so that no curve F(d) or F(v) describes it")
+
+
 def _of_laws(laws: list[PlacedLaw], d: FloatArray, v: FloatArray, element: SpringDamper) -> FloatArray:
     total = np.zeros_like(d)
     for placed in laws:
         law = placed.law
         assert isinstance(law, ElementLaw)
-        if law.memory:
-            raise ExchangeError(f"{placed.location}: {law.name} has memory, so that no curve F(d) or F(v) describes it")
         total = total + law.force(Motion(d, v), placed.values, element)
     return total

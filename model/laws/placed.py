@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sprung.model.address import LawSetting, LawValue
 from sprung.model.laws import CATALOGUE
@@ -167,6 +167,23 @@ def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) ->
 
 def _supports(file: SystemFile) -> list[str]:
     return [name for name, source in file.inputs.items() if isinstance(source, SupportInput)]
+
+
+def revalued(laws: Sequence[PlacedLaw], values: Mapping[str, float]) -> tuple[tuple[PlacedLaw, ...], dict[str, float]]:
+    """Laws with other values by full name (`secondary_2r.coulomb_friction.force`), and what names none of theirs.
+
+    Errors: ValueError, one line, for a value that a law does not admit.
+    """
+    known = {name for law in laws for name in law.names}
+    for law in laws:
+        for name, spec in zip(law.names, law.law.parameters, strict=True):
+            if name in values and not spec.admits(values[name]):
+                raise ValueError(f"{name}: must lie between {spec.low:g} and {spec.high:g} {spec.unit}")
+    changed = tuple(
+        replace(law, values=tuple(values.get(name, own) for name, own in zip(law.names, law.values, strict=True)))
+        for law in laws
+    )
+    return changed, {name: value for name, value in values.items() if name not in known}
 
 
 def _near(name: str, known: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ import scipy.linalg
 
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.in_place import LawError, is_linear, put_in_place
-from sprung.model.laws.placed import PlacedLaw
+from sprung.model.laws.placed import PlacedLaw, revalued
 from sprung.model.laws.undone import undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
@@ -44,14 +44,15 @@ def simulate_ride(
     """Simulate a system with the laws of its file.
 
     inputs: in the order of `system.inputs`, shape (T, I), without gaps, at `system.sample_rate`.
-    values: of parameters that differ from nominal, by name (`primary_11l.stiffness`, `car.mass`), SI.
+    values: of parameters that differ from nominal, by name (`primary_11l.stiffness`, `car.mass`), SI; those of laws
+    too (`secondary_2r.coulomb_friction.force`).
     start: state at the first sample, shape (N,); at rest if left out.
     noise: where given, sensors have the noise of the system file, drawn from it.
     Errors: `SimulationError`.
     """
     inputs = _checked(system, inputs)
-    mechanics = with_values(system, values or {})
-    laws = system.laws
+    system, laws, values = _with_law_values(system, values or {})
+    mechanics = with_values(system, values)
     names = [channel.name for channel in system.inputs]
     driven = undone(inputs, names, laws, system.sample_rate)
     windows = np.concatenate([driven, np.zeros((len(driven), len(system.sensors)))], axis=1)[None]
@@ -81,6 +82,19 @@ def simulate_ride(
     )
 
 
+def _with_law_values(
+    system: System, values: Mapping[str, float]
+) -> tuple[System, tuple[PlacedLaw, ...], Mapping[str, float]]:
+    """The system, its laws with those of the values that are theirs, and the other values."""
+    try:
+        laws, others = revalued(system.laws, values)
+    except ValueError as error:
+        raise SimulationError(str(error)) from None
+    if len(others) < len(values):  # laws of the structure are put in place with their new values
+        system = replace(system, whole=False)
+    return system, laws, others
+
+
 def with_values(system: System, values: Mapping[str, float]) -> Mechanics:
     """The mechanics with values of parameters or other element values by name.  Errors: `SimulationError`."""
     mechanics = system.mechanics
@@ -94,7 +108,9 @@ def with_values(system: System, values: Mapping[str, float]) -> Mechanics:
             ratio = value / system.file.bodies[part].mass.value
             changed["mass"][mechanics.body_of_dof == body] *= ratio
         else:
-            raise SimulationError(f"{name}: no such parameter; give ELEMENT.stiffness, ELEMENT.damping or BODY.mass")
+            raise SimulationError(
+                f"{name}: no such parameter; give ELEMENT.stiffness, ELEMENT.damping, BODY.mass or PLACE.LAW.VALUE"
+            )
         if not (np.isfinite(value) and value >= 0):
             raise SimulationError(f"{name}: a value of at least 0 is needed, not {value}")
     return replace(mechanics, **changed)

@@ -18,7 +18,7 @@ from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
-from sprung.service.cli.stdin import spooled
+from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.diagnosing import load_excerpt
 from sprung.service.improved import write_improved
 from sprung.service.loading import RecordRequest
@@ -46,7 +46,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
     with ExitStack() as stack:
         record = load(spooled(file, stack), system, database_of(system, dbc), start_time(asked.start, [file]))
     if str(file) == "-":
-        file = Path("standard input")
+        file = CALLED
     for problem in record.problems:
         print(f"sprung: {file}: {problem}", file=sys.stderr)
     try:

@@ -8,8 +8,9 @@ from sprung.model.exchange.fmu import write_fmu
 from sprung.model.exchange.modelica import write_modelica
 from sprung.model.exchange.statespace import ExchangeError, state_space, write_mat, write_npz
 from sprung.model.exchange.tables import write_tables
-from sprung.model.laws import SensorLaw
+from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.in_place import is_linear
+from sprung.model.laws.placed import PlacedLaw
 from sprung.model.system import System
 from sprung.model.systemfile import written
 
@@ -45,9 +46,12 @@ def left_out(system: System, out: Path) -> list[str]:
     suffix = out.suffix.lower()
     if suffix in (".yaml", ".yml"):
         return []
-    of_forces = suffix in (".mat", ".npz")
-    return [
-        f"{placed.location}.{placed.law.name}"
-        for placed in system.laws
-        if isinstance(placed.law, SensorLaw) or (of_forces and not is_linear(placed))
-    ]
+    return [f"{placed.location}.{placed.law.name}" for placed in system.laws if not _held(placed, suffix)]
+
+
+def _held(placed: PlacedLaw, suffix: str) -> bool:
+    if suffix in (".mat", ".npz"):
+        return is_linear(placed) and not isinstance(placed.law, SensorLaw)
+    if suffix == "":  # curves of single elements
+        return isinstance(placed.law, ElementLaw) and len(placed.places) == 1
+    return not isinstance(placed.law, SensorLaw)

@@ -14,7 +14,7 @@ from typing import Any
 from sprung.service.cli.apart import own_limits
 from sprung.service.cli.console import parameter_table, print_table, progress, width_of_output
 from sprung.service.cli.starts import start_time
-from sprung.service.cli.stdin import spooled
+from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.feed import Fed, comfort_dict, feed_file
@@ -63,6 +63,7 @@ def run(
         pipeline = Pipeline(engine, opened, compute, vehicles_in_memory=settings.vehicles_in_memory)
         for named in files:
             path = spooled(named, stack)
+            called = named if path is named else CALLED
             fed = _replay(
                 pipeline,
                 opened,
@@ -75,10 +76,10 @@ def run(
                 json_lines,
                 settings.store is not None,
             )
-            status = max(status, _report(pipeline, path, fed, json_lines))
+            status = max(status, _report(pipeline, called, fed, json_lines))
             told = slower_line(fed, speed, engine.system.sample_rate)
             if told:
-                print(f"sprung: {path}: {told}", file=sys.stderr)
+                print(f"sprung: {called}: {told}", file=sys.stderr)
     return status
 
 

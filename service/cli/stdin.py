@@ -5,11 +5,13 @@ from __future__ import annotations
 import shutil
 import sys
 import tempfile
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from sprung.service.errors import UserError
 
+CALLED = Path("standard input")  # in messages
 MAGIC = (  # how each kind of file begins; text is told by its first line
     (b"\x89MCAP", ".mcap"),
     (b"LOGG", ".blf"),
@@ -23,7 +25,7 @@ MAGIC = (  # how each kind of file begins; text is told by its first line
 def spooled(path: Path, stack: ExitStack) -> Path:
     """The path itself; for `-`, a temporary file with what standard input holds, which ends with the stack.
 
-    Raises UserError when nothing comes.
+    Errors that name this file within the stack name standard input instead.  Raises UserError when nothing comes.
     """
     if str(path) != "-":
         return path
@@ -33,7 +35,18 @@ def spooled(path: Path, stack: ExitStack) -> Path:
     suffix = next((suffix for magic, suffix in MAGIC if head.startswith(magic)), ".csv")
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sprung-")))
     kept = folder / f"stdin{suffix}"
+    stack.enter_context(_named_as_sent(kept))
     with open(kept, "wb") as file:
         file.write(head)
         shutil.copyfileobj(sys.stdin.buffer, file)
     return kept
+
+
+@contextmanager
+def _named_as_sent(kept: Path) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        if str(kept) not in str(error):
+            raise
+        raise UserError(str(error).replace(str(kept), str(CALLED))) from error

@@ -46,6 +46,22 @@ def test_state_space_of_an_export_comes_back(tmp_path: Path) -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+def test_names_of_states_inputs_and_outputs_are_kept(tmp_path: Path) -> None:
+    first = parse_system(read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=ROWS)))
+    names = np.array(["axle", "frame.z", "car body"], dtype=object)
+    matrices = state_space(first)
+    data = {key: getattr(matrices, key) for key in "ABCD"} | {"mass": 45.0, "states": names}
+    data |= {"inputs": ["road.displacement", "road.velocity"], "outputs": ["a2", "a3", "strut"]}  # rows of characters
+    again = parse_system(read_matrices(written(tmp_path / "c.mat", **data)))
+    assert again.bodies == ("axle", "frame", "car_body")
+    assert [channel.name for channel in again.channels] == ["road.displacement", "road.velocity", "a2", "a3", "strut"]
+    assert again.elements == ("axle_frame", "axle_road", "frame_car_body")
+    coordinates = written(tmp_path / "d.mat", M=np.diag(MASS), C=C, K=K, states=names)
+    assert parse_system(read_matrices(coordinates)).sensors[0] == "axle_acceleration"
+    with pytest.raises(ExchangeError, match="outputs: 2 names for 3"):
+        read_matrices(written(tmp_path / "e.mat", **data | {"outputs": ["a2", "a3"]}))
+
+
 def test_sensors_that_measure_the_same_stay_apart(tmp_path: Path) -> None:
     rows = np.vstack([ROWS, ROWS[0], -ROWS[2]])
     text = read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=rows))

@@ -132,6 +132,22 @@ def test_a_periodic_force_that_nobody_measured_acts_on_its_body() -> None:
     assert np.hypot(*fit) == pytest.approx(50 * abs(receptance), rel=0.01)
 
 
+def test_a_value_of_a_law_by_its_name_is_as_if_the_file_had_it() -> None:
+    inputs, name = road(300), "strut.coulomb_friction.force"
+    given = system(", laws: [{coulomb_friction: {force: 40, smoothing: 0.02}}]")
+    wanted = system(", laws: [{coulomb_friction: {force: 90, smoothing: 0.02}}]")
+    ride = simulate_ride(given, inputs, {name: 90.0, "strut.damping": 1400.0})
+    other = simulate_ride(wanted, inputs, {"strut.damping": 1400.0})
+    np.testing.assert_array_equal(ride.sensors, other.sensors)
+    heavier = system(body=", laws: [{mass_change: {ratio: 1.2}}]")
+    set_so = simulate_ride(heavier.whole_system, inputs, {"car.mass_change.ratio": 1.1})
+    np.testing.assert_allclose(
+        set_so.sensors, simulate_ride(system(), inputs, {"car.mass": 440.0}).sensors, atol=1e-9, rtol=1e-9
+    )
+    with pytest.raises(SimulationError, match="must lie between"):
+        simulate_ride(given, inputs, {name: -1.0})
+
+
 def test_values_by_name_are_checked() -> None:
     with pytest.raises(SimulationError, match="no such parameter"):
         with_values(system(), {"strut.stiffnes": 1.0})
