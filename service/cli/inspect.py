@@ -40,6 +40,7 @@ def run(
     if json_lines:
         print(json.dumps(as_dict(found), allow_nan=False))
     else:
+        print(heading(found))  # a line of its own: a table would break it, and its path, at its width
         print_table(table(found))
         for line in remarks(found):
             print(line)
@@ -78,10 +79,15 @@ def as_dict(found: Inspection) -> dict[str, object]:
     return {"file": said.pop("file"), "start": None if found.relative or start is None else to_iso(start), **said}
 
 
+def heading(found: Inspection) -> str:
+    """Which recording, how long, since when."""
+    began = "times count from 0" if found.relative or found.start is None else f"begins {to_iso(found.start)}"
+    return f"{found.file}: {found.seconds:.6g} s, {began}"
+
+
 def table(found: Inspection) -> Table:
     """A row for every signal."""
-    began = "times count from 0" if found.relative or found.start is None else f"begins {to_iso(found.start)}"
-    out = Table(title=f"{found.file}: {found.seconds:.6g} s, {began}", title_justify="left")
+    out = Table()
     out.add_column("signal", overflow="fold")
     out.add_column("unit")
     for name in ("rate Hz", "range", "mean", "std", "noise", "90 % of power Hz", "peak Hz"):

@@ -105,7 +105,11 @@ def open_store(url: str, migrated: bool = False) -> Store:
             engine = _postgresql_engine(parsed)
         store = Store(engine)
         if not migrated:
-            migrate(store)
+            try:
+                migrate(store)
+            except BaseException:
+                store.close()
+                raise
     except ModuleNotFoundError as error:
         raise UserError(f"store {shown}: {error.name} is missing; pip install 'sprung[fleet]'") from error
     except (ArgumentError, NoSuchModuleError) as error:

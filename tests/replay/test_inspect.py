@@ -126,7 +126,7 @@ def test_what_holds_no_plain_numbers_is_named(tmp_path):
 def test_the_command_prints_a_table_remarks_and_json(ride, capfd):
     assert main(["inspect", str(ride)]) == 0
     out, err = capfd.readouterr()
-    assert "ride.csv: 59.99 s, times count from 0" in " ".join(out.split())
+    assert f"{ride}: 59.99 s, times count from 0" in out.splitlines()
     assert "Turned [g]: is Accel [g] with the other sign" in out
     assert "Weg mm: stands still from 0 to 9.99 s" in out
     assert "off: always 0" in out
