@@ -32,6 +32,7 @@ from sprung.model.system import System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 
 POOLED = 40.0  # independent windows of a second that the estimate of one ride is worth
+ASIDE = 0.1  # m, standard deviation of how far a load lies to the side
 SERVICE_DAY = 16 * 3600.0  # s
 DAY = 86400.0
 SETTLED_DAYS = 3.0  # before a fault is hidden
@@ -112,16 +113,19 @@ def drawn(rng: np.random.Generator, pool: Pool, truth: FloatArray, off: FloatArr
 
 
 def boarded(rng: np.random.Generator, service: Service, empty: FloatArray) -> FloatArray:
-    """A drawn load as deviations [load, roll_inertia, pitch_inertia, centre]; `empty`: mass, roll, pitch inertia."""
+    """A drawn load as deviations, in the order of `CARGO`; `empty`: mass, roll and pitch inertia."""
     load, place, spread = (
         rng.uniform(*service.load),
         rng.normal(0, service.off_centre),
         rng.uniform(*service.load_spread, 2),
     )
     mass, roll, pitch = empty * (1 + load * np.array([1.0, *spread]))
+    aside = rng.normal(0, ASIDE)
     pitch += abs(load) * empty[0] * place**2
+    roll += abs(load) * empty[0] * aside**2
     grown = np.log([mass, roll, pitch] / empty)
-    return np.array([grown[0], *(grown[1:] - grown[0]), load * empty[0] * place / np.sqrt(mass * pitch)])
+    off = load * empty[0] * np.array([place / np.sqrt(mass * pitch), aside / np.sqrt(mass * roll)])
+    return np.array([grown[0], *(grown[1:] - grown[0]), *off])
 
 
 def live(

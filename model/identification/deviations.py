@@ -13,8 +13,8 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFau
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
-Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre"]
-CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre")  # another after every stop
+Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side"]
+CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre", "side")  # another after every stop
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,10 +56,11 @@ class ElementValues:
         """Accelerations under generalised forces (B, n, X)."""
         if self.coupling is None:
             return forces / self.mass[:, :, None]
-        # Each degree of freedom is coupled with one other at most, K K is diagonal: 1 / (1 + K) = (1 - K) / (1 - K K).
-        root, K = self.mass.sqrt().unsqueeze(2), self.coupling
-        scaled = forces / root
-        accelerations: Tensor = (scaled - K @ scaled) / ((1 - (K * K.mT).sum(dim=2, keepdim=True)) * root)
+        root, whole = (
+            self.mass.sqrt().unsqueeze(2),
+            self.coupling + torch.eye(self.mass.shape[1], dtype=self.mass.dtype),
+        )
+        accelerations: Tensor = torch.linalg.solve(whole, forces / root) / root
         return accelerations
 
 

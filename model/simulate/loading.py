@@ -1,12 +1,13 @@
 """What passengers and goods change of a body: its mass, how that is spread, where its centre of gravity lies.
 
-With m0, J0, I0 the body's mass, roll and pitch inertia without them, and one load's four numbers l, r, p, c,
+With m0, J0, I0 the body's mass, roll and pitch inertia without them, and one load's five numbers l, r, p, c, s,
 
-    m = m0 exp(l)     J = J0 exp(l + r)     I = I0 exp(l + p)     x_c = c sqrt(I / m)
+    m = m0 exp(l)    J = J0 exp(l + r)    I = I0 exp(l + p)    x_c = c sqrt(I / m)    y_c = s sqrt(J / m)
 
-J and I are about the body's `position` and x_c is how far its centre of gravity lies from there along x, so that the
-mass matrix of [z, roll, pitch] has m x_c = c sqrt(m I) between z and pitch.  All four are zero for the empty body, of
-the size of a relative change, and give a positive mass matrix for any |c| < 1.
+J and I are about the body's `position`, and x_c, y_c is how far its centre of gravity lies from there, so that the
+mass matrix of [z, roll, pitch] has m x_c = c sqrt(m I) between z and pitch, and m y_c = s sqrt(m J) between z and roll
+(m x_c y_c between roll and pitch is of second order and left out).  All five are zero for the empty body, of the size
+of a relative change, and give a positive mass matrix for c^2 + s^2 < 1.
 
 An air spring that a valve keeps at its height has a pressure, and so a stiffness, in proportion to the weight on it: an
 element with `by_load: a` under the body is stiffer by exp(a l).
@@ -25,10 +26,12 @@ from torch import Tensor
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-Kind = Literal["load", "roll_inertia", "pitch_inertia", "centre"]
+Kind = Literal["load", "roll_inertia", "pitch_inertia", "centre", "side"]
+COUPLED: dict[Kind, str] = {"centre": "pitch", "side": "roll"}  # what couples heave to which angle
 SPREAD_STD = 0.1  # of r and p: seated passengers have 0.6 times the inertia of a load spread like the body
 CENTRE_STD = 0.04  # of c: one metre off the middle of a car that carries 30 % is 0.03
-_MOST = 0.9  # of |c|: a step of the refinement does not leave the masses that there are
+SIDE_STD = 0.03  # of s: a load of 15 % of the car that sits 30 cm off its middle line is 0.03
+_MOST = 0.7  # of |c| and |s|: a step of the refinement does not leave the masses that there are
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +44,10 @@ class LoadTerm:
 
 
 def load_terms(system: System) -> tuple[LoadTerm, ...]:
-    """What loads are described by, in order: the masses of all of them, then how each is spread, where it has axes."""
+    """What loads are described by, in order: the masses of all of them, then how each is spread, where it has axes.
+
+    How far each lies to the side comes last: states of trackers from before it was known are continued.
+    """
     found = [LoadTerm(load.body, "load", load.std) for load in system.loads]
     for load in system.loads:
         body = system.file.bodies[load.body]
@@ -50,7 +56,8 @@ def load_terms(system: System) -> tuple[LoadTerm, ...]:
         if body.pitch_inertia is not None:
             found.append(LoadTerm(load.body, "pitch_inertia", SPREAD_STD))
             found.append(LoadTerm(load.body, "centre", CENTRE_STD))
-    return tuple(found)
+    rolling = (load for load in system.loads if system.file.bodies[load.body].roll_inertia is not None)
+    return (*found, *(LoadTerm(load.body, "side", SIDE_STD) for load in rolling))
 
 
 class Loading:
@@ -65,9 +72,9 @@ class Loading:
         for i, term in enumerate(self.terms):
             if term.kind == "load":
                 exponents[i] = mechanics.body_of_dof == system.bodies.index(term.body)
-            elif term.kind == "centre":
-                z, pitch = dofs.index(f"{term.body}.z"), dofs.index(f"{term.body}.pitch")
-                pattern[i, z, pitch] = pattern[i, pitch, z] = 1.0
+            elif term.kind in COUPLED:
+                z, angle = dofs.index(f"{term.body}.z"), dofs.index(f"{term.body}.{COUPLED[term.kind]}")
+                pattern[i, z, angle] = pattern[i, angle, z] = 1.0
             else:
                 exponents[i, dofs.index(f"{term.body}.{term.kind.removesuffix('_inertia')}")] = 1.0
         stiffness = np.zeros((len(self.terms), len(mechanics.stiffness)))
@@ -78,7 +85,7 @@ class Loading:
         self.stiffness = constant(stiffness)  # powers of each stiffness, of air springs under a load, (X, E)
         self.exponents = constant(exponents)  # powers of each mass and inertia, (X, n)
         self.pattern = constant(pattern)  # where each couples degrees of freedom, (X, n, n)
-        self.couples = any(term.kind == "centre" for term in self.terms)
+        self.couples = any(term.kind in COUPLED for term in self.terms)
 
     def __len__(self) -> int:
         return len(self.terms)

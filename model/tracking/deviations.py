@@ -33,8 +33,9 @@ SETTLED = 600.0  # s of used windows in which the gains of the learning phase go
 GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock
 GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
 CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
-CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4}  # per sqrt(s), of a running
-# vehicle: 1 % of the mass, 0.3 % of how it is spread in two minutes; one walks 10 m along the car for 1e-3
+# Per sqrt(s), of a running vehicle: 1 % of the mass, 0.3 % of how it is spread in two minutes; one walks 10 m along the
+# car, or from one side of it to the other, for 1e-3.
+CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4, "side": 1e-4}
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
 JUMPED = {"gain": 0.01, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told

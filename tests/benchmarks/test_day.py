@@ -15,7 +15,7 @@ from sprung.model.system import load_system
 from sprung.service.engine import load_engine
 from sprung.service.settings import settings_with
 
-CARRIED = np.array([0.2, -0.05, -0.02, 0.01])
+CARRIED = np.array([0.2, -0.05, -0.02, 0.01, -0.02])
 
 
 @pytest.fixture(scope="module")
@@ -26,12 +26,12 @@ def windows():
 def test_estimates_scatter_about_the_truth_as_they_state(windows):
     system, rng = load_system(), np.random.default_rng(1)
     truth, off = rng.normal(0, 0.1, 24), np.zeros(len(deviations(system)))
-    off[-4:] = CARRIED
+    off[-5:] = CARRIED
     drawn = [day.drawn(rng, windows[0], truth, off) for _ in range(400)]
     errors = np.array([e.log_ratio for e in drawn]) - truth
     scores = errors / np.sqrt(np.diag(drawn[0].covariance))
     assert np.sqrt(np.mean(scores**2)) == pytest.approx(1.0, abs=0.1)
-    loads = np.array([e.deviating.point[-4:] for e in drawn]) - CARRIED
+    loads = np.array([e.deviating.point[-5:] for e in drawn]) - CARRIED
     assert np.all(np.abs(loads.mean(axis=0)) < 4 * loads.std(axis=0) / np.sqrt(400))
     gains = [e.deviating.information @ (off - e.deviating.point) for e in drawn]
     slopes = np.array([e.deviating.score for e in drawn]) - gains  # at the true deviations: no slope on average
@@ -55,6 +55,9 @@ def test_a_drawn_load_gives_the_mass_matrix_of_the_generator():
     expected = np.diag(empty * (1 + load * np.array([1.0, *rng.uniform(*service.load_spread, 2)])))
     expected[2, 2] += abs(load) * empty[0] * place**2
     expected[0, 2] = expected[2, 0] = load * empty[0] * place
+    aside = rng.normal(0, day.ASIDE)
+    expected[1, 1] += abs(load) * empty[0] * aside**2
+    expected[0, 1] = expected[1, 0] = load * empty[0] * aside
     x = torch.as_tensor(np.concatenate([np.zeros(24), terms]))[None]
     found = LinearSimulator(system).element_values(x).inertia[0, :3, :3].numpy()
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-6)

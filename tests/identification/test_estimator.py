@@ -140,7 +140,7 @@ def test_progress_goes_from_simulation_through_training(small_car, tmp_path):
     assert seen[-1] == "train"
 
 
-@pytest.mark.parametrize("terms", [(0.25, -0.05, -0.03, 0.02), (-0.25, 0.04, 0.03, -0.01)])
+@pytest.mark.parametrize("terms", [(0.25, -0.05, -0.03, 0.02, 0.03), (-0.25, 0.04, 0.03, -0.01, 0.0)])
 def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
     system = vehicle[0]
     rng = np.random.default_rng(78)
@@ -148,10 +148,10 @@ def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
     windows = simulate_runs(system, truth, system.window, rng).values
     identifier = load_identifier(system)
     start = identifier.estimator.estimate(windows, loads=True).log_ratio
-    assert start.shape == (48, 28)
+    assert start.shape == (48, 29)
     error = np.sqrt(np.mean((start - truth) ** 2, axis=0))
     assert error[:24].max() < 0.06
-    assert np.all(error[24:] < [0.06, 0.06, 0.06, 0.03])
+    assert np.all(error[24:] < [0.06, 0.06, 0.06, 0.03, 0.03])
     found = identifier.examine(windows, np.zeros(48, dtype=bool))
     assert np.mean([e.iterations for e in found]) < 1.3
     ignorant = identifier.identify(windows, start[:, :24] * 0, explain=True)
@@ -163,8 +163,8 @@ def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
 def test_linear_changes_of_masses_become_the_terms_of_a_load():
     system = load_system()
     loading = LinearSimulator(system).loading
-    terms = torch.tensor([[0.25, -0.08, 0.06, 0.02]], dtype=torch.float64)
+    terms = torch.tensor([[0.25, -0.08, 0.06, 0.02, -0.03]], dtype=torch.float64)
     factors = loading.factors(terms)[0, :3]
-    both = loading.coupling(terms)[0, 0, 2] * (factors[0] * factors[2]).sqrt()
-    linear = torch.stack([factors[0] - 1, factors[1] - factors[0], factors[2] - factors[0], both])[None]
+    along, aside = (loading.coupling(terms)[0, 0, at] * (factors[0] * factors[at]).sqrt() for at in (2, 1))
+    linear = torch.stack([factors[0] - 1, factors[1] - factors[0], factors[2] - factors[0], along, aside])[None]
     np.testing.assert_allclose(loading.terms_of(linear).numpy(), terms.numpy(), atol=1e-12)

@@ -17,17 +17,16 @@ from tests.test_system import QUARTER_CAR
 
 CAR = slice(0, 3)  # z, roll, pitch
 MASS, ROLL, PITCH = 32000.0, 56800.0, 1.97e6
-CARRIED, AT, OWN_ROLL, OWN_PITCH = 6400.0, 1.5, 4000.0, 150e3  # kg, m, kg m^2 about its own centre
+CARRIED, AT, ASIDE, OWN_ROLL, OWN_PITCH = 6400.0, 1.5, 0.3, 4000.0, 150e3  # kg, m, m, kg m^2 about its own centre
 
 
 def described():
-    """Load, roll, pitch and centre of goods of `CARRIED` kg at `AT` m."""
-    mass, roll = MASS + CARRIED, ROLL + OWN_ROLL
+    """Load, roll, pitch, centre and side of goods of `CARRIED` kg at `AT` m, `ASIDE` m from the middle."""
+    mass, roll = MASS + CARRIED, ROLL + OWN_ROLL + CARRIED * ASIDE**2
     pitch = PITCH + OWN_PITCH + CARRIED * AT**2
     load = np.log(mass / MASS)
-    return np.array(
-        [load, np.log(roll / ROLL) - load, np.log(pitch / PITCH) - load, CARRIED * AT / np.sqrt(mass * pitch)]
-    )
+    grown = [load, np.log(roll / ROLL) - load, np.log(pitch / PITCH) - load]
+    return np.array([*grown, CARRIED * AT / np.sqrt(mass * pitch), CARRIED * ASIDE / np.sqrt(mass * roll)])
 
 
 @pytest.fixture(scope="module")
@@ -47,15 +46,16 @@ def values_at(simulator, terms):
 
 def test_the_mass_matrix_is_that_of_the_body_and_what_it_carries(simulator):
     inertia = values_at(simulator, described()).inertia[0].numpy()
-    expected = np.diag([MASS + CARRIED, ROLL + OWN_ROLL, PITCH + OWN_PITCH + CARRIED * AT**2])
+    expected = np.diag([MASS + CARRIED, ROLL + OWN_ROLL + CARRIED * ASIDE**2, PITCH + OWN_PITCH + CARRIED * AT**2])
     expected[0, 2] = expected[2, 0] = CARRIED * AT
+    expected[0, 1] = expected[1, 0] = CARRIED * ASIDE
     np.testing.assert_allclose(inertia[CAR, CAR], expected, rtol=1e-12, atol=1e-9)
     assert np.count_nonzero(inertia[CAR, 3:]) == 0
 
 
 def test_forces_accelerate_by_the_inverse_of_the_mass_matrix(simulator):
     forces = torch.as_tensor(np.random.default_rng(1).normal(size=(1, 9, 2)))
-    for terms in (np.zeros(4), described()):
+    for terms in (np.zeros(5), described()):
         values = values_at(simulator, terms)
         expected = torch.linalg.solve(values.inertia, forces)
         np.testing.assert_allclose(values.accelerated(forces), expected, rtol=1e-10)
@@ -66,7 +66,7 @@ def test_slopes_of_the_inertia_forces_agree_with_finite_differences(simulator):
     acceleration = torch.as_tensor(rng.normal(size=(1, 3, 9)) + 1j * rng.normal(size=(1, 3, 9)))
     here, loading = values_at(simulator, at), simulator.loading
     slopes = by_inertia(acceleration, here.mass, here.coupling, loading.exponents, loading.pattern)
-    for i, unit in enumerate(np.eye(4)):
+    for i, unit in enumerate(np.eye(5)):
         up, down = (values_at(simulator, at + sign * step * unit).inertia.to(acceleration.dtype) for sign in (1, -1))
         expected = (acceleration @ (up - down)) / (2 * step)
         np.testing.assert_allclose(slopes[..., i], expected, rtol=1e-6, atol=1e-3)
@@ -95,14 +95,14 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
     x = np.tile(np.concatenate([np.zeros(24), described()]), (48, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(4))
     at = [i for i, d in enumerate(deviations(system)) if d.kind not in ("gain", "delay")]
-    total, pull = np.zeros((4, 4)), np.zeros(4)
+    total, pull = np.zeros((5, 5)), np.zeros(5)
     for estimate in Identifier(system).examine(runs.values, np.zeros(48, dtype=bool)):
         said = estimate.deviating
         total += said.information[np.ix_(at, at)]
         pull += said.score[at] + said.information[np.ix_(at, at)] @ said.point[at]
     found, std = np.linalg.solve(total, pull), np.sqrt(np.diag(np.linalg.inv(total)))
     assert np.abs((found - described()) / std).max() < 3.5
-    assert std[3] < 0.01
+    assert std[3] < 0.01 and std[4] < 0.01
 
 
 def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
@@ -111,7 +111,7 @@ def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
     aired = re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 1, ", text)
     system, steel = parse_system(aired), parse_system(text)
     assert aired != text and system.digest != steel.digest
-    x = np.tile(np.concatenate([np.zeros(24), [np.log(1.2), 0.0, 0.0, 0.0]]), (24, 1))
+    x = np.tile(np.concatenate([np.zeros(24), [np.log(1.2), 0.0, 0.0, 0.0, 0.0]]), (24, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(5))
     found, taken = (Refiner(one).refine(runs.values, loads=True) for one in (system, steel))
     secondary = [i for i, p in enumerate(system.parameters) if p.name.startswith("secondary") and "stiff" in p.name]
@@ -130,7 +130,7 @@ def test_slopes_along_loads_of_air_springs_agree_with_finite_differences():
     x = torch.as_tensor(x)
     at = model.linearise(x, data)
     known = torch.linalg.qr(at.free.mT)[0]
-    for row in (24, 27):
+    for row in (24, 27, 28):
         step = torch.zeros_like(x)
         step[:, row] = 1e-5
         up, down = (model.chord(at, x + sign * step, at.x0, data).residual for sign in (1, -1))
