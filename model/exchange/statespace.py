@@ -43,6 +43,7 @@ class StateSpace:
     parameters: tuple[str, ...]
     values: FloatArray  # of the parameters, (P,)
     sample_rate: float  # Hz, of the recordings; the matrices are of continuous time
+    mass: FloatArray  # mass or inertia of each degree of freedom, the scale that A and B do not tell, (N / 2,)
 
 
 def state_space(system: System, values: Mapping[str, float] | None = None) -> StateSpace:
@@ -69,6 +70,7 @@ def state_space(system: System, values: Mapping[str, float] | None = None) -> St
         parameters=tuple(p.name for p in system.parameters),
         values=np.array([_value(system, mechanics, p) for p in system.parameters]),
         sample_rate=system.sample_rate,
+        mass=mechanics.mass,
     )
 
 
@@ -138,7 +140,7 @@ def write_mat(path: Path, space: StateSpace) -> None:
 
 
 def _arrays(space: StateSpace) -> dict[str, Any]:
-    names = ("A", "B", "C", "D", "dA", "dB", "dC", "dD", "values")
+    names = ("A", "B", "C", "D", "dA", "dB", "dC", "dD", "values", "mass")
     found: dict[str, Any] = {name: getattr(space, name) for name in names}
     found |= {name: np.array(getattr(space, name)) for name in ("states", "inputs", "outputs", "parameters")}
     found["sample_rate"] = np.array(space.sample_rate)

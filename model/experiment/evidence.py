@@ -8,7 +8,8 @@ as online; their values are then brought together, by the curvature of each wind
     2 D = sum_w [ c_w + (theta - theta_w)' P_w (theta - theta_w) ] + theta' K theta,   least over theta,
 
 c_w the window's misfit, P_w its information, K what is known before.  What the model of the truth itself leaves over in
-the same arithmetic is taken off.
+the same arithmetic is taken off; windows of which it leaves more than noise would (the run is too violent there for
+their sampling) tell nothing.
 """
 
 from __future__ import annotations
@@ -23,11 +24,12 @@ from sprung.model.experiment.menu import MenuRun
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identification.with_laws import LawRefiner, acting_laws
-from sprung.model.signals import FloatArray
+from sprung.model.signals import BoolArray, FloatArray
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System
 
 STRONG = 10.0  # log-likelihood ratio beyond which one model is taken: odds of 20 000 to 1
+_SOUND = 1.0  # chi-square per degree of freedom that is left without noise: as much as noise would
 KNOWN = 0.05  # by which springs and dampers are known from the recording before, of their logarithm
 
 
@@ -38,6 +40,7 @@ class FittedRun:
     misfit: float  # half the whitened squares, with what was known before
     unwhitened: float  # half the squares in the sensors' noise alone
     log_ratio: FloatArray  # values of the run together, (P,)
+    chi_square: FloatArray  # of every window, per degree of freedom, (B,)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,15 +69,24 @@ def simulated(system: System, run: MenuRun, seed: int = 0, noise: np.random.Gene
 def promise(truth: System, other: System, run: MenuRun, known: float = KNOWN, seed: int = 0) -> Promise:
     """What a run tells against `other` where `truth` is true."""
     values = simulated(truth, run, seed)
-    wrong, right = fitted(loaded(other, run), values, known), fitted(loaded(truth, run), values, known)
+    right = fitted(loaded(truth, run), values, known)
+    sound = right.chi_square < _SOUND
+    if not sound.any():
+        return Promise(0.0, 0.0)
+    right = right if sound.all() else fitted(loaded(truth, run), values, known, sound)
+    wrong = fitted(loaded(other, run), values, known, sound)
     return Promise(max(0.0, wrong.misfit - right.misfit), max(0.0, wrong.unwhitened - right.unwhitened))
 
 
-def fitted(system: System, values: FloatArray, known: float = KNOWN) -> FittedRun:
-    """A model fitted to samples (T, C); known: standard deviation of log-ratios of springs, dampers and masses."""
+def fitted(system: System, values: FloatArray, known: float = KNOWN, which: BoolArray | None = None) -> FittedRun:
+    """A model fitted to samples (T, C); known: standard deviation of log-ratios of springs, dampers and masses.
+
+    which: of the windows, (B,); all if left out.
+    """
     length = system.window
     starts = range(length, len(values) - length + 1, length)  # the first window swings in
     windows = np.stack([values[i : i + length] for i in starts])
+    windows = windows if which is None else windows[which]
     refined = _refined(system, windows)
     scale = np.maximum(refined.chi_square, 1.0)[:, None, None]  # deviations were stretched by what did not fit
     information = np.linalg.inv(refined.covariance / scale)  # (B, P, P)
@@ -86,7 +98,7 @@ def fitted(system: System, values: FloatArray, known: float = KNOWN) -> FittedRu
     cost = float((refined.chi_square * refined.freedom).sum() + spread + theta @ before @ theta)
     noise = np.array([channel.noise for channel in system.channels[len(system.inputs) :]])
     white = float(np.nansum((refined.error / noise) ** 2) * length + spread + theta @ before @ theta)
-    return FittedRun(0.5 * cost, 0.5 * white, theta)
+    return FittedRun(0.5 * cost, 0.5 * white, theta, refined.chi_square)
 
 
 def _refined(system: System, windows: FloatArray) -> Refined:

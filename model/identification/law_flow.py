@@ -69,6 +69,14 @@ class Flow:
                 setattr(found, name, tuple(part[at] for part in value))
         return found
 
+    def spread(self, rows: Tensor, count: int) -> Flow:
+        """The flow of `count` windows, of which those of this one are `rows`; the others, which are lost, have any."""
+        if len(rows) == count:
+            return self
+        at = torch.zeros(count, dtype=torch.int64)
+        at[rows] = torch.arange(len(rows))
+        return self.take(at)
+
     def along(self, deflection: Tensor, rate: Tensor) -> tuple[Tensor, Tensor | None]:
         """Forces (B, T, L, X), and memories (B, T-1, Z, X), that changes of the laws' deflections and rates bring about
         which are not the bodies'; each (B, T, L, X)."""

@@ -61,7 +61,10 @@ def opened(w: LawWindows, start: WindowPoint, data: WindowBatch) -> WindowPoint:
         weight = (error * size).repeat(T)[:, None] ** -1
         bend, off = bend * weight, (point.force - law).view(B, T * L, 1) * weight
         gradient = by.shown @ w.residual(Moved(states, outputs), data, whiten) - bend.mT @ off
-        step = torch.cholesky_solve(gradient, torch.linalg.cholesky(products + bend.mT @ bend)).squeeze(2)
+        factor, failed = torch.linalg.cholesky_ex(products + bend.mT @ bend)
+        step = torch.cholesky_solve(gradient, factor).squeeze(2)
+        sound = (failed == 0) & step.isfinite().all(dim=1)  # sensors that show nonsense: such a window stays
+        step = step.where(sound[:, None], 0.0)
         point = replace(point, x0=point.x0 + step[:, :N], force=point.force + step[:, N:].view(B, T, L))
     return point
 

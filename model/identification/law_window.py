@@ -160,14 +160,17 @@ class LawWindows:
                 moving = moving[~wild]
                 continue
             along = self.along(states, theirs, their_smooth, some, their_steps)
-            flow = self.flow(along, some, their_steps) if flow is None else flow
+            if flow is None:
+                flow = self.flow(along, some, their_steps).spread(moving, len(force))
             near = flow if everything else flow.take(moving)
             change = near.answer(self.forces_along(along, some, their_steps) - some.force)
             force[moving] += change
             moving = moving[self._shown_at_once(change, their_steps, theirs) >= _SETTLED]
         states, outputs = self.simulate(steps, force, point.x0, data)
-        if bool((wild := self._wild(outputs, data)).any()):
-            force[wild] = point.force[wild]
+        for usable in (point.force, torch.zeros_like(force)):
+            if not bool((wild := self._wild(outputs, data)).any()):
+                break
+            force[wild] = usable[wild]
             states, outputs = self.simulate(steps, force, point.x0, data)
         point = replace(point, force=force)
         if flow is None:

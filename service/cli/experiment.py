@@ -114,9 +114,9 @@ def _as_dict(found: RankedRun) -> dict[str, Any]:
 
 def _show(found: list[RankedRun], names: list[str]) -> None:
     print(f"told apart: {', '.join(names)}")
-    print(f"{'run':<28}{'evidence':>10}{'per cost':>10}  chance that it is strong")
+    print(f"{'run':<28}{'evidence':>11}{'per cost':>11}  chance that it is strong")
     for one in found:
-        print(f"{one.run[:27]:<28}{one.evidence:>10.1f}{one.per_cost:>10.1f}  {100 * one.chance:.0f} %")
+        print(f"{one.run[:27]:<28}{one.evidence:>11.5g}{one.per_cost:>11.5g}  {100 * one.chance:.0f} %")
     best = found[0]
     if best.chance < 0.5:
         print("no run of the menu is likely to decide: longer or rougher runs would tell more")

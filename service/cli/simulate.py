@@ -15,7 +15,7 @@ from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
-from sprung.service.comparison import Comparison, compare
+from sprung.service.comparison import SYSTEM_FILES, Comparison, compare
 from sprung.service.errors import UserError
 from sprung.service.loading import RecordRequest
 
@@ -68,8 +68,9 @@ def show(
     json_lines: bool,
     catalogue: tuple[Law, ...] = CATALOGUE,
 ) -> int:
-    """Print the errors of every sensor; with a folder, draw them."""
-    system = load_system(system_file or MANCHESTER, catalogue)
+    """Print the errors of every sensor; with a folder, draw them.  A system file alone reads the recording, too."""
+    simulated = other if other.suffix.lower() in SYSTEM_FILES else MANCHESTER
+    system = load_system(system_file or simulated, catalogue)
     database = database_of(system, dbc)
 
     def load(path: Path) -> Record:

@@ -40,8 +40,9 @@ def test_m_c_k_with_sensor_rows_become_the_same_system(tmp_path: Path) -> None:
 def test_state_space_of_an_export_comes_back(tmp_path: Path) -> None:
     first = parse_system(read_matrices(written(tmp_path / "a.mat", M=np.diag(MASS), C=C, K=K, S=ROWS)))
     write_mat(tmp_path / "b.mat", state_space(first))
-    data = scipy.io.loadmat(tmp_path / "b.mat")
-    again = parse_system(read_matrices(written(tmp_path / "c.mat", mass=45.0, **{k: data[k] for k in "ABCD"})))
+    again = parse_system(read_matrices(tmp_path / "b.mat"))
+    np.testing.assert_allclose(again.mechanics.mass, MASS)
+    assert again.bodies == first.bodies and again.elements == first.elements
     for ours, theirs in zip(again.mechanics.matrices(), first.mechanics.matrices(), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 

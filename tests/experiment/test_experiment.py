@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks.experiment import MENU, VEHICLE, with_law
+from sprung.model.experiment import evidence
 from sprung.model.experiment.choose import rank_runs
 from sprung.model.experiment.drives import loaded, run_inputs
 from sprung.model.experiment.evidence import fitted, promise, simulated
@@ -75,6 +76,16 @@ def test_the_evidence_that_is_promised_comes_with_the_noise() -> None:
         came.append(fitted(bare, values).misfit - fitted(friction, values).misfit)
     assert foreseen > 10
     assert abs(np.mean(came) - foreseen) < 4 * np.sqrt(2 * foreseen / len(came)) + 0.1 * foreseen
+
+
+def test_what_even_the_truth_leaves_unexplained_promises_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Windows too violent for their sampling: their misfit is no evidence."""
+    bare, cubic = parse_system(VEHICLE), with_law("cubic_stiffness", 1.0)
+    whole = promise(cubic, bare, SWEEP).evidence
+    values = simulated(cubic, SWEEP)
+    values[-200:, 2:] += np.random.default_rng(0).normal(0, 30 * np.std(values[:, 2:]), values[-200:, 2:].shape)
+    monkeypatch.setattr(evidence, "simulated", lambda *_: values)
+    assert 0 < promise(cubic, bare, SWEEP).evidence < whole
 
 
 def test_a_model_promises_nothing_against_itself_and_more_on_a_rougher_run() -> None:

@@ -92,3 +92,14 @@ def test_a_law_that_throws_the_motion_out_of_bounds_is_no_end_of_the_batch() -> 
     _, values = ride("[]")
     found = load_identifier(system).identify(1.5 * windows_of(values))
     assert all(np.isfinite(estimate.log_ratio).all() and np.isfinite(estimate.covariance).all() for estimate in found)
+
+
+def test_a_window_whose_sensors_show_nonsense_is_no_end_of_the_batch() -> None:
+    """Its motion leaves all bounds before any window has been followed."""
+    system, values = ride(CUBIC, 4.0)
+    windows = windows_of(values)[:3]
+    spoiled = windows.copy()
+    spoiled[1, :, 2:] += 30 * np.random.default_rng(0).normal(size=(100, 2)) * np.std(windows[:, :, 2:])
+    _, nonsense, last = load_identifier(system).identify(spoiled)
+    assert not nonsense.adequate and last.adequate
+    assert np.all(np.abs(last.log_ratio) < 2 * np.sqrt(np.diag(last.covariance)))
