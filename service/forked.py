@@ -68,8 +68,10 @@ class ForkedFunctions:
     `call` may be used from any thread; one call is worked on at a time.
     """
 
-    def __init__(self, name: str, functions: Mapping[str, Callable[..., Any]]) -> None:
-        """name: what it does, as in `identifies windows`."""
+    def __init__(
+        self, name: str, functions: Mapping[str, Callable[..., Any]], begin: Callable[[], None] | None = None
+    ) -> None:
+        """name: what it does, as in `identifies windows`; begin: called in the process before anything else."""
         self._name = name
         self._lock = threading.Lock()
         context = multiprocessing.get_context("fork")
@@ -78,7 +80,7 @@ class ForkedFunctions:
         _widen(answer)
         process = context.Process(
             target=_work,
-            args=(os.getpid(), functions, (ask, answers), asked, answer),
+            args=(os.getpid(), functions, begin, (ask, answers), asked, answer),
             name=f"sprung-{name.split(maxsplit=1)[0]}",
             daemon=True,
         )
@@ -170,6 +172,7 @@ def _widen(pipe: Connection) -> None:
 def _work(
     parent: int,
     functions: Mapping[str, Callable[..., Any]],
+    begin: Callable[[], None] | None,
     not_mine: Sequence[Connection],
     asked: Connection,
     answer: Connection,
@@ -180,6 +183,8 @@ def _work(
         connection.close()
     for told_all in (signal.SIGINT, signal.SIGTERM):  # Ctrl-C and service managers tell the whole group; the parent,
         signal.signal(told_all, signal.SIG_IGN)  # which finishes what it accepted, decides
+    if begin is not None:
+        begin()
     gc.freeze()  # what the parent made is not looked through, so that its memory stays shared
     with suppress(EOFError, OSError):
         while True:

@@ -8,6 +8,7 @@ from typing import Any
 
 from sprung.model.identifier import Identifies, StageTimes
 from sprung.model.signals import Estimate, FloatArray
+from sprung.service.engine import one_thread_an_operation
 from sprung.service.forked import ForkedFunctions, ProcessEnded
 
 
@@ -18,7 +19,9 @@ class IdentifierApart:
         self.digest = identifier.digest
         self.times = StageTimes()
         self._here = identifier
-        self.forked = ForkedFunctions("identifies windows", {"ask": partial(_asked, identifier)})
+        self.forked = ForkedFunctions(
+            "identifies windows", {"ask": partial(_asked, identifier)}, one_thread_an_operation
+        )
 
     def identify(self, windows: FloatArray, start: FloatArray | None = None, *, states: bool = False) -> list[Estimate]:
         """As that of the identifier."""

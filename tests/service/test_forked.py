@@ -9,17 +9,19 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from sprung.model.identifier import UnusableWindow
 from sprung.model.system import System
 from sprung.service.compute import Compute
-from sprung.service.engine import Engine
+from sprung.service.engine import Engine, one_thread_an_operation
 from sprung.service.following import FollowingApart, follow
 from sprung.service.forked import ForkedFunctions, ProcessEnded
 from sprung.service.identifying import IdentifierApart
@@ -50,6 +52,26 @@ def doubling() -> Iterator[ForkedFunctions]:
     functions = {"double": _double, "pid": os.getpid, "doubles": _doubles}
     with closing(ForkedFunctions("doubles", functions)) as forked:
         yield forked
+
+
+def _in_eight_threads() -> float:
+    numbers, together = torch.ones(100_000), threading.Barrier(8)
+
+    def add(one: float) -> float:
+        together.wait()
+        return float((numbers + one).sum())
+
+    with ThreadPoolExecutor(8) as pool:
+        return sum(pool.map(add, [1.0] * 8))
+
+
+def test_threads_of_the_process_may_use_torch_at_the_same_moment() -> None:
+    """Without its beginning every third process fails."""
+    one_thread_an_operation()
+    torch.ones(100_000) + 1.0
+    for _ in range(20):
+        with closing(ForkedFunctions("adds", {"add": _in_eight_threads}, one_thread_an_operation)) as forked:
+            assert forked.call("add") == 8 * 200_000
 
 
 def test_functions_run_in_another_process(doubling: ForkedFunctions) -> None:
