@@ -140,9 +140,9 @@ def make_tracker(system: System) -> Tracker:
 
 
 def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:
-    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses leave open; None: there
-    are none."""
-    if not system.doubtful_masses:
+    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses and laws leave open;
+    None: there are none."""
+    if not system.doubtful_masses and not system.laws:
         return None
     from sprung.model.identification.doubt import mass_doubt  # brings torch
 

@@ -92,7 +92,7 @@ class Identifier:
         return estimates(refined, P, states, deviating)
 
     def _doubted(self, estimate: Estimate) -> Estimate:
-        """With what masses that are not quite those of the file leave open."""
+        """With what masses that are not quite those of the file, and laws between samples, leave open."""
         if self._doubt is None:
             self._doubt = mass_doubt(self.system, loads=any(load.declared for load in self.system.loads))
         if self._doubt.none:

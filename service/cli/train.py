@@ -24,6 +24,10 @@ OPTIONAL = (
     "training is optional: without weights every window is refined from the nominal values, to the same result; "
     "weights give it a nearer start"
 )
+WITH_LAWS = (
+    "windows of a system with laws begin at the values of its file, not at those of weights: these weights are for the "
+    "same vehicle without its laws"
+)
 TOGETHER = 128  # windows that the reader hands over at once
 
 
@@ -38,15 +42,16 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     windows = whole_windows(system, recordings, database) if recordings else None
     given = {name: value for name, value in changes.items() if value is not None}
     settings = replace(TrainingSettings(), **given)
-    print(OPTIONAL, file=sys.stderr, flush=True)
+    print(OPTIONAL if not system.laws else WITH_LAWS, file=sys.stderr, flush=True)
     with TrainingProgress() as shown:
         estimator = train(system, out, recordings=windows, settings=settings, progress=shown.show)
     before, after = what_is_saved(system, estimator)
     of_file = "" if system_file is None else f" --system {system_file}"
+    use = f"use them with\n  sprung replay FILE{of_file} --weights {out}\n  sprung serve{of_file} --weights {out}"
     print(
         f"a window takes {after.iterations:.1f} instead of {before.iterations:.1f} iterations, "
-        f"{after.milliseconds:.1f} instead of {before.milliseconds:.1f} ms of a core; use them with\n"
-        f"  sprung replay FILE{of_file} --weights {out}\n  sprung serve{of_file} --weights {out}",
+        f"{after.milliseconds:.1f} instead of {before.milliseconds:.1f} ms of a core; "
+        + ("without its laws" if system.laws else use),
         file=sys.stderr,
     )
     saved = {"iterations": [before.iterations, after.iterations], "ms": [before.milliseconds, after.milliseconds]}

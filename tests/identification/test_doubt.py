@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sprung.model.identification.doubt import mass_doubt
+from sprung.model.identification.doubt import bounce_doubt, mass_doubt
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.system import load_system, parse_system
@@ -94,3 +94,19 @@ def test_stated_doubt_makes_no_other_vehicle():
     assert stated.digest == quarter_car(40.0).digest
     assert quarter_car("{value: 40.0, std: 0}").doubtful_masses == {}
     assert load_system().doubtful_masses == {}  # wheels are measured, bogies pitch
+
+
+def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it():
+    def stated(stiffness, rate):
+        law = f"damping: 1500.0, laws: [{{bump_stop: {{gap: 0.01, stiffness: {stiffness}}}}}]"
+        text = QUARTER_CAR.format(mass=40.0).replace("damping: 1500.0", law)
+        system = parse_system(text.replace("sample_rate: 100", f"sample_rate: {rate}"))
+        names, std = [p.name for p in system.tracked], np.sqrt(bounce_doubt(system))
+        (at,) = np.flatnonzero(std)
+        assert names[at] == "strut.bump_stop.stiffness"
+        tracker = make_tracker(system)
+        assert tracker.posterior(tracker.initial_state())[1][at] >= std[at]
+        return std[at]
+
+    assert stated("5.0e+5", 100) == pytest.approx(0.0056, rel=0.05)  # 19 Hz on 40 kg
+    assert stated("5.0e+5", 200) < 0.0005 and stated("2.0e+4", 100) < 0.0001
