@@ -84,25 +84,17 @@ class Engine:
             return self.tracker.initial_state()
 
 
-def one_thread_an_operation() -> None:
-    """Have torch split none: batches are shared among workers instead, and single operations are too small.
-
-    In a process that was forked this comes before its first thread: there torch makes its threads anew when they are
-    first needed, and two threads that need them at the same moment fail ("Invalid thread pool", torch 2.13).
-    """
-    import torch
-
-    torch.set_num_threads(1)
-
-
 def load_engine(settings: Settings) -> Engine:
     """Load the system file and the trained estimator that belongs to it.
 
     Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
     """
-    from sprung.model.identification.identify import load_identifier  # takes a second; a bad system file is told before
+    import torch  # takes a second; a bad system file is told before
 
-    one_thread_an_operation()
+    from sprung.model.identification.identify import load_identifier
+
+    torch.set_num_threads(1)  # batches are shared among workers instead: single operations are too small to split
+
     path = settings.system or MANCHESTER
     system = load_system(path)
     if not system.bodies:
@@ -140,11 +132,9 @@ def make_tracker(system: System) -> Tracker:
 
 
 def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:
-    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses and laws leave open;
-    None: there are none."""
-    if not system.doubtful_masses and not system.laws:
-        return None
+    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses, places and laws leave
+    open; None: nothing is in doubt."""
     from sprung.model.identification.doubt import mass_doubt  # brings torch
 
-    doubt = mass_doubt(system, loads=True, channels=True)
-    return np.diag(doubt.parameters), doubt.deviations
+    doubt = mass_doubt(system, loads=True, tracked=True)
+    return None if doubt.none else (np.diag(doubt.parameters), doubt.deviations)

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from sprung.model.system import MANCHESTER_DBC, System, load_system
+from sprung.model.tracking.tracker import Tracker
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.fleet import local_postgres as postgres_tests
@@ -37,9 +38,14 @@ def identifier(system: System) -> FakeIdentifier:
     return FakeIdentifier(system)
 
 
+@pytest.fixture(scope="session")
+def tracker(system: System) -> Tracker:
+    return make_tracker(system)
+
+
 @pytest.fixture
-def engine(system: System, identifier: FakeIdentifier) -> Engine:
-    return Engine(system, identifier, make_tracker(system), MANCHESTER_DBC)
+def engine(system: System, identifier: FakeIdentifier, tracker: Tracker) -> Engine:
+    return Engine(system, identifier, tracker, MANCHESTER_DBC)
 
 
 @pytest.fixture(scope="session")

@@ -150,7 +150,7 @@ class DeviationSensitivity:
         root = torch.linalg.cholesky(at.covariance)  # C = root root'
         known = torch.cat([free, root.mT @ J], dim=1).to(torch.float32)  # (B, N + P, K)
         r = after.residual.to(torch.float32)
-        columns, redundant = self._columns(at, after, data, by_drive)
+        columns, redundant = self.columns(at, after, data, by_drive)
         rows = as_rows(columns)  # (B, H, K)
         with_known = known @ rows.mT  # (B, N + P, H)
         information = rows @ rows.mT - with_known.mT @ with_known
@@ -192,7 +192,7 @@ class DeviationSensitivity:
             information = information - along @ along.mT * share
         return information, score
 
-    def _columns(
+    def columns(
         self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor | None]:
         """Whitened sensitivities of the compressed signals (B, F, R, H), and of the dropped ones (B, F, X, H)."""

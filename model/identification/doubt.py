@@ -1,14 +1,18 @@
-"""What masses that are not quite those of the system file leave open of the parameters.
+"""What masses and places that are not quite those of the system file leave open of the parameters.
 
 A window does not tell an axle that is heavier from one whose springs are softer: only with the scale of all forces,
 which nothing but masses gives.  What it says of a mass beyond that hangs on delays of microseconds.  So masses are
-taken as stated, and their doubt is part of what is stated of the others: with the products A of Gauss-Newton summed
-over windows of an average ride, what is estimated beside them, x, changes with the masses m by
+taken as stated, and their doubt is part of what is stated of the others.  With the products A of Gauss-Newton summed
+over windows of an average ride, and r what the sensors show more of a vehicle that is one standard deviation of one
+doubt off, what is estimated, x, moves by
 
-    D = -(A_xx + prior)^-1 A_xm,        covariance of x from the masses: D diag(std^2) D'
+    D = (A_xx + prior)^-1 J_x' r,        covariance of x from all doubts: sum of D D'
 
 To a tracker x are parameters, loads, and gains and delays of channels: a sensor that measures a force itself shows one
-that is not that of the masses, and that is read as its gain.
+that is not that of the masses, and that is read as its gain.  A tracker sums so many windows that it would soon be
+surer of a spring than anybody is of a bogie's mass, so it doubts what no file states, too: masses, inertias, and the
+places of springs and sensors.  These doubts are small, but for masses that are wrong together: what is off by more
+than three times as much no longer fits, and that is said; what fits is within three deviations.
 
 Laws leave something open, too: a stop so stiff that its body bounces on it at a fifth of the sample rate is followed
 between samples to some thousandths of its force only, and that is the same in every window.
@@ -16,30 +20,40 @@ between samples to some thousandths of its force only, and that is the same in e
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.deviations import deviations
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.gauss_newton import Linearisation, WindowBatch
-from sprung.model.identification.linearise import PRIOR_STD, WindowModel
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows
 from sprung.model.laws import ElementLaw
-from sprung.model.schema import Load, MassValue, SystemFile
+from sprung.model.schema import ElementSensor, SystemFile
 from sprung.model.signals import FloatArray
+from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import System
 
+TOGETHER_STD = 0.01  # relative, of all masses that no file doubts alike: bogies of one drawing; no window shows it
+MASS_STD = 0.005  # relative, of each of them beside that: what is off by four times as much fits no window
+INERTIA_STD = 0.005  # relative, of a roll or pitch inertia beyond that of its mass; likewise
+PLACE_STD = (
+    0.002  # of a body's furthest point, of where springs and sensors are: 3 mm on a bogie, 2 cm on a car; likewise
+)
+INERTIAS = "roll_inertia", "pitch_inertia"
 _WINDOWS = 8  # of a simulated ride; sensitivities differ little between them
-
-
+_RIDE = 120.0  # windows that a tracker has soon
 _BOUNCE = 4.0  # by (bounce / sample rate)^4, what a stiffness of a law errs; measured: 0.6 % at 0.195, none at 0.09
+_STEP = 0.1  # of a standard deviation: small enough to be linear
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MassDoubt:
-    """Covariances that doubtful masses, or laws between samples, give what is estimated."""
+    """Covariances that doubtful masses and places, or laws between samples, give what is estimated."""
 
     parameters: FloatArray  # of the log-ratios, shape (P, P)
     deviations: FloatArray  # of gains, delays and loads, see `model.identification.deviations`, shape (H, H)
@@ -50,17 +64,25 @@ class MassDoubt:
         return not self.parameters.any()
 
 
-def mass_doubt(system: System, *, loads: bool, channels: bool = False) -> MassDoubt:
-    """What the doubtful masses of a system leave open; `loads`, `channels`: with its loads, its gains and delays
-    unknown, as a tracker takes them.
+def mass_doubt(system: System, *, loads: bool, tracked: bool = False) -> MassDoubt:
+    """What doubtful masses of a system leave open; `loads`: with its loads unknown.
 
+    tracked: as a tracker takes it, gains and delays unknown, too, masses and places that no file doubts in doubt.
     Where laws act or no input is measured masses are taken as stated; of laws see `bounce_doubt`.
     """
     H = len(deviations(system))
     none = MassDoubt(np.diag(bounce_doubt(system)), np.zeros((H, H)))
-    if not system.doubtful_masses or system.laws or system.on_track or not system.file.inputs:
+    if system.laws or system.on_track or not system.file.inputs or not system.bodies:
         return none
-    return _computed(system, loads, channels)
+    wrong = [*_masses(system.file, system.doubtful_masses)]
+    if tracked:
+        wrong += [
+            *_together(system),
+            *_masses(system.file, _unstated(system)),
+            *_inertias(system),
+            *_places(system.file),
+        ]
+    return _computed(system, wrong, loads, tracked) if wrong else none
 
 
 def bounce_doubt(system: System) -> FloatArray:
@@ -79,52 +101,142 @@ def bounce_doubt(system: System) -> FloatArray:
     return found
 
 
-def _computed(system: System, loads: bool, channels: bool) -> MassDoubt:
-    P, doubtful, stated = len(system.parameters), system.doubtful_masses, deviations(system)
-    free = System(_with_masses(system.file, doubtful, [load.body for load in system.loads] if loads else []))
-    model = WindowModel(free, system.window)
-    runs = simulate_runs(free, np.zeros((_WINDOWS, len(free.parameters))), system.window, np.random.default_rng(0))
+def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: bool) -> MassDoubt:
+    P, stated = len(system.parameters), deviations(system)
+    model = WindowModel(system, system.window)
+    runs = simulate_runs(system, np.zeros((_WINDOWS, P)), system.window, np.random.default_rng(0))
     X = len(model.simulator.loading) if loads else 0
     with torch.no_grad():
-        sensors = np.ones(len(free.sensors), dtype=bool)
-        data = model.batch(model.knots(runs.values), runs.values, sensors)
-        found = model.linearise(torch.zeros(_WINDOWS, len(free.parameters) + X, dtype=torch.float64), data)
-        measured = 2 * len(system.channels) if channels else 0
-        information = _information(model, found, data, measured).sum(axis=0)
-    names = [p.name for p in free.parameters]
-    masses = [names.index(f"{body}.mass") for body in doubtful]
-    others = [names.index(p.name) for p in system.parameters] + list(range(len(names), len(information)))
+        data = model.batch(model.knots(runs.values), runs.values, np.ones(len(system.sensors), dtype=bool))
+        at = model.linearise(torch.zeros(_WINDOWS, P + X, dtype=torch.float64), data)
+        measured = 2 * len(system.channels) if tracked else 0
+        one = _Ride(model, at, data, measured)
+        here = one.outputs(model.simulator)
+        shown = [one.slope(one.outputs(LinearSimulator(System(file))) - here) for file in wrong]
+        information = one.information().sum(axis=0) * (_RIDE / _WINDOWS if tracked else 1.0)
+    pull = np.stack(shown, axis=1) / _STEP * (_RIDE / _WINDOWS if tracked else 1.0)
     of_loads = [term.std for term in model.simulator.loading.terms][:X]
     spread = np.array([PRIOR_STD] * P + of_loads + [d.std for d in stated[:measured]])
-    own = information[np.ix_(others, others)] + np.diag(spread**-2.0)
-    moved = -np.linalg.solve(own, information[np.ix_(others, masses)]) * np.array(list(doubtful.values()))
+    moved = np.linalg.solve(information + np.diag(spread**-2.0), pull)
     C = len(system.channels)
-    beside = np.zeros((len(stated), len(masses)))
+    beside = np.zeros((len(stated), len(wrong)))
     beside[:measured], beside[2 * C : 2 * C + X] = moved[P + X :], moved[P : P + X]
     return MassDoubt(moved[:P] @ moved[:P].T, beside @ beside.T)
 
 
-def _information(model: WindowModel, at: Linearisation, data: WindowBatch, measured: int) -> FloatArray:
-    """Of windows on parameters, loads and the first `measured` deviations, without priors, (B, U, U)."""
-    inverse = np.linalg.inv(at.covariance.numpy())
-    own = inverse - np.diag(model.precision[: inverse.shape[1]].numpy())
-    if not measured:
-        return np.asarray(own)
-    sensitivity, second = DeviationSensitivity(model), model.chord(at, at.x, at.x0, data)
-    shown = model.by_drive(at, sensitivity.motions(data), data)
-    cross, profiled, _ = sensitivity.evidence(at, second, data, shown).numpy()
-    cross, profiled = cross[:, :, :measured], profiled[:, :measured, :measured]
-    across = -inverse @ cross
-    return np.block([[own, across], [across.transpose(0, 2, 1), profiled + cross.transpose(0, 2, 1) @ inverse @ cross]])
+class _Ride:
+    """Windows at nominal values: what they tell, and what another vehicle's sensors would pull at."""
+
+    def __init__(self, model: WindowModel, at: Linearisation, data: WindowBatch, measured: int) -> None:
+        """measured: how many of the deviations are unknown, the first ones."""
+        self.model, self.at, self.data, self.measured = model, at, data, measured
+        self.sensitivity = DeviationSensitivity(model)
+        self.second = model.chord(at, at.x, at.x0, data)
+        self.shown = model.by_drive(at, self.sensitivity.motions(data), data)
+        columns, redundant = self.sensitivity.columns(at, self.second, data, self.shown)
+        self.columns = as_rows(columns[..., :measured]).double()
+        self.redundant = None if redundant is None else as_rows(redundant[..., :measured]).double()
+
+    def outputs(self, other: LinearSimulator) -> Tensor:
+        """What the sensors of a vehicle show in these windows, (B, T, S)."""
+        discrete = other.discretise(other.element_values(self.at.x))
+        return other.states(discrete, self.data.w, self.at.x0) @ discrete.C.mT + self.data.w @ discrete.D.mT
+
+    def slope(self, more: Tensor) -> FloatArray:
+        """Of the log-likelihood along parameters, loads and the unknown deviations, where sensors show `more`
+        (B, T, S); summed over the windows, (U,)."""
+        at, model = self.at, self.model
+        r = as_rows(at.whiten @ model.spectra(more @ model.compression.matrix(self.data.present).mT).unsqueeze(3)).mT
+        left = r - at.free.mT @ torch.cholesky_solve(at.free @ r, at.factor)
+        pull = self.columns @ left
+        if self.redundant is not None:
+            over = model.spectra(more @ self.sensitivity.dropped(self.data.present).mT)
+            pull = pull + self.redundant @ as_rows((model.weight[:, None] * over).unsqueeze(3)).mT
+        return torch.cat([at.sensitivities @ left, pull], dim=1).squeeze(2).sum(dim=0).numpy()
+
+    def information(self) -> FloatArray:
+        """Of each window on parameters, loads and the unknown deviations, without priors, (B, U, U)."""
+        inverse = np.linalg.inv(self.at.covariance.numpy())
+        own = inverse - np.diag(self.model.precision[: inverse.shape[1]].numpy())
+        n = self.measured
+        if not n:
+            return np.asarray(own)
+        cross, profiled, _ = self.sensitivity.evidence(self.at, self.second, self.data, self.shown).numpy()
+        cross, profiled = cross[:, :, :n], profiled[:, :n, :n]
+        across = -inverse @ cross
+        whole = profiled + cross.transpose(0, 2, 1) @ inverse @ cross
+        return np.block([[own, across], [across.transpose(0, 2, 1), whole]])
 
 
-def _with_masses(file: SystemFile, doubtful: dict[str, float], loads: list[str]) -> SystemFile:
-    """The file with the doubtful masses among what is estimated, every other one fixed, and `loads` said to be such."""
-    bodies = {}
-    for name, body in file.bodies.items():
-        known = body.mass.fixed or ("mass" not in file.estimate and name not in doubtful)
-        update: dict[str, object] = {"mass": MassValue(value=body.mass.value, fixed=known)}
-        if name in loads and body.load is None:
-            update["load"] = Load()
-        bodies[name] = body.model_copy(update=update)
-    return file.model_copy(update={"bodies": bodies, "estimate": tuple(dict.fromkeys([*file.estimate, "mass"]))})
+def _unstated(system: System) -> dict[str, float]:
+    """Bodies whose mass no file doubts: neither loads, nor estimated, nor fixed."""
+    told = {load.body for load in system.loads} | {p.element for p in system.parameters if p.quantity == "mass"}
+    return {
+        name: MASS_STD
+        for name, body in system.file.bodies.items()
+        if name not in told and name not in system.doubtful_masses and body.mass.std is None and not body.mass.fixed
+    }
+
+
+def _masses(file: SystemFile, doubtful: dict[str, float]) -> Iterator[SystemFile]:
+    """The file with one mass after the other, inertias along, a step of its doubt larger."""
+    for name, std in doubtful.items():
+        body, more = file.bodies[name], 1 + _STEP * std
+        heavier = {"mass": body.mass.model_copy(update={"value": body.mass.value * more})}
+        inertias = {k: getattr(body, k) * more for k in INERTIAS if getattr(body, k)}
+        yield _with_body(file, name, heavier | inertias)
+
+
+def _together(system: System) -> Iterator[SystemFile]:
+    """The file with all masses that no file doubts larger."""
+    file = system.file
+    for name in _unstated(system):
+        (file,) = _masses(file, {name: TOGETHER_STD})
+    if file is not system.file:
+        yield file
+
+
+def _inertias(system: System) -> Iterator[SystemFile]:
+    """The file with one inertia after the other larger, of the bodies whose mass no file doubts."""
+    for name in _unstated(system):
+        body = system.file.bodies[name]
+        for kind in INERTIAS:
+            if getattr(body, kind):
+                yield _with_body(system.file, name, {kind: getattr(body, kind) * (1 + _STEP * INERTIA_STD)})
+
+
+def _places(file: SystemFile) -> Iterator[SystemFile]:
+    """The file with one spring or sensor after the other a step of its doubt further along x, then along y."""
+    reach = {name: _reach(file, name) for name, body in file.bodies.items() if body.roll_inertia or body.pitch_inertia}
+    for name, element in file.elements.items():
+        ends = [reach[end] for end in (element.upper, element.lower) if end in reach]
+        for position in _moved(element.position, np.min(ends, axis=0) if ends else np.zeros(2)):
+            changed = element.model_copy(update={"position": position})
+            yield file.model_copy(update={"elements": {**file.elements, name: changed}})
+    for name, sensor in file.sensors.items():
+        if isinstance(sensor, ElementSensor) or sensor.body not in reach:
+            continue
+        for position in _moved(sensor.position, reach[sensor.body]):
+            moved = sensor.model_copy(update={"position": position})
+            yield file.model_copy(update={"sensors": {**file.sensors, name: moved}})
+
+
+def _reach(file: SystemFile, body: str) -> FloatArray:
+    """How far springs and sensors of a body are from its position at most, along x and y."""
+    points = [e.position for e in file.elements.values() if body in (e.upper, e.lower)]
+    points += [s.position for s in file.sensors.values() if not isinstance(s, ElementSensor) and s.body == body]
+    known = np.array([p for p in points if p is not None]).reshape(-1, 2)
+    return np.asarray(np.abs(known - file.bodies[body].position).max(axis=0, initial=0.0))
+
+
+def _moved(position: tuple[float, float] | None, reach: FloatArray) -> Iterator[tuple[float, float]]:
+    """A position a step of its doubt further along one axis after the other, where it matters."""
+    if position is not None:
+        for axis in np.flatnonzero(reach):
+            at = np.array(position)
+            at[axis] += _STEP * PLACE_STD * reach[axis]
+            yield float(at[0]), float(at[1])
+
+
+def _with_body(file: SystemFile, name: str, update: dict[str, object]) -> SystemFile:
+    return file.model_copy(update={"bodies": {**file.bodies, name: file.bodies[name].model_copy(update=update)}})

@@ -96,6 +96,51 @@ def test_stated_doubt_makes_no_other_vehicle():
     assert load_system().doubtful_masses == {}  # wheels are measured, bogies pitch
 
 
+PITCHING = """
+name: bogie
+sample_rate: 100
+window: 100
+bodies:
+  car: {{mass: 16000.0}}
+  bogie: {{mass: {mass}, pitch_inertia: {pitch}}}
+inputs:
+  front: {{kind: support, displacement: {{csv: z1, noise: 1.0e-5}}, velocity: {{csv: v1, noise: 5.0e-4}}}}
+  rear: {{kind: support, displacement: {{csv: z2, noise: 1.0e-5}}, velocity: {{csv: v2, noise: 5.0e-4}}}}
+elements:
+  first: {{upper: bogie, lower: front, position: [{arm}, 0.0], stiffness: 2.44e+6, damping: 8.0e+3}}
+  second: {{upper: bogie, lower: rear, position: [-1.28, 0.0], stiffness: 2.44e+6, damping: 8.0e+3}}
+  strut: {{upper: car, lower: bogie, stiffness: 8.6e+5, damping: 4.0e+4}}
+sensors:
+  body: {{kind: acceleration, body: car, csv: a1, noise: 0.004}}
+  leading: {{kind: acceleration, body: bogie, position: [1.28, 0.0], csv: a2, noise: 0.03}}
+  trailing: {{kind: acceleration, body: bogie, position: [-1.28, 0.0], csv: a3, noise: 0.03}}
+"""
+
+
+def bogie(mass=2615.0, pitch=1476.0, arm=1.28):
+    return parse_system(PITCHING.format(mass=mass, pitch=pitch, arm=arm))
+
+
+@pytest.mark.parametrize("off", [{"mass": 2650.0, "pitch": 1496.0}, {"pitch": 1496.0}, {"arm": 1.2876}])
+def test_a_tracker_doubts_masses_inertias_and_places_that_no_file_doubts(off):
+    """1.4 % of a bogie, of its inertia, 8 mm of a spring's place: windows fit, and springs are wrong by a per cent."""
+    system, true = bogie(), bogie(**off)
+    tracker = make_tracker(system)
+    runs = simulate_runs(true, np.zeros((80, len(true.parameters))), 100, np.random.default_rng(9))
+    estimates = Identifier(system).examine(runs.values, np.arange(80) % 2 == 0)
+    assert np.mean([e.adequate for e in estimates]) > 0.9
+    state = tracker.update_many(tracker.initial_state(), [(e, 10**18 + k * 10**9) for k, e in enumerate(estimates)])
+    mean, std = tracker.posterior(state)
+    assert np.abs(mean / std).max() < 3
+    assert tracker.sensors(state) == ()
+    assert std.max() < 0.03
+
+
+def test_what_is_fixed_or_stated_is_not_doubted_beside():
+    certain = parse_system(QUARTER_CAR.format(mass="{value: 40.0, fixed: true}"))
+    assert mass_doubt(certain, loads=True, tracked=True).none
+
+
 def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it():
     def stated(stiffness, rate):
         law = f"damping: 1500.0, laws: [{{bump_stop: {{gap: 0.01, stiffness: {stiffness}}}}}]"
