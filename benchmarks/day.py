@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -31,6 +31,7 @@ from sprung.model.signals import Conditions, Deviating, Estimate, FloatArray
 from sprung.model.system import System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 
+ALIKE = 8  # windows of the library, next to each other, that stand for those of one ride
 POOLED = 40.0  # independent windows of a second that the estimate of one ride is worth
 ASIDE = 0.1  # m, standard deviation of how far a load lies to the side
 SERVICE_DAY = 16 * 3600.0  # s
@@ -79,12 +80,21 @@ class Pool:
     covariance: FloatArray  # of the parameters, (P, P)
 
 
-def pool(window: Estimate, cargo: int) -> Pool:
-    """cargo: how many of the deviations, the last ones, describe the load."""
-    like = window.deviating
-    assert like is not None
-    information: FloatArray = POOLED * 0.5 * (like.information + like.information.T)
-    given: FloatArray = like.given / POOLED
+def pool(some: Sequence[Estimate], cargo: int) -> Pool:
+    """`POOLED` windows like `some`, each as often as the others: what a clock that is off by milliseconds does at the
+    edges of one window averages out over a ride.
+
+    cargo: how many of the deviations, the last ones, describe the load.
+    """
+    window, said = some[0], [one.deviating for one in some if one.deviating is not None]
+    precision = [np.linalg.inv(of.given) for of in said]
+    given: FloatArray = np.linalg.inv(np.mean(precision, axis=0)) / POOLED
+    cross = POOLED * given @ np.mean([p @ of.cross for p, of in zip(precision, said, strict=True)], axis=0)
+    # What windows differ in with deviations, while the parameters are the same, tells of the deviations, too.
+    apart = [(of.cross - cross).T @ p @ (of.cross - cross) for p, of in zip(precision, said, strict=True)]
+    told = np.mean([of.information for of in said], axis=0) + np.mean(apart, axis=0)
+    information: FloatArray = POOLED * 0.5 * (told + told.T)
+    like = replace(said[0], cross=cross, given=given, information=information)
     values, vectors = np.linalg.eigh(information)
     root = np.asarray(vectors * np.sqrt(values.clip(0)), dtype=np.float64)
     error = np.asarray(np.linalg.cholesky(given), dtype=np.float64)
@@ -210,14 +220,15 @@ class Lives:
     @cached_property
     def pools(self) -> list[Pool]:
         cargo = sum(part.kind in CARGO for part in deviations(self.system))
-        return [pool(window, cargo) for window in library(self.system, self.windows, self.seed)]
+        found = library(self.system, self.windows, self.seed)
+        return [pool([found[(k + i) % len(found)] for i in range(ALIKE)], cargo) for k in range(len(found))]
 
     def ours(self, number: int) -> bool:
         return number % self.part[1] == self.part[0] - 1
 
     def life(self, days: float, seed: int, *, measured: bool, fault: str | None = None) -> Life:
         file = None if self.folder is None else self.folder / f"life-{seed}.json"
-        settings = [days, seed, measured, fault, self.windows, self.seed, POOLED, FAULTS, asdict(Service())]
+        settings = [days, seed, measured, fault, self.windows, self.seed, POOLED, ALIKE, FAULTS, asdict(Service())]
         settings = json.loads(json.dumps(settings))  # as they are read back
         told = kept(file, settings)
         if told is None:
