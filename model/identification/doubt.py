@@ -110,7 +110,7 @@ def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: boo
         data = model.batch(model.knots(runs.values), runs.values, np.ones(len(system.sensors), dtype=bool))
         at = model.linearise(torch.zeros(_WINDOWS, P + X, dtype=torch.float64), data)
         measured = 2 * len(system.channels) if tracked else 0
-        one = _Ride(model, at, data, measured)
+        one = _UsualRide(model, at, data, measured)
         here = one.outputs(model.simulator)
         shown = [one.slope(one.outputs(LinearSimulator(System(file))) - here) for file in wrong]
         information = one.information().sum(axis=0) * (_RIDE / _WINDOWS if tracked else 1.0)
@@ -124,7 +124,7 @@ def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: boo
     return MassDoubt(moved[:P] @ moved[:P].T, beside @ beside.T)
 
 
-class _Ride:
+class _UsualRide:
     """Windows at nominal values: what they tell, and what another vehicle's sensors would pull at."""
 
     def __init__(self, model: WindowModel, at: Linearisation, data: WindowBatch, measured: int) -> None:
