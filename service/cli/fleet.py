@@ -24,7 +24,7 @@ from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
-from sprung.service.fleet.nats_broker import NatsBroker
+from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds
 from sprung.service.fleet.ray_serving import ServingSizes
 from sprung.service.fleet.tasks import tasks_for
 from sprung.service.logs import set_up
@@ -154,17 +154,19 @@ def run_consume(options: dict[str, Any], address: str, alive: Path | None) -> in
         ingest = Ingest(pipeline, settings.late_seconds)
         ingest.start()
         stack.callback(ingest.close)
-        asyncio.run(_consume(address, ingest, counts, alive))
+        asyncio.run(_consume(address, settings.late_seconds, ingest, counts, alive))
     print(f"{counts.messages} messages with {counts.windows} windows stored, {counts.refused} refused", flush=True)
     return 0
 
 
-async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts, alive: Path | None) -> None:
+async def _consume(
+    address: str, late_seconds: float, ingest: Ingest, counts: ConsumerCounts, alive: Path | None
+) -> None:
     stopping = asyncio.Event()
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
-    broker = await _broker(address)
+    broker = await _broker(address, late_seconds)
     print(f"sprung fleet: folding what {address} holds; Ctrl-C stops", flush=True)
     try:
         await consume(broker, ingest, stopping, counts, (lambda: None) if alive is None else alive.touch)
@@ -172,9 +174,9 @@ async def _consume(address: str, ingest: Ingest, counts: ConsumerCounts, alive: 
         await broker.close()
 
 
-async def _broker(address: str) -> Broker:
+async def _broker(address: str, late_seconds: float) -> Broker:
     if address.startswith("nats://"):
-        return await NatsBroker.open(address)
+        return await NatsBroker.open(address, ack_seconds(late_seconds))
     if address.startswith("kafka://"):
         return await open_kafka(address)
     raise UserError(f"{address}: give nats://HOST:PORT or kafka://HOST:PORT/TOPIC")

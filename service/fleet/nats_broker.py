@@ -16,6 +16,15 @@ FIRST_ANSWER_SECONDS = 15.0
 SUBJECT = "sprung.estimates"
 STREAM = "SPRUNG"
 DURABLE = "sprung-fold"
+LEAST_ACK_SECONDS = 2.0  # a transaction takes less
+
+
+def ack_seconds(late_seconds: float) -> float:
+    """After which the server gives a message to somebody else: those after it in time wait for it only so long.
+
+    A consumer that dies with a message in its hands would else leave a message that is stored but not tracked.
+    """
+    return max(LEAST_ACK_SECONDS, late_seconds / 2)
 
 
 class NatsDelivery:
@@ -46,17 +55,25 @@ class NatsBroker:
         self._subscription = subscription
 
     @classmethod
-    async def open(cls, servers: str, ack_seconds: float = 30.0) -> NatsBroker:
-        """Connect, and make stream and consumer where they are missing.  Raises UserError."""
+    async def open(cls, servers: str, ack_seconds: float) -> NatsBroker:
+        """Connect, and make stream and consumer, or bring them up to date.  Raises UserError.
+
+        ack_seconds: see the function of that name.
+        """
         connection = await _connected(servers)
         from nats.js.api import AckPolicy, ConsumerConfig
 
         stream = connection.jetstream()
         await _ensure_stream(stream)
         config = ConsumerConfig(
-            durable_name=DURABLE, ack_policy=AckPolicy.EXPLICIT, ack_wait=ack_seconds, max_ack_pending=4 * TOGETHER
+            durable_name=DURABLE,
+            filter_subject=f"{SUBJECT}.>",
+            ack_policy=AckPolicy.EXPLICIT,
+            ack_wait=ack_seconds,
+            max_ack_pending=4 * TOGETHER,
         )
-        subscription = await stream.pull_subscribe(f"{SUBJECT}.>", durable=DURABLE, stream=STREAM, config=config)
+        await stream.add_consumer(STREAM, config)
+        subscription = await stream.pull_subscribe_bind(DURABLE, STREAM)
         return cls(connection, subscription)
 
     async def fetch(self, most: int, seconds: float) -> Sequence[BrokerMessage]:

@@ -22,7 +22,7 @@ from sprung.service.fleet.broker import Broker, BrokerMessage, ConsumerCounts, c
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import KafkaBroker
 from sprung.service.fleet.message import encode
-from sprung.service.fleet.nats_broker import NatsBroker, NatsLink
+from sprung.service.fleet.nats_broker import NatsBroker, NatsLink, ack_seconds
 from sprung.service.fleet.spool import SpoolEntry
 from sprung.service.pipeline import Pipeline
 from tests.service.fleet.test_ingest import Clock, messages
@@ -198,6 +198,10 @@ def test_nats_keeps_messages_over_kills_of_both_sides(
     asyncio.run(until(opened, ingest, counts, lambda: counts.messages >= 4))
     assert pipeline.state("north-1").used == 40
     assert counts.messages == 4  # each once: the server dropped what was published twice
+
+
+def test_a_message_comes_again_before_those_behind_it_stop_waiting() -> None:
+    assert ack_seconds(10.0) == 5.0 and ack_seconds(0.0) > 0.0
 
 
 def test_raw_recordings_do_not_go_through_a_broker() -> None:
