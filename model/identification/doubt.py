@@ -35,7 +35,7 @@ from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_row
 from sprung.model.laws import ElementLaw
 from sprung.model.schema import ElementSensor, SystemFile
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.simulate.linear import Discrete, LinearSimulator
 from sprung.model.system import System
 
 TOGETHER_STD = 0.01  # relative, of all masses that no file doubts alike: bogies of one drawing; no window shows it
@@ -139,7 +139,9 @@ class _UsualRide:
 
     def outputs(self, other: LinearSimulator) -> Tensor:
         """What the sensors of a vehicle show in these windows, (B, T, S)."""
-        discrete = other.discretise(other.element_values(self.at.x))
+        one = other.discretise(other.element_values(self.at.x[:1]))  # nominal in all windows
+        parts = (one.Ad, one.G0, one.G1, one.C, one.D)
+        discrete = Discrete(*(part.expand(len(self.at.x), -1, -1) for part in parts))
         return other.states(discrete, self.data.w, self.at.x0) @ discrete.C.mT + self.data.w @ discrete.D.mT
 
     def slope(self, more: Tensor) -> FloatArray:
