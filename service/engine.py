@@ -84,17 +84,25 @@ class Engine:
             return self.tracker.initial_state()
 
 
+def one_thread_an_operation() -> None:
+    """Have torch split none: batches are shared among workers instead, and single operations are too small.
+
+    In a process that was forked this comes before its first thread: there torch makes its threads anew when they are
+    first needed, and two threads that need them at the same moment fail ("Invalid thread pool", torch 2.13).
+    """
+    import torch
+
+    torch.set_num_threads(1)
+
+
 def load_engine(settings: Settings) -> Engine:
     """Load the system file and the trained estimator that belongs to it.
 
     Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
     """
-    import torch  # takes a second; a bad system file is told before
+    from sprung.model.identification.identify import load_identifier  # takes a second; a bad system file is told before
 
-    from sprung.model.identification.identify import load_identifier
-
-    torch.set_num_threads(1)  # batches are shared among workers instead: single operations are too small to split
-
+    one_thread_an_operation()
     path = settings.system or MANCHESTER
     system = load_system(path)
     if not system.bodies:
