@@ -13,6 +13,7 @@ from sprung.service.fleet.sending import Answer
 from sprung.service.fleet.spool import SpoolEntry
 
 FIRST_ANSWER_SECONDS = 15.0
+PUBLISHED_SECONDS = 5.0  # for a message of kB; one that was on its way when the server died is sent again after that
 SUBJECT = "sprung.estimates"
 STREAM = "SPRUNG"
 DURABLE = "sprung-fold"
@@ -134,7 +135,7 @@ class NatsLink:
             self._stream = self._connection.jetstream()
             await _ensure_stream(self._stream)
         headers = {"Nats-Msg-Id": hashlib.sha256(body).hexdigest()}
-        await self._stream.publish(self._subject, body, headers=headers, timeout=10.0)
+        await self._stream.publish(self._subject, body, headers=headers, timeout=PUBLISHED_SECONDS)
 
 
 async def _connected(servers: str) -> Any:
