@@ -70,6 +70,12 @@ class FitRules:
     prior: float = rule(
         1.0, "deviation of a log-ratio to nominal; derived: a factor e, no vehicle is further", 0.7, 2.0
     )
+    work: float = rule(
+        1e7,
+        "samples of all models linearised; chosen: thousands on a minute at 100 Hz, minutes of processor time",
+        3e6,
+        3e7,
+    )
 
 
 @dataclass(frozen=True)
@@ -118,6 +124,7 @@ class SelectionRules:
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
     gross: float = rule(0.3, "error over the signal, from which scores tell the place alone; chosen", 0.2, 0.5)
     most_gross: int = rule(14, "candidates that are fitted then; chosen: all laws of an element", 9, 20)
+    wider: int = rule(2, "of the best laws beside another, that are fitted in their wider forms; chosen", 1, 3)
     unnamed: int = rule(2, "unnamed forces among them at one place; chosen", 1, 3)
     last: int = rule(3, "that are fitted to the end in any case; chosen", 2, 6)
     finished: int = rule(6, "that are fitted to the end when they are close; chosen", 4, 9)
@@ -136,6 +143,9 @@ class PlausibleRules:
     """What is not believed, however well it fits."""
 
     knees: float = rule(0.5, "of the rate passed within a sample; derived: both knees lie within it", 0.3, 0.8)
+    corner: float = rule(
+        0.4, "of the rms rate, over which friction changes its sign; chosen: wider, a damper saturates", 0.25, 0.7
+    )
     pure: float = rule(0.8, "of an excitation's power in a few lines, its own frequencies; chosen", 0.6, 0.95)
     lines: int = rule(4, "of them at most; chosen", 2, 8)
     bins: int = rule(2, "on either side of a line; derived: they hold 92 % of a sine between two bins", 1, 4)

@@ -151,6 +151,7 @@ class FittedElement(NamedTuple):
     damping: float  # N s/m
     nominal_damping: float  # N s/m, of the system file
     frequency: float  # rad/s, rms rate over rms deflection
+    rate: float  # m/s, rms
 
 
 class Restart(NamedTuple):

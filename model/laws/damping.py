@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from statistics import NormalDist
 
 import numpy as np
 
 from sprung.model.laws.base import (
     RARE,
     ElementLaw,
+    FittedElement,
     Motion,
     Observed,
     ParameterSpec,
+    Restart,
     SpringDamper,
     Values,
     grid,
@@ -79,6 +82,22 @@ def _knees(seen: Observed) -> FloatArray:
     return seen.rate_quantile([0.35, 0.65, 0.9])
 
 
+_STRONGER, _FALLS_TO = (1.4, 2.0), 0.3  # times the damping that was read; beyond the knee
+
+
+def _of_a_stronger_damper(read: FittedElement) -> tuple[Restart, ...]:
+    """Valves of stronger dampers that are read as this one: by the mean slope over a normal rate of the same size.
+
+    The mean slope of a ratio r beyond a knee q is c (r + (1 - r) P(|v| < q)) (statistical linearisation, Booton 1954).
+    """
+    starts = []
+    for stronger in _STRONGER:
+        below = (1 / stronger - _FALLS_TO) / (1 - _FALLS_TO)
+        knee = read.rate * NormalDist().inv_cdf((1 + below) / 2)
+        starts.append(Restart(1.0, stronger, (knee, _FALLS_TO)))
+    return tuple(starts)
+
+
 _BLOWOFF = ElementLaw(
     name="damper_blowoff",
     title="damper blow-off",
@@ -104,6 +123,7 @@ _BLOWOFF = ElementLaw(
     sentence="the damper blows off beyond {knee}; its slope falls to {ratio} of the nominal one",
     strength=1,
     knees=(0,),
+    restarts=_of_a_stronger_damper,
 )
 DAMPER_BLOWOFF = with_wider_form(
     _BLOWOFF,
@@ -119,6 +139,7 @@ DAMPER_BLOWOFF = with_wider_form(
     ),
     strength=None,
     knees=(0, 2),
+    restarts=None,
     prior_cost=RARE,
     screened=False,
     widened=lambda p, seen: ((*p, *p),),

@@ -45,7 +45,7 @@ def test_a_path_is_the_law_that_its_memory_integrates(law):
 
 
 def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike():
-    read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0)
+    read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0, rate=0.05)
     (restart,) = find_law("series_stiffness").restarts(read)
     c, (ks,) = restart.damping * read.damping, restart.parameters
     r = read.frequency * c / ks
@@ -56,7 +56,7 @@ def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alik
 
 def test_a_damper_without_a_spring_beside_it_has_other_starts_too():
     """A slide on a guide: what is read has no stiffness."""
-    (restart,) = find_law("series_stiffness").restarts(FittedElement(0.0, 200.0, 400.0, 12.0))
+    (restart,) = find_law("series_stiffness").restarts(FittedElement(0.0, 200.0, 400.0, 12.0, 0.05))
     assert restart.stiffness == 1.0 and np.all(np.isfinite(restart.parameters))
 
 

@@ -13,6 +13,7 @@ from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.whitening import Whitener
+from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.record.channels import DiagnosisError
 from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
 from sprung.model.diagnosis.response.point import Point
@@ -36,6 +37,7 @@ def baseline(
     split: int,
     rules: Rules = RULES,
     memory: FitMemory | None = None,
+    work: WorkBudget | None = None,
     *,
     roughly: bool = False,
 ) -> tuple[Problem, Fit]:
@@ -46,7 +48,7 @@ def baseline(
     """
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
-            problem, fit = _begun(system, signals, declared, split, rules, memory)
+            problem, fit = _begun(system, signals, declared, split, rules, memory, work)
             if not roughly:
                 problem, fit = refreshed(problem, fit)
     except (np.linalg.LinAlgError, FloatingPointError):
@@ -57,12 +59,18 @@ def baseline(
 
 
 def _begun(
-    system: System, signals: Signals, declared: Noise, split: int, rules: Rules, memory: FitMemory | None
+    system: System,
+    signals: Signals,
+    declared: Noise,
+    split: int,
+    rules: Rules,
+    memory: FitMemory | None,
+    work: WorkBudget | None,
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
-    problem = Problem(system, part, signals.sensor_index, noise, rules, memory)
+    problem = Problem(system, part, signals.sensor_index, noise, rules, memory, work)
     start = Point(np.zeros(len(system.parameters)), given_terms(system), np.zeros(0))
     start = replace(start, state=np.zeros(problem.forward(start).plant.structure.states))
     if len(noise.force):

@@ -105,6 +105,8 @@ class _Sensitivities:
 
 def linearise(problem: Problem, point: Point, working: Working) -> Linearised:
     """Residual and sensitivities at a point."""
+    if problem.work is not None:
+        problem.work.add(problem.part.grid.samples)
     shown, forward, forces = problem.predict(point, working.inputs, working.plant)
     return Linearised(problem, point, working, forward, forces, shown, problem.free_columns(forward))
 

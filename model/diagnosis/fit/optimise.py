@@ -123,7 +123,9 @@ class _State:
 
 
 def try_optimise(problem: Problem, start: Point, iterations: int, whitener: Whitener | None = None) -> Fit | None:
-    """A fit that may diverge: None where it does."""
+    """A fit that may diverge: None where it does, or where no work is left for it."""
+    if problem.worked_out:
+        return None
     try:
         with np.errstate(all="ignore"):  # what diverges is judged by its chi-square
             fit = optimise(problem, start, iterations=iterations, whitener=whitener)
@@ -147,7 +149,13 @@ def optimise(
     """
     if problem.memory is None:
         return _optimised(problem, start, iterations, tolerance, whitener)
-    others = (iterations, tolerance, problem.rules.fit.prior, None if whitener is None else whitener.factor)
+    others = (
+        iterations,
+        tolerance,
+        problem.patient,
+        problem.rules.fit.prior,
+        None if whitener is None else whitener.factor,
+    )
     key = key_of(problem.system, problem.part, problem.noise, start, *others)
     known: Fit = problem.memory.recall(key, lambda: _optimised(problem, start, iterations, tolerance, whitener))
     return known

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.fit.memory import FitMemory
+from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
@@ -41,11 +42,18 @@ class Problem:
     noise: Noise
     rules: Rules = RULES  # by which fits to it are judged
     memory: FitMemory | None = None  # fits that are known already
+    work: WorkBudget | None = None  # what fits may cost; None: any
+    patient: bool = True  # whether loops of laws and motion are solved however long that takes
 
     @property
     def process_noise(self) -> bool:
         """Whether laws act along the motion that the sensors saw: a measured force may lack what nobody measured."""
         return self.noise.process_noise
+
+    @property
+    def worked_out(self) -> bool:
+        """Whether the budget of work is spent: nothing more is tried."""
+        return self.work is not None and self.work.ended
 
     def forward(self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None) -> Forward:
         """The model at a point under the measured inputs, or under smoothed ones.
@@ -53,7 +61,7 @@ class Problem:
         known: the plant of a model nearby, often the same.
         """
         part = self.part if inputs is None else inputs.part
-        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known)
+        return Forward(self.system, part, self.sensors, point.theta, point.terms, point.warm_start, known, self.patient)
 
     def predict(
         self, point: Point, inputs: SmoothedInputs | None = None, known: Plant | None = None

@@ -9,6 +9,7 @@ from typing import Protocol
 from sprung.model.diagnosis.fit.memory import FitMemory
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
+from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict
 from sprung.model.diagnosis.record.channels import Prepared
@@ -46,10 +47,12 @@ class Options:
     alpha: float = 1e-3  # chance of a false finding per recording before the held-out check
     train_share: float = 0.7  # of the recording, from its start
     most_findings: int = 4
+    unnamed: bool = True  # whether forces without a name, and their formulas, are sought, too
     file: str = ""  # name of the recording, for the report
     catalogue: tuple[Law, ...] = CATALOGUE
     rules: Rules = RULES  # every number that decides
     memory: FitMemory | None = None  # of the same recording's earlier diagnoses
+    work: WorkBudget | None = None  # what its fits may cost; None: as the rules say
 
 
 @dataclass(frozen=True)
@@ -156,6 +159,7 @@ class Judgement:
     strange: float | None  # error over the signal of a model that does not describe the recording
     lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
     parts: int  # changes of the structure that were needed, where they are too many to be believed; else 0
+    ended: bool  # the search ended at its budget of work
     carried: bool  # the findings carry the verdict: what they explain outweighs what they leave
     place: str  # where most of what is left is seen
     where: str  # the same in words, with size and frequencies; empty where nothing is left

@@ -9,6 +9,8 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.fit.work import WorkBudget
+from sprung.model.diagnosis.investigation.by_names import by_names
 from sprung.model.diagnosis.investigation.course import (
     Found,
     InputFault,
@@ -24,7 +26,12 @@ from sprung.model.diagnosis.investigation.formula import formula_of, left
 from sprung.model.diagnosis.investigation.formula_doubt import missing
 from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
-from sprung.model.diagnosis.investigation.judgement import another_structure, judged, unmeasured_share
+from sprung.model.diagnosis.investigation.judgement import (
+    another_structure,
+    judged,
+    leaves_more_than_noise,
+    unmeasured_share,
+)
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
@@ -34,6 +41,7 @@ from sprung.model.diagnosis.investigation.widened import (
     tried_wider,
     widest,
     with_wider,
+    with_wider_rivals,
 )
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
@@ -63,13 +71,18 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
     """Finding after finding until the rest is noise."""
     # what a delay, scale or position leaves, estimated as it is, is no physics
     uncertain = any(fault.value is not None for fault in state.setup_faults)
-    for number in range(0 if uncertain else state.options.most_findings):
-        count, before = len(state.found), state.fit
+    for number in range(len(state.found), 0 if uncertain else state.options.most_findings):
+        before = state
         state = _next_finding(state, number, tell)
-        if len(state.found) == count:
+        if state.problem.worked_out:
+            tell(0.92, "the budget of work is spent: no further candidate is fitted")
+        if len(state.found) == len(before.found):
             break
+        if not state.found[-1].trial.named:
+            tell(0.3 + 0.17 * number, "laws with names in the place of a force without")
+            state = by_names(before, state, lambda plain: with_findings(plain, tell))
         state = without_idle(state)
-        if _still_strange(state, before) or another_structure(state):
+        if _still_strange(state, before.fit) or another_structure(state):
             break  # what comes next would be names for what another structure does
     return state
 
@@ -109,6 +122,7 @@ def under(state: Investigation, rules: Rules) -> Investigation:
 def begun(system: System, record: Recorded, options: Options, tell: Progress) -> Investigation:
     """The nominal structure on the recording, with faulty inputs compensated, and its held-out part."""
     tell(0.02, "channels and noise")
+    options = replace(options, work=options.work or WorkBudget(options.rules.fit.work))
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
     signals, split = cut(prepared.signals, options.train_share)
     declared = declared_noise(system, signals, options.rules.record)
@@ -173,7 +187,7 @@ def _on_everything(state: Investigation) -> Fit:
     """The model fitted to the whole recording, once it has been judged; the first part's where that diverges."""
     differentiated = drifting(state.system, state.signals.sensor_index)
     part = transform(state.signals, state.problem.noise, differentiated=differentiated)
-    problem = replace(state.problem, part=part)
+    problem = replace(state.problem, part=part, work=None)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
     most = state.options.rules.acceptance.astray * state.fit.reduced
     return fit if fit is not None and fit.reduced < most else state.fit
@@ -190,6 +204,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
             h
             for h in hits
             if h.family is not INPUT
+            and (options.unnamed or h.term.law.named)
             and not _repeats(state, h)
             and not _hopeless(state, h)
             and harmonic(state.problem.part, h.term, plausible) is None
@@ -208,6 +223,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         return state
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
+    tried = with_wider_rivals(state, tried)
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
     worthy = [t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)]
     plain = [t for t in worthy if any(t is one for one in believed)]
@@ -274,7 +290,7 @@ def _with_formula(state: Investigation, plain: list[Trial], trials: list[Trial])
     that is far more likely.
     """
     leader = _led_by(state, plain)
-    if leader is None or state.problem.process_noise:
+    if leader is None or state.problem.process_noise or not state.options.unnamed:
         return trials, ()
     with np.errstate(all="ignore"):  # trial formulas overflow
         formula, reason = formula_of(state.problem, state.fit, leader, state.held)
@@ -367,8 +383,14 @@ def _minor(state: Investigation, trial: Trial) -> bool:
             if trial.worth < min(rules.minor_beside * found.trial.worth, rules.most_left * left):
                 return True
         elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index, found.trial.term.law):
-            return True
+            return not _explains_the_rest(state, trial)
     return False
+
+
+def _explains_the_rest(state: Investigation, trial: Trial) -> bool:
+    """Whether a small second law explains most of what is left where that is far more than noise: no inaccuracy."""
+    most = trial.worth > state.options.rules.verdict.carried * state.fit.chi_square
+    return most and leaves_more_than_noise(state)
 
 
 def _takes_up(state: Investigation, trial: Trial) -> bool:

@@ -24,7 +24,7 @@ def nominal(
 ) -> Nominal:
     """The nominal structure on the first `split` samples, and all candidates (or those of `laws`) screened on its
     residual."""
-    problem, fit = baseline(system, signals, declared, split, options.rules, options.memory)
+    problem, fit = baseline(system, signals, declared, split, options.rules, options.memory, options.work)
     return Nominal(signals, problem, fit, screen(problem, fit, laws or options.catalogue, options.project))
 
 

@@ -48,7 +48,8 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
     verdict = verdict_of(kinds + physics, deciding, rules)
     other = another_structure(state, deciding)
-    verdict = "unknown_physics" if other else verdict
+    ended = state.problem.worked_out  # what was not tried may well have been there
+    verdict = "unknown_physics" if other or (ended and verdict == "consistent") else verdict
     strange = float(np.sqrt(np.mean(deciding.after**2)))
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
@@ -59,9 +60,20 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
         parts=changed_parts(state) if other else 0,
         lost_phase=lost,
         carried=carried,
+        ended=ended,
         place=_place(state),
         where=_words(state, errors, after),
     )
+
+
+def leaves_more_than_noise(state: Investigation) -> bool:
+    """Whether the findings so far leave what a verdict would call unexplained."""
+    run = state.held.run(state.fit.point)
+    size = np.sqrt(np.mean(run.measured**2, axis=0))
+    expected = state.held.noise_rms(state.fit, bounded(state)) / np.where(size > 0, size, 1.0)
+    rules = state.options.rules.verdict
+    errors = HeldOutErrors(run.per_sensor, run.per_sensor, realised_floor(expected, run, rules))
+    return bool(np.any(errors.unexplained(rules) > 0))
 
 
 def changed_parts(state: Investigation) -> int:

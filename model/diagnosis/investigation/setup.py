@@ -130,10 +130,12 @@ def _best(
     accepted: list[_Accepted] = []
     for ranked in _ranked(system, signals, problem, fit, total):
         for hypothesis in _seen_on_a_stretch(ranked, system, signals, declared, problem):
+            if problem.worked_out:
+                return None
             changed, mended = hypothesis.undo(system, signals)
             try:
                 fitted = fitted_samples(signals, mended, split)
-                other, again = baseline(changed, mended, declared, fitted, problem.rules, problem.memory)
+                other, again = baseline(changed, mended, declared, fitted, problem.rules, problem.memory, problem.work)
             except DiagnosisError:
                 continue
             left = _left(again)
@@ -168,7 +170,8 @@ def _seen_on_a_stretch(
         if 2 * mended.samples < stretch.samples:
             return 0.0  # a delay that takes most of it: only the whole recording tells
         try:
-            return _left(baseline(changed, mended, declared, mended.samples, problem.rules, roughly=True)[1])
+            begun = baseline(changed, mended, declared, mended.samples, problem.rules, work=problem.work, roughly=True)
+            return _left(begun[1])
         except DiagnosisError:
             return np.inf
 
@@ -244,6 +247,6 @@ def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
         value = effect.further(value, change)
         system, mended = effect.remainder(fault.site, change)(system, signals)
         split, signals = fitted_samples(signals, mended, split), mended
-        problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory)
+        problem, fit = baseline(system, signals, declared, split, problem.rules, problem.memory, problem.work)
     std *= value if effect.relative else 1.0
     return replace(fault, value=value, std=std, after=_left(fit)), system, signals, problem, fit

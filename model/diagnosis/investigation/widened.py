@@ -19,8 +19,9 @@ from sprung.model.diagnosis.investigation.course import Investigation, TriedWide
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term
+from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.compete import Trial
+from sprung.model.diagnosis.selection.compete import Trial, compete, graded
 from sprung.model.diagnosis.selection.evidence import occam_cost, profile_gain
 from sprung.model.diagnosis.selection.plausible import doubt
 from sprung.model.laws import ElementLaw, Observed, observe
@@ -100,6 +101,23 @@ def act_together(state: Investigation) -> bool:
     """Whether several laws were found at one element, whose forces may be no mere sum."""
     places = [found.trial.term.location for found in state.found if isinstance(found.trial.term.law, ElementLaw)]
     return len(set(places)) < len(places)
+
+
+def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
+    """Trials with the wider forms of the best of them at elements where a law was found already.
+
+    Beside a stop, valves that differ in the two directions are told as friction sooner than as valves that do not.
+    """
+    taken = {found.trial.term.location for found in state.found}
+    beside = [trial for trial in trials if trial.finished and trial.evidence > 0 and trial.term.location in taken]
+    hits: list[Candidate] = []
+    for trial in beside:
+        starts = list(_starts(trial.fit, len(trial.fit.point.terms) - 1))
+        if starts and len({hit.effect for hit in hits}) < state.options.rules.selection.wider:
+            hits += [replace(trial.hit, term=start.terms[-1], start=start) for start in starts]
+    if not hits or state.problem.process_noise:
+        return trials
+    return graded(state.problem, state.fit, [*trials, *compete(state.problem, state.fit, hits)])
 
 
 def _widened(state: Investigation, index: int) -> Fit | None:

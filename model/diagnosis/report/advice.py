@@ -7,6 +7,11 @@ import numpy as np
 from sprung.model.diagnosis.investigation.course import Investigation, Outcome
 from sprung.model.diagnosis.report.values import deviations
 
+ENDED = (
+    "the search ended at its budget of work: more candidates were left to be fitted, and what is still unexplained "
+    "may have a name; a shorter recording, or one with fewer samples a second, is searched to the end"
+)
+
 
 def nothing_fits(outcome: Outcome, strange: float) -> str:
     """That the system file does not describe the recording, and the likeliest reasons."""

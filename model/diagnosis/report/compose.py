@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.diagnosis.investigation.course import Investigation, Outcome, Recorded
-from sprung.model.diagnosis.report.advice import nothing_fits, undecided
+from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
 from sprung.model.diagnosis.report.report import (
@@ -30,6 +30,8 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         advice.insert(0, nothing_fits(outcome, said.strange))
     elif said.lost_phase and not course.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
+    if said.ended:
+        advice.insert(0, ENDED)
     explained = said.errors.explained() if course.found else None
     left = said.errors.unexplained()
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), said.where)
@@ -142,4 +144,6 @@ def _summary(outcome: Outcome, findings: list[Finding], explained: float | None)
         text += f"; explains {share} % of the excess error"
         if said.where:
             text += f"; still unexplained: {said.where}"
+    if said.ended:
+        text += "; the search ended at its budget of work"
     return text + "."

@@ -48,13 +48,14 @@ def _unknown_finding(outcome: Outcome) -> Finding:
     if course.found:
         names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in course.found)
         tried = f"; {names} would explain too little of it"
+    left = f"a misfit that no law explains: {said.where}" if said.where else "candidates that were not fitted"
     return Finding(
         location=said.place,
         effect=UNKNOWN,
         parameters=(),
         p_value=None if best is None else course.last.p_value(best),
         delta_bic=None,
-        sentence=f"a misfit that no law explains: {said.where}{tried}",
+        sentence=f"{left}{tried}",
     )
 
 

@@ -16,6 +16,7 @@ from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray, detrend_ends
 from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
+from sprung.model.diagnosis.response.newton import PATIENCE, newton_step
 from sprung.model.diagnosis.response.structure import Structure
 from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
@@ -59,6 +60,7 @@ class Forward:
     terms: tuple[Term, ...] = ()
     start_force: tuple[FloatArray, ...] = ()  # forces of a nearby solution, to start the iteration from
     known: Plant | None = None  # of a model nearby, taken where its structure is the same
+    patient: bool = True  # whether loops that do not settle are solved by Newton's steps
 
     @cached_property
     def plant(self) -> Plant:
@@ -282,7 +284,14 @@ class Forward:
         if loop is None:
             return None
         start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
-        return loop.answer(*fixed_point(lambda force: loop.law(*loop.motion(force)), start, tolerance))
+        force, settled = fixed_point(lambda force: loop.law(*loop.motion(force)), start, tolerance)
+        if settled or not self.patient or self.plant.floats:
+            return loop.answer(force, settled)
+        for begin in (start,) if self.start_force else (start, np.zeros_like(start)):
+            found, settled = fixed_point(newton_step(loop), begin, tolerance, PATIENCE)
+            if settled:
+                return loop.answer(found)
+        return loop.answer(force, converged=False)
 
     def loop(self, state: FloatArray) -> HarmonicBalance | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""

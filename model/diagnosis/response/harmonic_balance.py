@@ -153,7 +153,10 @@ class HarmonicBalance:
 
 
 def fixed_point(
-    step: Callable[[FloatArray], FloatArray], start: FloatArray, tolerance: float = TOLERANCE
+    step: Callable[[FloatArray], FloatArray],
+    start: FloatArray,
+    tolerance: float = TOLERANCE,
+    patience: int = _PATIENCE,
 ) -> tuple[FloatArray, bool]:
     """f = step(f) by Anderson acceleration; returns the best point and whether the tolerance was met."""
     shape = start.shape
@@ -171,7 +174,7 @@ def fixed_point(
         if size <= tolerance * max(float(np.linalg.norm(image)), 1e-300):
             return image.reshape(shape), True
         sizes.append(best_size)
-        if iteration >= _PATIENCE and best_size > _PROGRESS * sizes[-_PATIENCE]:
+        if iteration >= patience and best_size > _PROGRESS * sizes[-patience]:
             break
         x = history.mixed(image, residual)
         image = step(x.reshape(shape)).ravel()

@@ -180,6 +180,7 @@ def _begun(problem: Problem, base: Fit, hit: Candidate, again: bool = False) -> 
 
     again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
     """
+    problem = replace(problem, patient=False)
     starts = starts_of(problem, base, hit)
     tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)

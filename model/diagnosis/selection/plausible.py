@@ -22,6 +22,8 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str 
     reason = out_of_range(term)
     if reason is not None:
         return reason
+    if isinstance(term.law, ElementLaw) and term.law.corner is not None and _saturates(fit, term, rules):
+        return "its corner is as wide as the rates of the motion: a damper that saturates"
     if isinstance(term.law, ElementLaw) and term.law.knees:
         return _unresolved(fit, term, rules)
     if isinstance(term.law, (BodyLaw, SupportLaw)):
@@ -37,6 +39,13 @@ def out_of_range(term: Term) -> str | None:
             unit = "" if spec.unit == "1" else f" {spec.unit}"
             return f"{spec.name} {value:.3g}{unit} lies outside {low:g} to {high:g}"
     return None
+
+
+def _saturates(fit: Fit, term: Term, rules: PlausibleRules) -> bool:
+    """Whether a force that should change its sign at once does so over most of the rates that there are."""
+    corner = term.element_law.corner
+    rate = fit.element_motion[1] @ term.port(fit.forward.system)
+    return corner is not None and term.parameters[corner] > rules.corner * float(np.std(rate))
 
 
 def _unresolved(fit: Fit, term: Term, rules: PlausibleRules) -> str | None:

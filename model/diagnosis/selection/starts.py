@@ -88,7 +88,8 @@ def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
     element, read = problem.system.elements.index(location), base.forward.element_at(location)
     nominal = next(p.nominal for p in problem.system.parameters if p.name == f"{location}.damping")
     deflection, rate = (motion[:, element] for motion in base.element_motion)
-    return FittedElement(float(read.stiffness), float(read.damping), nominal, float(np.std(rate) / np.std(deflection)))
+    k, c, speed = float(read.stiffness), float(read.damping), float(np.std(rate))
+    return FittedElement(k, c, nominal, speed / float(np.std(deflection)), speed)
 
 
 def alike_starts(base: Fit, hit: Candidate) -> list[Point]:

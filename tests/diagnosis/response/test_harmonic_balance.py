@@ -34,6 +34,18 @@ def test_forces_are_the_laws_along_the_motion_that_they_shape(k3: float) -> None
     np.testing.assert_allclose(forces.force[:, 0], expected, atol=2e-5 * np.max(np.abs(expected)))
 
 
+def test_a_stop_that_is_hit_all_the_time_is_solved_by_newtons_steps() -> None:
+    stop = Term(find_law("bump_stop"), "secondary", (2e-3, 1.45e6), scales=(1e-3, 5e5))
+    point = Point(np.zeros(len(PROBLEM.system.parameters)), (stop,), np.zeros(4))
+    forward = PROBLEM.forward(point)
+    loop = forward.loop(point.state)
+    assert not replace(forward, patient=False).law_forces(point.state).converged
+    forces = forward.law_forces(point.state)
+    assert forces.converged
+    expected = loop.law(forces.deflection, forces.rate)
+    np.testing.assert_allclose(forces.force, expected, atol=1e-4 * np.max(np.abs(expected)))
+
+
 def test_the_answer_to_a_weak_law_grows_with_it() -> None:
     weak, double = solved(1e6), solved(2e6)
     np.testing.assert_allclose(double.sensors, 2 * weak.sensors, atol=1e-3 * np.max(np.abs(weak.sensors)))

@@ -1,0 +1,32 @@
+"""A search that ends at its budget says so, and is no all-clear."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.fit.optimise import try_optimise
+from sprung.model.diagnosis.fit.work import WorkBudget
+from sprung.model.diagnosis.response.point import Point
+from tests.diagnosis_cases import problem_of, quarter_car, simulate
+
+
+def test_a_search_without_any_work_left_is_not_consistent() -> None:
+    said: list[str] = []
+    options = Options(work=WorkBudget(0.0))
+    report = diagnose(quarter_car(), simulate(seconds=6, seed=4), options, lambda share, text: said.append(text))
+    assert report.verdict == "unknown_physics"
+    assert "ended at its budget" in report.summary and "ended at its budget" in report.advice[0]
+    assert any("budget" in text for text in said)
+
+
+def test_work_is_counted_and_nothing_more_is_fitted_once_it_is_done() -> None:
+    work = WorkBudget(1e9)
+    problem = replace(problem_of(simulate(seconds=4, seed=4)), work=work)
+    start = Point(np.zeros(len(problem.system.parameters)), (), np.zeros(4))
+    assert try_optimise(problem, start, 2) is not None
+    assert work.done > 0 and not work.ended
+    work.most = work.done
+    assert work.ended and try_optimise(problem, start, 2) is None
