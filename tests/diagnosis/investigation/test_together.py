@@ -15,7 +15,7 @@ from sprung.model.diagnosis.investigation.by_names import by_names
 
 
 @dataclass(frozen=True)
-class _State:
+class _Stand:
     """What `by_names` reads of an investigation: a fit that leaves `left` times the noise."""
 
     left: float
@@ -46,10 +46,10 @@ def test_laws_with_names_stand_where_they_leave_next_to_nothing(left: float, ref
 
     def search(state: Any) -> Any:
         asked.append(state.options.unnamed)
-        return _State(left, ("valve", "stop"), options=state.options)
+        return _Stand(left, ("valve", "stop"), options=state.options)
 
-    unnamed: Any = _State(1.0, ("surface",), refuted)
-    chosen: Any = by_names(_State(40.0), unnamed, search)  # type: ignore[arg-type]
+    unnamed: Any = _Stand(1.0, ("surface",), refuted)
+    chosen: Any = by_names(_Stand(40.0), unnamed, search)  # type: ignore[arg-type]
     assert asked == [False]
     assert (chosen.found == ("valve", "stop")) is taken
     assert chosen.options.unnamed
