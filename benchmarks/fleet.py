@@ -34,7 +34,6 @@ from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
 from sprung.service.pipeline import Pipeline
 from sprung.service.reading import Here, ReadRequest
 from sprung.service.settings import Settings
-from sprung.service.threads import one_thread_each
 
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns
@@ -58,7 +57,6 @@ def run(
     recordings, seconds: of identity and scaling; workers: Ray's cores; minutes: of chaos, and of many vehicles in
     ingest (0: none); every: s between kills; together: windows in a request of ingest, by default one, then ten.
     """
-    one_thread_each()
     if part not in PARTS:
         raise UserError(f"bench fleet: no part {part!r}; known are {', '.join(PARTS)}")
     if part in ("identity", "quick"):

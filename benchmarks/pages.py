@@ -32,7 +32,6 @@ from sprung.service.settings import Settings
 from sprung.service.store import fleet, status
 from sprung.service.store.schema import rollups
 from sprung.service.store.windows import pack
-from sprung.service.threads import one_thread_each
 from sprung.service.times import NANOSECONDS, now_ns
 
 VEHICLE = "car-0099"  # the first that is out of specification
@@ -44,7 +43,6 @@ LISTS = ("/", "/?page=20", "/?q=car-1", "/?health=out_of_specification", "/vehic
 
 def run(vehicles: int = 2000, requests: int = 100, seed: int = 1) -> Iterator[dict[str, Any]]:
     """Figures: latencies of the fleet's lists, bytes of a vehicle's page, a month of every parameter."""
-    one_thread_each()  # as the command does; the server inherits it
     with tempfile.TemporaryDirectory(prefix="sprung-bench-") as folder:
         last = filled(Path(folder), vehicles, seed)
         with _served(folder) as port:

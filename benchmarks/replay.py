@@ -16,8 +16,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from sprung.service.threads import one_thread_each
-
 RECORDING = Path(__file__).resolve().parents[1] / "tests" / "data" / "drift-600s.blf"
 TARGET = 100.0  # times real time
 
@@ -32,7 +30,6 @@ print(json.dumps(one_run(Path(sys.argv[1]), sys.argv[2], int(sys.argv[3]), begun
 
 def run(recording: Path = RECORDING, *, repeats: int = 3, lengths: str = "1,10") -> Iterator[dict[str, Any]]:
     """Figures; `lengths`: how often the recording is played for the memory figures."""
-    one_thread_each()  # as the command does; the children inherit it
     runs = [_child(recording, 1) for _ in range(repeats)]
     best = min(runs, key=lambda r: r["seconds"])
     recorded = best["recorded_seconds"]

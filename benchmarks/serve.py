@@ -23,7 +23,6 @@ import numpy as np
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
-from sprung.service.threads import one_thread_each
 
 TARGET_MS = 15.0
 WARM_UP = 20
@@ -31,7 +30,6 @@ WARM_UP = 20
 
 def run(requests: int = 300, *, clients: int = 32, seconds: float = 5.0) -> Iterator[dict[str, Any]]:
     """Figures: latencies one request after the other, then throughput with several clients."""
-    one_thread_each()  # as the command does; the servers inherit it
     system = load_system()
     body = window_body(system)
     context = multiprocessing.get_context("spawn")

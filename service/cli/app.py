@@ -388,6 +388,7 @@ def bench(
     name: Annotated[str | None, typer.Argument(help="Without a name, all benchmarks are listed.")] = None,
 ) -> int:
     """A benchmark, one JSON line per figure; further arguments go to it (--budget full, --data DIR)."""
+    one_thread_each()  # as the commands that it measures do; before anything numerical is loaded
     from sprung.service.cli.bench import run
 
     return run(name, context.args)
