@@ -42,4 +42,4 @@ def _left(state: Investigation, judge: Investigation) -> float:
     fit = state.fit
     residual = judge.fit.whitener(fit.spectrum, judge.problem.part)
     reduced = float(residual @ residual) / max(1, fit.count - fit.jacobian.shape[1])
-    return max(0.0, reduced - noise_bound(judge.problem, fit))
+    return float(max(0.0, reduced - noise_bound(judge.problem, fit)))
