@@ -7,14 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import (
-    ComponentFit,
-    covariance,
-    fitted,
-    left_open,
-    refined,
-    spread,
-)
+from sprung.model.diagnosis.component.alike import Alike, look_alikes
+from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
+from sprung.model.diagnosis.component.fit import ComponentFit, fitted, refined
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
@@ -81,9 +76,14 @@ class Judged:
 
     @cached_property
     def covariance(self) -> tuple[FloatArray, list[str]]:
-        """Covariance of what the final model has, with what noise and sampling of the motion leave open, and names."""
+        """Covariance of what the final model has, with what the record leaves open besides chance, and names."""
         full, names = covariance(self.final)
-        return (full + left_open(self.final) if self.named and self.found.steps else full), names
+        return full + left_open(self.final, [one.moved for one in self.alike]), names
+
+    @cached_property
+    def alike(self) -> tuple[Alike, ...]:
+        """What the record does not tell from the laws that are named."""
+        return look_alikes(self.final, self.found.steps if self.named else (), len(self.record.given.pieces))
 
     @property
     def errors(self) -> HeldOutErrors:
@@ -268,18 +268,19 @@ def _findings(one: Judged) -> list[Finding]:
         findings.append(reversed_finding(one.record.sensor, one.record.element))
     for index, step in enumerate(one.found.steps if one.named else (), len(one.record.given.pieces)):
         sigma = spread(one.final, index, full, names)
+        others = [other.effect for other in one.alike if other.index == index]
         if isinstance(one.final.model.pieces[index], Lag):
             late, std = one.final.model.late, float(sigma[0][0])
-            findings.append(late_finding(one.record.sensor, one.record.element, late, std, step))
+            findings.append(late_finding(one.record.sensor, one.record.element, late, std, step, others))
         else:
-            findings.append(finding_of(one.record.element, one.final, one.base, index, step, sigma))
+            findings.append(finding_of(one.record.element, one.final, one.base, index, step, sigma, others))
     first = None if one.named else next(iter(one.found.steps), None)
     unnamed = one.surface or first
     if unnamed is not None:
         findings.append(unknown_finding(one.record.element, unnamed, one.found.steps, mapped=one.surface is not None))
-    deviation = float(np.sqrt(max(full[0, 0], 0.0)))
+    deviation, by_chance = (float(np.sqrt(max(of[0, 0], 0.0))) for of in (full, covariance(one.final)[0]))
     sign = -1.0 if one.reversed else 1.0
-    least = one.final.task.rules.preload * max(deviation, one.floor / np.sqrt(one.record.task.split))
+    least = one.final.task.rules.preload * max(by_chance, one.floor / np.sqrt(one.record.task.split))
     if abs(one.final.preload) > least:
         findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
     return findings

@@ -1,12 +1,4 @@
-"""A component's force fitted to a record: strengths by linear least squares, shapes around them.
-
-Uncertainty: errors that repeat with every cycle of a test do not average out, so the covariance is the sandwich
-
-    (J^T J)^-1  [sum over bins of J_f^H J_f |r_f|^2]  (J^T J)^-1
-
-with the residual's raw periodogram |r_f|^2 (White 1980, in the frequency domain), which counts an error at a test's
-own frequency with its full size; never less than what white noise of the residual's level would give.
-"""
+"""A component's force fitted to a record: strengths by linear least squares, shapes around them."""
 
 from __future__ import annotations
 
@@ -27,7 +19,6 @@ from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
 _ENOUGH = 1e-6  # change of the squares, or of the shapes, at which it ends: far below any deviation
-_RELATIVE = 1e-4  # steps of finite differences
 _KEPT = 2_500_000  # samples of columns that a task remembers: rounds of trials and refinements ask for them again
 
 
@@ -120,6 +111,13 @@ class ComponentModel:
     def without(self, index: int) -> ComponentModel:
         keep = [i for i in range(len(self.pieces)) if i != index]
         return ComponentModel(tuple(self.pieces[i] for i in keep), tuple(self.shapes[i] for i in keep))
+
+    def replaced(self, index: int, piece: Part, shape: tuple[float, ...]) -> ComponentModel:
+        """With another law in one place."""
+        return ComponentModel(
+            (*self.pieces[:index], piece, *self.pieces[index + 1 :]),
+            (*self.shapes[:index], shape, *self.shapes[index + 1 :]),
+        )
 
     @property
     def late(self) -> float:
@@ -275,103 +273,3 @@ def refined(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     )
     best, first = fitted(task, at(found.x)), fitted(task, model)
     return best if best.error <= first.error else first
-
-
-def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
-    """Covariance of preload, k, c (where free), strengths and shapes, in this order, and their names."""
-    task, model = fit.task, fit.model
-    base, free, _ = task.delayed(model.late).linear
-    columns = np.column_stack([base, model.columns(task)])[: task.split]
-    motion, moved = task.motion.delayed(model.late), []
-    for i, (piece, shape) in enumerate(zip(model.pieces, model.shapes, strict=True)):
-        for j in range(len(shape)):
-            step = _RELATIVE * max(abs(shape[j]), 1e-12) * 10
-            if isinstance(piece, Lag):
-                moved.append(_per_lag(fit)[: task.split])
-                continue
-            other = tuple(s + step * (k == j) for k, s in enumerate(shape))
-            change = (piece.columns(motion, other) - piece.columns(motion, shape)) @ fit.strengths_of(i)
-            moved.append(change[: task.split] / step)
-    jacobian = np.column_stack([columns, *moved]) if moved else columns
-    scale = np.linalg.norm(jacobian, axis=0)
-    scale[scale == 0] = 1.0
-    jacobian = jacobian / scale
-    residual = fit.residual[: task.split]
-    inverse = np.linalg.pinv(jacobian.T @ jacobian, rcond=1e-10, hermitian=True)
-    of_bins = np.fft.rfft(jacobian, axis=0, norm="ortho")
-    power = 2 * np.abs(np.fft.rfft(residual, norm="ortho")) ** 2
-    middle = np.real((of_bins.conj() * power[:, None]).T @ of_bins)
-    sandwich = inverse @ middle @ inverse
-    white = inverse * float(residual @ residual) / max(1, len(residual) - jacobian.shape[1])
-    grow = np.sqrt(np.maximum(np.diag(white) / np.maximum(np.diag(sandwich), 1e-300), 1.0))
-    full = sandwich * np.outer(grow, grow) / np.outer(scale, scale)
-    names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
-    return full, names
-
-
-def left_open(fit: ComponentFit) -> FloatArray:
-    """Squares of what the motion's noise and its sampling leave open, as `covariance` counts the numbers.
-
-    Both bias what is fitted along a measured motion.  As much noise again moves the numbers by about as much as what
-    is there has done (Cook and Stefanski 1994), half the samples by no less than what is missing between them.
-    """
-    task = fit.task
-    half = task.every(2)
-    others = [replace(task, motion=task.motion.noisier()), replace(half, motion=half.motion.undersampled())]
-    moved = [_numbers(refined(other, fit.model)) - _numbers(fit) for other in others]
-    found: FloatArray = sum(
-        (np.outer(change, change) for change in moved if np.all(np.isfinite(change))), np.zeros((len(moved[0]),) * 2)
-    )
-    return found
-
-
-def _numbers(fit: ComponentFit) -> FloatArray:
-    """Everything that is fitted, in the order of `covariance`."""
-    linear = np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
-    return np.concatenate([linear, fit.strengths, *(np.array(shape, dtype=float) for shape in fit.model.shapes)])
-
-
-def _per_lag(fit: ComponentFit) -> FloatArray:
-    """Derivative of the modelled force by the lag, N/s, (T,)."""
-    late, step = fit.model.late, _RELATIVE * fit.task.motion.step
-
-    def force(delay: float) -> FloatArray:
-        task = fit.task.delayed(delay)
-        linear = task.motion.deflection * fit.element.stiffness + task.motion.rate * fit.element.damping
-        pieces = zip(fit.model.pieces, fit.model.shapes, strict=True)
-        found = [piece.columns(task.motion, shape) for piece, shape in pieces]
-        return np.asarray(linear + np.column_stack([*found, np.zeros((len(linear), 0))]) @ fit.strengths)
-
-    return (force(late + step) - force(late)) / step
-
-
-def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations of a piece's law parameters and of what is quoted of it, by linear propagation."""
-    count = len(names)
-    at = count + sum(len(p.signs) for p in fit.model.pieces[:index])
-    own = list(range(at, at + len(fit.model.pieces[index].signs)))
-    first = count + len(fit.strengths) + sum(len(p.shapes) for p in fit.model.pieces[:index])
-    own += list(range(first, first + len(fit.model.pieces[index].shapes)))
-    linear = [names.index(name) for name in ("stiffness", "damping") if name in names]
-    block = full[np.ix_(own + linear, own + linear)]
-    piece, shape, strengths = fit.model.pieces[index], fit.model.shapes[index], fit.strengths_of(index)
-    start = np.concatenate([strengths, shape, [getattr(fit.element, names[i]) for i in linear]])
-
-    def values(x: FloatArray, what: str) -> FloatArray:
-        a, s = x[: len(strengths)], x[len(strengths) : len(strengths) + len(shape)]
-        of = dict(zip([names[i] for i in linear], x[len(strengths) + len(shape) :], strict=True))
-        element = SpringDamper(of.get("stiffness", fit.element.stiffness), of.get("damping", fit.element.damping))
-        return np.array([value for value, _ in getattr(piece, what)(a, s, element).values()])
-
-    result = []
-    for what in ("values", "quoted"):
-        centre = values(start, what)
-        gradient = np.zeros((len(centre), len(start)))
-        for j in range(len(start)):
-            step = _RELATIVE * max(abs(start[j]), 1e-9)
-            with np.errstate(over="ignore", invalid="ignore"):  # what a huge exponent leaves open is infinite
-                gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
-        with np.errstate(over="ignore", invalid="ignore"):
-            variance = np.diag(gradient @ block @ gradient.T) if len(centre) else centre
-        result.append(np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, np.inf), 0.0)))
-    return result[0], result[1]

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, covariance, refined, spread
+from sprung.model.diagnosis.component.deviations import covariance, spread
+from sprung.model.diagnosis.component.fit import ComponentModel, ComponentTask, refined
 from sprung.model.diagnosis.component.piece import HYSTERESIS, STATIC, Piece, Seen, Shape
 from sprung.model.diagnosis.component.search import Ranked, Search, Step, next_laws
 from sprung.model.diagnosis.rules import ComponentRules

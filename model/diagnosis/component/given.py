@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, spread
+from sprung.model.diagnosis.component.deviations import spread
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel
 from sprung.model.diagnosis.component.formula import given_piece
 from sprung.model.diagnosis.component.own import own_piece
 from sprung.model.diagnosis.component.piece import Piece

@@ -11,24 +11,19 @@ import numpy as np
 from sprung.model.diagnosis.component.fit import ComponentFit, fitted
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.component.pieces import PIECES
-from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
 
 _KNEES = (0.9, 1.1, 1.3, 1.5, 1.7, 1.9, 2.2)  # over the rate at which tanh turns: it levels off at 1.5
 
 
-def valve_as_well(fit: ComponentFit, index: int) -> str | None:
-    """The name of the valve that fits as well as the friction at `index` of a fit; None: none does, or it is none."""
+def low_valve(fit: ComponentFit, index: int) -> ComponentFit | None:
+    """With the best valve in place of the friction at `index` of a fit; None: none acts there, or it is no friction."""
     piece, task = fit.model.pieces[index], fit.task
     rival = piece.at_low_rates if isinstance(piece, Piece) else ""
     valve = next((other for other in PIECES if other.effect == rival), None)
     if valve is None:
         return None
     corner, (smoothing,) = task.seen.slowest_corner(task.motion), fit.model.shapes[index]
-    rest = fit.model.without(index)
     knees = [factor * smoothing for factor in _KNEES if factor * smoothing > corner]
-    others = [fitted(task, rest.plus(valve, (knee,))) for knee in knees]
+    others = [fitted(task, fit.model.replaced(index, valve, (knee,))) for knee in knees]
     best = min(others, key=lambda one: one.error, default=None)
-    if best is None or not np.any(best.strengths_of(len(rest.pieces))):
-        return None
-    behind = level_gain(best.error, fit.error, effective_count(fit.residual[: task.split]))
-    return valve.effect if behind < task.rules.naming_margin or best.at_noise else None
+    return best if best is not None and np.any(best.strengths_of(index)) else None

@@ -319,6 +319,17 @@ _GAS_SPRING = Piece(
     plain=1,
 )
 
+_FRACTIONAL = Piece(
+    _law("fractional_stiffness"),
+    ("order",),
+    lambda seen: grid([0.1, 0.2, 0.35, 0.55]),
+    lambda seen: [(0.03, 0.9)],
+    (1,),
+    lambda a, s, e: (a[0], s[0]),
+    lambda p: (p[1],),
+    plain=1,
+)
+
 # --- drift ------------------------------------------------------------------------------------------------------
 
 
@@ -355,6 +366,7 @@ PIECES: tuple[Piece, ...] = (
     _BUMP_STOP,
     _CLEARANCE,
     _GAS_SPRING,
+    _FRACTIONAL,
     _drift("time_varying_stiffness", "stiffness"),
     _drift("time_varying_damping", "damping"),
 )

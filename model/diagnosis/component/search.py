@@ -12,16 +12,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sprung.model.diagnosis.component.deviations import covariance, spread
 from sprung.model.diagnosis.component.fit import (
     NO_LAWS,
     ComponentFit,
     ComponentModel,
     ComponentTask,
     bounded_solution,
-    covariance,
     fitted,
     refined,
-    spread,
 )
 from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Following, Lag, LawPiece, Part
 from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
@@ -53,6 +52,7 @@ class Step:
     before: Ranked
     rivals: tuple[Ranked, ...]  # other laws in its place, best first
     p_value: float
+    forms: tuple[Ranked, ...] = ()  # other forms of the same law
 
     @property
     def gain(self) -> float:
@@ -215,12 +215,9 @@ def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> li
     return sorted(found, key=lambda t: t[0])[: rules.starts]
 
 
-def plausible(fit: ComponentFit) -> bool:
-    """Whether the last law's values are ones that it can have, and that the sampling resolves."""
-    return _plausible(fit, len(fit.model.pieces) - 1)
-
-
-def _plausible(fit: ComponentFit, index: int) -> bool:
+def plausible(fit: ComponentFit, index: int = -1) -> bool:
+    """Whether a law's values, the last one's, are ones that it can have, and that the sampling resolves."""
+    index %= len(fit.model.pieces)
     piece, strengths = fit.model.pieces[index], fit.strengths_of(index)
     if len(strengths) and not np.any(np.abs(strengths) > 0):
         return False
@@ -276,6 +273,7 @@ def _accepted(
         return None
     chosen, before = _plainest(near, rules), current
     rivals = tuple(r for r in ranked if r is not chosen and r.last.effect != chosen.last.effect)
+    forms = tuple(r for r in ranked if r is not chosen and r.last.effect == chosen.last.effect)
     freedom = chosen.fit.model.count - before.fit.model.count
     p_value = chance(chosen.gain, freedom, tests)
     if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
@@ -284,7 +282,7 @@ def _accepted(
         removed = before.fit.held_out - chosen.fit.held_out
         if not told or removed < max(rules.least_share * before.fit.held_out, rules.minor * base.held_out):
             return None
-    return Step(chosen, before, rivals, p_value)
+    return Step(chosen, before, rivals, p_value, forms)
 
 
 def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
@@ -334,5 +332,6 @@ def _renamed(steps: list[Step], current: Ranked, given: int, tests: int) -> list
         piece = model.pieces[index]
         p_value = chance(gain, len(piece.signs) + len(piece.shapes), tests)
         known = next((s for s in steps if s.chosen.last.effect == piece.effect), None)
-        result.append(Step(current, ranked, known.rivals if known else (), p_value))
+        others = (known.rivals, known.forms) if known else ((), ())
+        result.append(Step(current, ranked, others[0], p_value, others[1]))
     return result

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.formula import FormulaPiece
-from sprung.model.diagnosis.component.low_valve import valve_as_well
 from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
 from sprung.model.diagnosis.report.report import Finding, LawParameter
@@ -25,15 +25,21 @@ _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
 
 
 def finding_of(
-    element: str, fit: ComponentFit, base: ComponentFit, index: int, step: Step, sigma: tuple[FloatArray, FloatArray]
+    element: str,
+    fit: ComponentFit,
+    base: ComponentFit,
+    index: int,
+    step: Step,
+    sigma: tuple[FloatArray, FloatArray],
+    alike: Sequence[str],
 ) -> Finding:
-    """The finding of one law."""
+    """The finding of one law; alike: names of others that the recording does not tell from it."""
     piece = fit.model.pieces[index]
     values, quoted = _parameters(fit.values(index), sigma[0]), _parameters(fit.quoted(index), sigma[1])
     if piece.dissipates:
         quoted += (_loop_area(fit),)
     quoted += _forces_at_rates(fit)
-    family = _family(step, valve_as_well(fit, index))
+    family = _family(piece.effect, alike)
     rival = step.rivals[0] if step.rivals else None
     freedom = len(piece.signs) + len(piece.shapes)
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
@@ -83,16 +89,10 @@ def _parameters(values: Values, sigma: FloatArray) -> tuple[LawParameter, ...]:
     )
 
 
-def _family(step: Step, as_well: str | None = None) -> str | None:
-    """Laws that the recording cannot tell from the chosen one; as_well: one that was held against it alone."""
-    best = step.chosen
-    near = [
-        r.last.effect
-        for r in step.rivals
-        if r.evidence > best.evidence - best.fit.task.rules.naming_margin and r.last.effect != best.last.effect
-    ]
-    near += [as_well] if as_well is not None else []
-    return " or ".join([best.last.effect, *dict.fromkeys(near)]) if near else None
+def _family(effect: str, alike: Sequence[str]) -> str | None:
+    """A law and those that the recording does not tell from it; None: there are none."""
+    others = [other for other in dict.fromkeys(alike) if other != effect]
+    return " or ".join([effect, *others]) if others else None
 
 
 def _loop_area(fit: ComponentFit) -> LawParameter:
@@ -195,10 +195,10 @@ def reversed_finding(sensor: str, element: str) -> Finding:
     )
 
 
-def late_finding(sensor: str, element: str, value: float, sigma: float, step: Step) -> Finding:
+def late_finding(sensor: str, element: str, value: float, sigma: float, step: Step, alike: Sequence[str]) -> Finding:
     """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics."""
     size = LawParameter("time", abs(1e3 * value), 1e3 * sigma, "ms")
-    near, way = _family(step), "later" if value > 0 else "earlier"
+    near, way = _family(SENSOR_LAG.name, alike), "later" if value > 0 else "earlier"
     sentence = f"{sensor}: the force comes {value_words(size)} {way} than the motion of {element}"
     if near is not None:
         sentence += f" ({near.replace('_', ' ')} fit almost equally well)"

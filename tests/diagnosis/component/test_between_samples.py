@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentTask, covariance, fitted, left_open, refined
+from sprung.model.diagnosis.component.deviations import covariance, left_open
+from sprung.model.diagnosis.component.fit import NO_LAWS, ComponentTask, fitted, refined
 from sprung.model.diagnosis.component.motion import element_motion
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.laws.paths import presliding_path

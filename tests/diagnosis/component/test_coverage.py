@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks import naming
-from sprung.model.diagnosis.component.fit import ComponentModel, covariance, left_open, refined, spread
+from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
+from sprung.model.diagnosis.component.fit import ComponentModel, refined
 from sprung.model.diagnosis.component.measured import component_records
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.rules import RULES

@@ -1,0 +1,70 @@
+"""Laws that look alike to a record: what else may stand in the place of a law that was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sprung.model.diagnosis.component.deviations import moved_in_common
+from sprung.model.diagnosis.component.fit import ComponentFit, refined
+from sprung.model.diagnosis.component.low_valve import low_valve
+from sprung.model.diagnosis.component.search import Step, plausible
+from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Alike:
+    """A model with another law, or another form of one, in one place."""
+
+    index: int
+    fit: ComponentFit
+    found: ComponentFit  # the model that was found, on the same samples
+
+    @property
+    def effect(self) -> str:
+        return self.fit.model.pieces[self.index].effect
+
+    @property
+    def moved(self) -> FloatArray:
+        """By how much what both have in common differs."""
+        return moved_in_common(self.fit, self.found)
+
+
+def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple[Alike, ...]:
+    """What a record does not tell from the laws of a model, which were found in `steps` and begin at `first`.
+
+    Those of almost the same evidence.  Where a model leaves more than noise, it is not quite what is there, and the
+    evidence tells which of two wrong laws comes closer, not which is nearer to the truth: then those, too, that leave
+    hardly more.
+    """
+    task = final.task.every(max(1, len(final.task.force) // final.task.rules.search))
+    here, found = refined(task, final.model), []
+    for index, step in enumerate(steps, first):
+        valve = low_valve(here, index)
+        found += [Alike(index, valve, here)] if valve is not None and _as_well(valve, here) else []
+        near = step.chosen.evidence - task.rules.naming_margin
+        for other in (*step.rivals, *step.forms):
+            if other.evidence > near or _leaves(here):
+                model = final.model.replaced(index, other.last, other.fit.model.shapes[-1])
+                one = Alike(index, refined(task, model), here)
+                found += (
+                    [one] if other.evidence > near or (plausible(one.fit, index) and _as_well(one.fit, here)) else []
+                )
+    return tuple(found)
+
+
+def _leaves(found: ComponentFit) -> bool:
+    """Whether a model leaves more than noise."""
+    return min(found.error, found.held_out) > found.task.rules.above * found.floor**2
+
+
+def _as_well(other: ComponentFit, found: ComponentFit) -> bool:
+    rules, noise, task = found.task.rules, found.floor**2, found.task
+    behind = level_gain(other.error, found.error, effective_count(found.residual[: task.split]))
+    if behind < rules.naming_margin or other.at_noise:
+        return True
+    return _leaves(found) and all(
+        there - noise < rules.hardly_more * (here - noise)
+        for there, here in ((other.error, found.error), (other.held_out, found.held_out))
+    )

@@ -1,0 +1,212 @@
+"""How far the numbers of a fitted component may be from the truth, as the record itself shows it.
+
+Chance: errors that repeat with every cycle of a test do not average out, so the covariance is the sandwich
+
+    (J^T J)^-1  [sum over bins of J_f^H J_f |r_f|^2]  (J^T J)^-1
+
+with the residual's raw periodogram |r_f|^2 (White 1980, in the frequency domain), which counts an error at a test's
+own frequency with its full size; never less than what white noise of the residual's level would give, nor than the
+same sum over stretches of time, of which the loud ones alone have told the numbers and made the errors.
+
+What chance does not tell (`left_open`) is found by moving the numbers: noise and sampling of the motion, the part of
+the record that was not fitted, a force of no law as large as what is left, and laws that look alike.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, refined
+from sprung.model.diagnosis.component.piece import SURFACE, Lag
+from sprung.model.laws import SpringDamper
+from sprung.model.signals import FloatArray
+
+_RELATIVE = 1e-4  # steps of finite differences
+_SEEN = 1e-3  # of a column's size: less of it is not seen beside the laws
+_SETTLED = 1e-10  # of the largest singular value: directions below it are told by nothing
+
+
+def covariance(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
+    """Covariance of preload, k, c (where free), strengths and shapes, in this order, by chance; names of the first."""
+    task = fit.task
+    jacobian, names = _jacobian(fit)
+    train = slice(0, task.split)
+    scale, inverse = _normal(jacobian[train])
+    scaled, residual = jacobian[train] / scale, fit.residual[train]
+    power = 2 * np.abs(np.fft.rfft(residual, norm="ortho")) ** 2
+    of_bins = np.fft.rfft(scaled, axis=0, norm="ortho")
+    sandwich = inverse @ np.real((of_bins.conj() * power[:, None]).T @ of_bins) @ inverse
+    white = inverse * float(residual @ residual) / max(1, len(residual) - scaled.shape[1])
+    score = scaled * residual[:, None]
+    parts = np.array([part.sum(axis=0) for part in np.array_split(score, task.rules.stretches)])
+    stretches = inverse @ (parts.T @ parts) @ inverse
+    least = np.maximum(np.diag(white), np.diag(stretches))
+    grow = np.sqrt(np.maximum(least / np.maximum(np.diag(sandwich), 1e-300), 1.0))
+    full = sandwich * np.outer(grow, grow) / np.outer(scale, scale)
+    return full + np.diag(np.where(np.any(scaled, axis=0), 0.0, _sought(fit) ** 2)), names
+
+
+def _sought(fit: ComponentFit) -> FloatArray:
+    """The range in which every shape is sought, which is what is known of it where nothing depends on it; else 0."""
+    limits = [limit for piece in fit.model.pieces for limit in piece.limits(fit.task.seen)]
+    linear = int(fit.task.linear[1].sum()) + len(fit.strengths)
+    return np.concatenate([np.zeros(linear), [high - low for low, high in limits]])
+
+
+def _normal(jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Lengths of a Jacobian's columns, and (J^T J)^-1 of the columns of length one."""
+    scale = np.linalg.norm(jacobian, axis=0)
+    scale[scale == 0] = 1.0
+    unit = jacobian / scale
+    return scale, np.asarray(np.linalg.pinv(unit.T @ unit, rcond=_SETTLED, hermitian=True))
+
+
+def _jacobian(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
+    """Derivatives of the modelled force by everything that is fitted, (T, P), and the names of the first of it."""
+    task, model = fit.task, fit.model
+    base, free, _ = task.delayed(model.late).linear
+    motion, moved = task.motion.delayed(model.late), []
+    for i, (piece, shape) in enumerate(zip(model.pieces, model.shapes, strict=True)):
+        for j in range(len(shape)):
+            step = _RELATIVE * max(abs(shape[j]), 1e-12) * 10
+            if isinstance(piece, Lag):
+                moved.append(_per_lag(fit))
+                continue
+            other = tuple(s + step * (k == j) for k, s in enumerate(shape))
+            change = (piece.columns(motion, other) - piece.columns(motion, shape)) @ fit.strengths_of(i)
+            moved.append(change / step)
+    names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
+    return np.column_stack([base, model.columns(task), *moved]), names
+
+
+def left_open(fit: ComponentFit, alike: Sequence[FloatArray] = ()) -> FloatArray:
+    """Squares of what the record leaves open besides chance, as `covariance` counts the numbers.
+
+    alike: by how much laws that look alike move the numbers (`moved_in_common`).
+    """
+    jacobian, _ = _jacobian(fit)
+    moved = [*_by_motion(fit), _by_the_rest(fit, jacobian), *alike]
+    found: FloatArray = sum(
+        (np.outer(change, change) for change in moved if np.all(np.isfinite(change))),
+        np.zeros((jacobian.shape[1],) * 2),
+    )
+    return found + _by_what_is_left(fit, jacobian)
+
+
+def _by_motion(fit: ComponentFit) -> Iterator[FloatArray]:
+    """By the motion's noise and its sampling, which both bias what is fitted along a measured motion.
+
+    As much noise again moves the numbers by about as much as what is there has done (Cook and Stefanski 1994), half
+    the samples by no less than what is missing between them.
+    """
+    task = fit.task
+    half = task.every(2)
+    others = [replace(task, motion=task.motion.noisier()), replace(half, motion=half.motion.undersampled())]
+    for other in others:
+        yield _numbers(refined(other, fit.model)) - _numbers(fit)
+
+
+def _by_the_rest(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
+    """By fitting the whole record, in one step: another part has other loops and rates."""
+    scale, inverse = _normal(jacobian)
+    rest = slice(fit.task.split, None)
+    return np.asarray(inverse @ ((jacobian[rest] / scale).T @ fit.residual[rest]) / scale)
+
+
+def _by_what_is_left(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
+    """By a force of no law as large as what is left beyond noise (Kennedy and O'Hagan 2001), a covariance (P, P).
+
+    A force over deflection, rate and memory has a part that the laws have taken up, and one that is seen: its columns'
+    sizes are drawn at random with the variance that explains the part that is seen.
+    """
+    motion = fit.task.motion.delayed(fit.model.late)
+    columns = SURFACE.columns(motion, ())
+    columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
+    scale, inverse = _normal(jacobian)
+    taken = inverse @ ((jacobian / scale).T @ columns)
+    seen = columns - jacobian / scale @ taken
+    basis, sizes, _ = np.linalg.svd(seen, full_matrices=False)
+    basis = basis[:, sizes > _SEEN * np.sqrt(len(seen))]
+    inside, whole = float(np.sum((basis.T @ fit.residual) ** 2)), float(fit.residual @ fit.residual)
+    chance = basis.shape[1] * (whole - inside) / max(1, len(seen) - basis.shape[1])  # noise lies in all directions
+    power = max(inside - chance, 0.0) / max(float(np.sum(sizes**2)), 1e-300)
+    moved = taken / scale[:, None]
+    return np.asarray(power * moved @ moved.T)
+
+
+def moved_in_common(other: ComponentFit, found: ComponentFit) -> FloatArray:
+    """By how much another law in one place moves the numbers that both models have, as `covariance` counts them."""
+    there, here = _in_common(other, found.model), _in_common(found, found.model)
+    return np.where(there == 0.0, 0.0, there - here)
+
+
+def _in_common(fit: ComponentFit, model: ComponentModel) -> FloatArray:
+    """The numbers of a fit that a model with another law, or another form of one, has too; 0 for its others."""
+    strengths, shapes = [], []
+    for index, (one, other) in enumerate(zip(fit.model.pieces, model.pieces, strict=True)):
+        same = one.effect == other.effect
+        own = fit.strengths_of(index).tolist() if same else []
+        strengths += [value for value, _ in itertools.zip_longest(own[: len(other.signs)], other.signs, fillvalue=0.0)]
+        named = dict(zip(one.shapes, fit.model.shapes[index], strict=True)) if same else {}
+        shapes += [named.get(name, 0.0) for name in other.shapes]
+    return np.concatenate([_linear(fit), strengths, shapes])
+
+
+def _linear(fit: ComponentFit) -> FloatArray:
+    """Preload, k and c, as far as they are free."""
+    return np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
+
+
+def _numbers(fit: ComponentFit) -> FloatArray:
+    """Everything that is fitted, in the order of `covariance`."""
+    return np.concatenate([_linear(fit), fit.strengths, *(np.array(shape, dtype=float) for shape in fit.model.shapes)])
+
+
+def _per_lag(fit: ComponentFit) -> FloatArray:
+    """Derivative of the modelled force by the lag, N/s, (T,)."""
+    late, step = fit.model.late, _RELATIVE * fit.task.motion.step
+
+    def force(delay: float) -> FloatArray:
+        task = fit.task.delayed(delay)
+        linear = task.motion.deflection * fit.element.stiffness + task.motion.rate * fit.element.damping
+        pieces = zip(fit.model.pieces, fit.model.shapes, strict=True)
+        found = [piece.columns(task.motion, shape) for piece, shape in pieces]
+        return np.asarray(linear + np.column_stack([*found, np.zeros((len(linear), 0))]) @ fit.strengths)
+
+    return (force(late + step) - force(late)) / step
+
+
+def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations of a piece's law parameters and of what is quoted of it, by linear propagation."""
+    count = len(names)
+    at = count + sum(len(p.signs) for p in fit.model.pieces[:index])
+    own = list(range(at, at + len(fit.model.pieces[index].signs)))
+    first = count + len(fit.strengths) + sum(len(p.shapes) for p in fit.model.pieces[:index])
+    own += list(range(first, first + len(fit.model.pieces[index].shapes)))
+    linear = [names.index(name) for name in ("stiffness", "damping") if name in names]
+    block = full[np.ix_(own + linear, own + linear)]
+    piece, shape, strengths = fit.model.pieces[index], fit.model.shapes[index], fit.strengths_of(index)
+    start = np.concatenate([strengths, shape, [getattr(fit.element, names[i]) for i in linear]])
+
+    def values(x: FloatArray, what: str) -> FloatArray:
+        a, s = x[: len(strengths)], x[len(strengths) : len(strengths) + len(shape)]
+        of = dict(zip([names[i] for i in linear], x[len(strengths) + len(shape) :], strict=True))
+        element = SpringDamper(of.get("stiffness", fit.element.stiffness), of.get("damping", fit.element.damping))
+        return np.array([value for value, _ in getattr(piece, what)(a, s, element).values()])
+
+    result = []
+    for what in ("values", "quoted"):
+        centre = values(start, what)
+        gradient = np.zeros((len(centre), len(start)))
+        for j in range(len(start)):
+            step = _RELATIVE * max(abs(start[j]), 1e-9)
+            with np.errstate(over="ignore", invalid="ignore"):  # what a huge exponent leaves open is infinite
+                gradient[:, j] = (values(start + step * (np.arange(len(start)) == j), what) - centre) / step
+        with np.errstate(over="ignore", invalid="ignore"):
+            variance = np.diag(gradient @ block @ gradient.T) if len(centre) else centre
+        result.append(np.sqrt(np.maximum(np.where(np.isfinite(variance), variance, np.inf), 0.0)))
+    return result[0], result[1]
