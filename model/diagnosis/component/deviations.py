@@ -158,7 +158,8 @@ def _in_common(fit: ComponentFit, model: ComponentModel) -> FloatArray:
 
 def _linear(fit: ComponentFit) -> FloatArray:
     """Preload, k and c, as far as they are free."""
-    return np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
+    linear: FloatArray = np.array([fit.preload, fit.element.stiffness, fit.element.damping])
+    return linear[fit.task.linear[1]]
 
 
 def _numbers(fit: ComponentFit) -> FloatArray:
