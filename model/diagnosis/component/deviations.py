@@ -158,8 +158,8 @@ def _in_common(fit: ComponentFit, model: ComponentModel) -> FloatArray:
 
 def _linear(fit: ComponentFit) -> FloatArray:
     """Preload, k and c, as far as they are free."""
-    linear: FloatArray = np.array([fit.preload, fit.element.stiffness, fit.element.damping])
-    return linear[fit.task.linear[1]]
+    free: FloatArray = np.array([fit.preload, fit.element.stiffness, fit.element.damping])[fit.task.linear[1]]
+    return free
 
 
 def _numbers(fit: ComponentFit) -> FloatArray:
