@@ -64,14 +64,11 @@ def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
     if not isinstance(law, ElementLaw) or at["damping"] not in names:
         return []
     start = start_of(base, hit)
-    if law.restarts is not None:
-        restarts = law.restarts(_reading(problem, base, hit.location))
-    elif hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
+    restarts = () if law.restarts is None else law.restarts(_reading(problem, base, hit.location))
+    if hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
         stronger = problem.rules.selection.stronger
         values = law.scaled(hit.term.parameters, 1 / stronger)
-        restarts = (Restart(1.0, stronger * hit.beyond, tuple(values)),)
-    else:
-        return []
+        restarts += (Restart(1.0, stronger * hit.beyond, tuple(values)),)
     points = []
     for restart in restarts:
         theta = start.theta.copy()
