@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -132,7 +131,7 @@ class _Reader:
         """NumPy's reader for batches in which every cell of the wanted columns is a number."""
         separator, width = self.layout.separator, len(self.layout.names)
         text = "\n".join(lines)
-        if '"' in text or "_" in text or not text.isascii():
+        if not lines or '"' in text or "_" in text or not text.isascii():
             return None
         if separator is None:
             if any(len(line.split()) != width for line in lines):
@@ -142,10 +141,8 @@ class _Reader:
         if self.layout.comma:
             text = text.replace(",", ".")
         try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("error")
-                table = np.loadtxt(io.StringIO(text), delimiter=separator, usecols=self.columns, ndmin=2, comments=None)
-        except (ValueError, UserWarning):
+            table = np.loadtxt(io.StringIO(text), delimiter=separator, usecols=self.columns, ndmin=2, comments=None)
+        except ValueError:
             return None
         return np.where(np.isfinite(table), table, np.nan)
 
