@@ -1,9 +1,10 @@
 """`sprung bench structure [--count 24] [--clean 6] [--seed 1]`: parts that a vehicle has and its file does not state.
 
 The independent generator makes the recordings from a file with the part in it: a spring-damper between two bodies or a
-body and a support, a mass that hangs on a body, an element at another place.  The diagnosis is given the file without
-it, with its own values for all elements.  Every other recording is of the bundled vehicle, the others of half a lorry.
-Counted are the parts whose signal-to-noise ratio, for a test that knows place and kind, is at least twice its limit.
+body and a support, a mass that hangs on a body, an element at another place, a spring of rubber, whose stiffness grows
+with a power of the frequency.  The diagnosis is given the file without it, with its own values for all elements.  Half
+of the recordings are of the bundled vehicle, half of half a lorry.  Counted are the parts whose signal-to-noise ratio,
+for a test that knows place and kind, is at least twice its limit.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from sprung.model.system import MANCHESTER, System, load_system
 
 Array = NDArray[np.float64]
 HALF_CAR = Path(__file__).resolve().parent / "systems" / "half_car.yaml"
-KINDS = ("missing_connection", "suspended_mass", "wrong_position")
+KINDS = ("missing_connection", "suspended_mass", "wrong_position", "fractional_stiffness")
 LIMIT = 4.4  # signal-to-noise ratio at which a test of one place and kind finds half at a chance of 1e-5
 VISIBLE = 2.0  # limits, from which on a part counts
 HIDDEN = "hidden"
@@ -43,6 +44,7 @@ class ConcealedPart:
     location: str
     parameters: dict[str, float]
     data: dict[str, Any]
+    rubber: tuple[str, float, float] | None = None  # as the generator's cases have it
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def run(
     places = [only] * count if only else [*np.resize(KINDS, count), *["clean"] * clean]
     for number, kind in enumerate(places):
         random = np.random.default_rng([seed, number])
-        path = MANCHESTER if number % 2 == 0 else HALF_CAR
+        path = (MANCHESTER, HALF_CAR)[(number + number // len(KINDS)) % 2]  # every kind on both
         part = drawn(yaml.safe_load(path.read_text(encoding="utf-8")), str(kind), random)
         system = load_system(path)
         record, snr = made(part, yaml.safe_load(path.read_text(encoding="utf-8")), system, random, seconds)
@@ -125,6 +127,8 @@ def drawn(data: dict[str, Any], kind: str, random: np.random.Generator) -> Conce
         return _suspended(data, random)
     if kind == "wrong_position":
         return _moved(data, random)
+    if kind == "fractional_stiffness":
+        return _of_rubber(data, random)
     return ConcealedPart("", "", {}, data)
 
 
@@ -188,6 +192,15 @@ def _moved(data: dict[str, Any], random: np.random.Generator) -> ConcealedPart:
     return ConcealedPart("wrong_position", name, {"offset": offset}, data)
 
 
+def _of_rubber(data: dict[str, Any], random: np.random.Generator) -> ConcealedPart:
+    """A spring with a part K(w) = k (j w / w1)^a, w1 of 1 Hz."""
+    name = str(random.choice(list(data["elements"])))
+    size = data["elements"][name]["stiffness"] * float(np.exp(random.uniform(np.log(0.03), np.log(0.4))))
+    order = float(random.uniform(0.15, 0.6))
+    values = {"stiffness": size, "order": order}
+    return ConcealedPart("fractional_stiffness", name, values, data, (name, size, order))
+
+
 def made(
     part: ConcealedPart, stated: dict[str, Any], system: System, random: np.random.Generator, seconds: float
 ) -> tuple[MadeSamples, float]:
@@ -201,6 +214,7 @@ def made(
         speed=float(random.uniform(39, 50)),
         level=float(np.exp(random.uniform(np.log(LOW_TRACK), np.log(HIGH_TRACK)))),
         joints=None,
+        rubber=part.rubber,
     )
     clean = exact_response(whole, case, seconds)
     snr = oracle_snr(vehicle, case, clean, clean)

@@ -33,6 +33,7 @@ class Case:
     flex: list[float] | None = None  # [Hz, damping ratio, shape at the secondary springs, modal mass kg]
     drive: list[float] | None = None  # [N, Hz, degree of freedom]
     mass_scale: tuple[str, float] | None = None  # body, ratio
+    rubber: tuple[str, float, float] | None = None  # element, N/m at 1 Hz, power of the frequency
     fault: tuple[str, str, float] | None = None  # channel, kind, value
     change: dict[str, dict[str, float]] = field(default_factory=dict)  # k_scale, c_scale
 
@@ -49,6 +50,9 @@ class Case:
         if self.mass_scale:
             body, ratio = self.mass_scale
             found.append({"location": body, "effect": "mass_change", "parameters": [ratio]})
+        if self.rubber:
+            element, *values = self.rubber
+            found.append({"location": element, "effect": "fractional_stiffness", "parameters": values})
         if self.fault:
             channel, kind, value = self.fault
             known = [] if kind == "sensor_stuck" else [value]

@@ -22,8 +22,14 @@ class VehicleTransfer:
     """Frequency responses of one vehicle from the wheels to the sensors, and to element motions."""
 
     def __init__(
-        self, vehicle: Vehicle, stiffness: Array, damping: Array, omega: Array, inertia: Array | None = None
+        self,
+        vehicle: Vehicle,
+        stiffness: Array | Complex,
+        damping: Array,
+        omega: Array,
+        inertia: Array | None = None,
     ) -> None:
+        """stiffness: (E,), or complex and of every frequency, (F, E)."""
         jw = 1j * omega[:, None]
         impedance = stiffness + jw * damping  # (F, E)
         geometry = vehicle.geometry
@@ -66,7 +72,11 @@ def exact_response(vehicle: Vehicle, case: Case, seconds: float) -> Array:
     if case.mass_scale:
         inertia[vehicle.on_body(case.mass_scale[0])] *= case.mass_scale[1]
     live = np.flatnonzero(omega < 2 * np.pi * 50.0)  # nothing on the track is faster
-    transfer = VehicleTransfer(vehicle, values[0], values[1], omega[live], inertia)
+    stiffness = np.tile(values[0].astype(complex), (len(live), 1))  # (F, E)
+    if case.rubber:
+        element, size, order = case.rubber
+        stiffness[:, vehicle.elements.index(element)] += size * (1j * omega[live] / (2 * np.pi)) ** order
+    transfer = VehicleTransfer(vehicle, stiffness, values[1], omega[live], inertia)
     return filtered(transfer, spectra[live], omega[live], samples, seconds, (0, 1))
 
 

@@ -183,3 +183,15 @@ def test_the_integrator_agrees_with_the_exact_response_of_a_linear_vehicle() -> 
     error = np.abs(integrated[settled] - exact[settled]).max(axis=0)
     noise = np.concatenate([VEHICLE.input_noise.ravel(), VEHICLE.sensor_noise])
     assert (error < 0.05 * noise).all()
+
+
+def test_rubber_of_the_first_power_is_a_damper() -> None:
+    (case,) = draw_cases(VEHICLE, 1, 11, ["clean"])
+    size = 2e4
+    rubber = replace(case, rubber=("primary_12l", size, 1.0))
+    damping = case.damping | {"primary_12l": case.damping["primary_12l"] + size / (2 * np.pi)}
+    exact = exact_response(VEHICLE, replace(case, damping=damping), 20.0)
+    assert exact_response(VEHICLE, rubber, 20.0) == pytest.approx(exact, rel=1e-9, abs=1e-12)
+    assert rubber.findings() == [
+        {"location": "primary_12l", "effect": "fractional_stiffness", "parameters": [size, 1.0]}
+    ]
