@@ -100,7 +100,8 @@ def load_engine(settings: Settings) -> Engine:
 
     Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
     """
-    from sprung.model.identification.identify import load_identifier  # takes a second; a bad system file is told before
+    # takes a second; a bad system file is told before
+    from sprung.model.identification.identify import load_identifier, without_weights
 
     one_thread_an_operation()
     path = settings.system or MANCHESTER
@@ -112,6 +113,8 @@ def load_engine(settings: Settings) -> Engine:
         )
     if not system.tracked:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
+    if settings.weights is not None and (reason := without_weights(system)):
+        log.warning("%s: these weights are not used: %s", settings.weights, reason)
     return Engine(
         system,
         load_identifier(system, settings.weights, workers=os.cpu_count() or 1),

@@ -179,6 +179,15 @@ def load_identifier(system: System, model: str | Path | None = None, workers: in
     return Identifier(system, estimator, workers)
 
 
+def without_weights(system: System) -> str:
+    """Why no weights are used for a system's windows, in words; empty where they are."""
+    if system.laws:
+        return f"{system.name} has laws, and windows with laws begin at the values of the system file"
+    if system.on_track or not system.file.inputs:
+        return f"{system.name} has no measured inputs, and is identified from spectra"
+    return ""
+
+
 def _with_laws(system: System, workers: int) -> Identifies:
     """The identifier of a system file with laws.  Errors: `UnusableWindow` for a law that windows cannot hold."""
     if system.on_track or not system.file.inputs:

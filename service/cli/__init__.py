@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import os
 import sys
 from collections.abc import Sequence
@@ -16,6 +17,7 @@ INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status; never a traceback, unless SPRUNG_DEBUG is set."""
     _usable_streams()
+    logging.basicConfig(format="sprung: %(message)s")  # warnings; a service sets up logs of its own
     from sprung.service.cli.app import app
 
     try:

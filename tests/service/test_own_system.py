@@ -16,6 +16,7 @@ from sprung.service.cli import main
 from sprung.service.core import build_core
 from sprung.service.engine import load_engine
 from sprung.service.settings import Settings
+from tests.strut import TEXT
 from tests.test_system import QUARTER_CAR
 
 TRUTH = {"tyre.stiffness": 0.9, "strut.stiffness": 1.15, "tyre.damping": 1.0, "strut.damping": 0.8}
@@ -78,3 +79,11 @@ def test_replay_and_simulate_take_accelerations_of_supports(
             assert abs(parameter["ratio"] - TRUTH[parameter["name"]]) < 4 * parameter["std"] / parameter["nominal"]
     assert main(["simulate", str(path), "--inputs", str(table), "--out", str(tmp_path / "shown.csv")]) == 0
     assert len((tmp_path / "shown.csv").read_text().splitlines()) == len(values) + 1
+
+
+def test_weights_that_are_not_used_are_said_so(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file = tmp_path / "strut.yaml"
+    file.write_text(TEXT.format(law="{coulomb_friction: {force: 80, smoothing: 0.01}}", sensor=""))
+    load_engine(Settings(system=file, weights=tmp_path, data_dir=tmp_path))
+    (line,) = [record.getMessage() for record in caplog.records]
+    assert line.startswith(f"{tmp_path}: these weights are not used: quarter-car has laws")
