@@ -19,6 +19,14 @@ from sprung.model.mechanics import ACCELERATION, DEFLECTION, DISPLACEMENT, FORCE
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
+# words that Modelica 3.6 keeps for itself (appendix A.1), and its clock
+KEYWORDS = """
+algorithm and annotation block break class connect connector constant constrainedby der discrete each else elseif
+elsewhen encapsulated end enumeration equation expandable extends external false final flow for function if import
+impure in initial inner input loop model not operator or outer output package parameter partial protected public pure
+record redeclare replaceable return stream then true type when while within time
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class EquationSite:
@@ -58,8 +66,12 @@ def sites(system: System) -> list[EquationSite]:
 
 def linear(row: FloatArray, names: Callable[[int], str]) -> str:
     """A linear combination as text: `0.5*a - b`."""
-    terms = [f"{weight!r}*{names(i)}" for i, weight in enumerate(row.tolist()) if weight != 0]
-    return " + ".join(terms) if terms else "0.0"
+    return total(*(f"{weight!r}*{names(i)}" for i, weight in enumerate(row.tolist()) if weight != 0))
+
+
+def total(*terms: str) -> str:
+    """A sum as text, without terms "0.0".  Modelica admits no sign behind an operator: negative ones are subtracted."""
+    return " + ".join(term for term in terms if term != "0.0").replace(" + -", " - ") or "0.0"
 
 
 def output(
@@ -85,4 +97,5 @@ def output(
 
 def identifier(name: str) -> str:
     """A name that C and Modelica admit."""
-    return "".join(ch if ch.isalnum() else "_" for ch in name)
+    plain = "".join(ch if ch.isascii() and ch.isalnum() else "_" for ch in name)
+    return f"{plain}_" if plain in KEYWORDS.split() else plain if not plain[:1].isdigit() else f"_{plain}"

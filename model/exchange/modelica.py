@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites
+from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites, total
 from sprung.model.laws import CLOCK_LEAD
 from sprung.model.system import System
 
@@ -20,7 +20,7 @@ def modelica(system: System, package: str) -> str:
     laws = sites(system)
     blocks = [line for index, site in enumerate(laws) for line in _block(site, index)]
     lines = [
-        f'package {package} "{system.name}, written by Sprung"',
+        f"package {package} {_text(f'{system.name}, written by Sprung')}",
         *blocks,
         *_vehicle(system, laws),
         f"end {package};",
@@ -32,13 +32,19 @@ def _name(site: EquationSite, index: int) -> str:
     return f"{identifier(site.law.name)}_{identifier(site.placed.location)}_{index}"
 
 
+def _text(words: str) -> str:
+    escaped = words.replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
+
+
 def _block(site: EquationSite, index: int) -> list[str]:
     """A law: its motion in, its force out."""
     name = _name(site, index)
-    rename = {"t": f"(time + {CLOCK_LEAD!r})"}
-    lines = [f'  block {name} "{site.law.title} at {site.placed.location}"']
+    own_names = {own: identifier(f"{own}_" if own == "f" else own) for own in site.law.names}
+    rename = own_names | {"t": f"(time + {CLOCK_LEAD!r})"}
+    lines = [f"  block {name} {_text(f'{site.law.title} at {site.placed.location}')}"]
     for own, value, spec in zip(site.law.names, site.placed.values, site.law.parameters, strict=True):
-        lines.append(f'    parameter Real {own} = {value!r} "{spec.unit}";')
+        lines.append(f"    parameter Real {own_names[own]} = {value!r} {_text(spec.unit)};")
     lines += [
         '    input Real d "deflection, m";',
         '    input Real v "rate, m/s";',
@@ -81,11 +87,12 @@ def _vehicle(system: System, laws: list[EquationSite]) -> list[str]:
     value, slope = ([drives[int(i) + part] for i in m.support_drive] for part in (0, 1))
     rates = [f"{dof}_rate" for dof in dofs]
     for e, name in enumerate(names):
-        lines.append(f"    d_{name} = {linear(m.H[e], dofs.__getitem__)} + {linear(m.G[e], value.__getitem__)};")
-        lines.append(f"    v_{name} = {linear(m.H[e], rates.__getitem__)} + {linear(m.G[e], slope.__getitem__)};")
+        for motion, above, below in (("d", dofs, value), ("v", rates, slope)):
+            found = total(linear(m.H[e], above.__getitem__), linear(m.G[e], below.__getitem__))
+            lines.append(f"    {motion}_{name} = {found};")
         own = f"{name}_stiffness * d_{name} + {name}_damping * v_{name}"
         added = [f"{float(s.weights[e])!r} * law_{i}.f" for i, s in enumerate(laws) if s.weights[e]]
-        lines.append(f"    f_{name} = {' + '.join([own, *added])};")
+        lines.append(f"    f_{name} = {total(own, *added)};")
     for i, site in enumerate(laws):
         element = names[site.element]
         lines += [
@@ -97,7 +104,7 @@ def _vehicle(system: System, laws: list[EquationSite]) -> list[str]:
     for i, dof in enumerate(dofs):
         pull = linear(-m.H[:, i], lambda e: f"f_{names[e]}")
         push = linear(m.F[i], lambda j: drives[int(m.force_drive[j])])
-        lines.append(f"    {float(m.mass[i])!r} * der({dof}_rate) = {pull} + {push};")
+        lines.append(f"    {float(m.mass[i])!r} * der({dof}_rate) = {total(pull, push)};")
     for s, sensor in enumerate(system.sensors):
         shown = output(
             system,

@@ -274,6 +274,32 @@ def test_the_modelica_text_has_the_same_equations(laws: str, tmp_path: Path) -> 
     np.testing.assert_allclose([found[name] for name in vehicle.sensors], shown, rtol=1e-12)
 
 
+def grammatical(text: str) -> bool:
+    """Whether a text is an arithmetic expression of Modelica (3.6, appendix A.2.7)."""
+    factor = r"x(\^x)?"
+    term = rf"{factor}([*/]{factor})*"
+    total = rf"[-+]?{term}([-+]{term})*"
+    text = re.sub(r"\d+\.?\d*(e[-+]?\d+)?|[A-Za-z_][\w.]*", "x", text.replace(" ", ""))
+    before = ""
+    while before != text:
+        before, text = text, re.sub(rf"x?\({total}(,{total})*\)", "x", text)
+    return re.fullmatch(total, text) is not None
+
+
+def test_expressions_follow_the_grammar_of_modelica(tmp_path: Path) -> None:
+    assert (
+        not grammatical("a + -1.0*b") and not grammatical("2*-a") and grammatical("-a + (-1.0)*min(b, c.d)^(2 - 1e-3)")
+    )
+    (tmp_path / "car.yaml").write_text(TEXT % LAWS["hysteresis"])
+    for file in ("end.mo", "2nd car.mo"):
+        write_modelica(tmp_path / file, load_system(tmp_path / "car.yaml"))
+    text = (tmp_path / "end.mo").read_text()
+    equations = "".join(re.findall(r"  equation\n(.*?)  end ", text, re.DOTALL))
+    sides = [side for pair in re.findall(r"^    (.+) = (.+);$", equations, re.MULTILINE) for side in pair]
+    assert len(sides) > 40 and [side for side in sides if not grammatical(side)] == []
+    assert text.startswith("package end_ ") and (tmp_path / "2nd car.mo").read_text().startswith("package _2nd_car ")
+
+
 @pytest.mark.skipif(shutil.which("omc") is None, reason="OpenModelica is not installed")
 def test_the_modelica_text_compiles(tmp_path: Path) -> None:
     write_modelica(tmp_path / "car.mo", system(LAWS["hysteresis"]))
