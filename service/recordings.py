@@ -12,13 +12,12 @@ from sprung.service.feed import Fed, OnTally, feed_file
 from sprung.service.jobs import Progress
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch
+from sprung.service.reading import SLOWEST_BYTES_PER_SECOND
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, work
 from sprung.service.store.work import JobRow
 from sprung.service.times import now_ns
 from sprung.service.worker import ProcessLimits
-
-SLOWEST_BYTES_PER_SECOND = 100_000  # any reader is faster, by an order of magnitude
 
 
 class RecordingJobs:

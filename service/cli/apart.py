@@ -10,8 +10,7 @@ from typing import TypeVar
 from sprung.replay.inspection import Inspection
 from sprung.replay.record import Record
 from sprung.service.loading import InspectionRequest, RecordRequest, inspect_task, load_task
-from sprung.service.reading import Apart, Here, Reading, ReadRequest, ReadWindows
-from sprung.service.recordings import SLOWEST_BYTES_PER_SECOND
+from sprung.service.reading import SLOWEST_BYTES_PER_SECOND, Apart, Here, Reading, ReadRequest, ReadWindows
 from sprung.service.settings import Settings, settings_with
 from sprung.service.worker import ProcessLimits, Task, Worker
 

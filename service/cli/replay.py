@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from sprung.service.cli.apart import own_limits
-from sprung.service.cli.console import parameter_table, print_table, progress, width_of_output
+from sprung.service.cli.console import print_table, width_of_output
+from sprung.service.cli.parameters import parameter_table
+from sprung.service.cli.progress import progress
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.compute import Compute

@@ -8,7 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sprung.service.cli.console import parameter_table, plain_progress, print_table, width_of_output
+from sprung.service.cli.console import print_table, width_of_output
+from sprung.service.cli.parameters import parameter_table
+from sprung.service.cli.progress import plain_progress
 from sprung.service.cli.replay import closing_line, incomplete_line, readable
 from sprung.service.core import Core
 from sprung.service.feed import Fed, OnBatch

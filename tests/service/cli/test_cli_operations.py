@@ -19,8 +19,8 @@ from can import BusState
 from mcap.reader import make_reader
 
 from sprung.service.cli import describe, main
-from sprung.service.cli.console import parameter_table
 from sprung.service.cli.doctor import _bus
+from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.replay import slower_line, told_when_interrupted
 from sprung.service.engine import Engine
 from sprung.service.feed import Fed

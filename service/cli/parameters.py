@@ -1,0 +1,54 @@
+"""The table of a vehicle's parameters."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from sprung.service.pages.render import percent, quantity
+from sprung.service.views import VehicleView
+
+COLUMNS = {  # of the table of parameters, and the width from which they are shown
+    "parameter": 0,
+    "value": 64,
+    "± std": 96,
+    "nominal": 84,
+    "ratio": 74,
+    "drift": 0,
+    "state": 0,
+}
+HEALTH_STYLE = {"ok": "green", "maintenance_required": "yellow"}
+
+
+def parameter_table(view: VehicleView, width: int = 120) -> Table:
+    """Every tracked parameter, the ones with alarms marked; on narrow terminals fewer columns, whole names."""
+    style = HEALTH_STYLE.get(view.health, "red")
+    table = Table(
+        title=f"{view.vehicle}: [{style}]{view.health.replace('_', ' ')}[/{style}]",
+        title_justify="left",
+        title_style="bold",
+    )
+    shown = [name for name, least in COLUMNS.items() if width >= least]
+    for name in shown:
+        table.add_column(name, justify="left" if name in ("parameter", "state") else "right", no_wrap=True)
+    for p in view.parameters:
+        told = p.identifiable
+        cells = {
+            "parameter": p.name,
+            "value": quantity(p.value, p.unit) if told else "–",
+            "± std": quantity(p.std, p.unit) if told else "–",
+            "nominal": quantity(p.nominal, p.unit),
+            "ratio": f"{p.value / p.nominal:.3f}" if told else "–",
+            "drift": percent(p.drift),
+            "state": _state(p.alarm, told, p.drift),
+        }
+        colour = {"alarm": "red", "warning": "yellow"}.get(p.alarm or "")
+        table.add_row(*(cells[name] for name in shown), style=colour)
+    return table
+
+
+def _state(alarm: str | None, identifiable: bool, drift: float | None) -> str:
+    if alarm is not None:
+        return alarm
+    if not identifiable:
+        return "not identifiable"
+    return "learning" if drift is None else "ok"
