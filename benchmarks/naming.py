@@ -12,10 +12,9 @@ earthquake's, with noise and quantisation as of a test bench.  Counted as
 
 from __future__ import annotations
 
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 from scipy.signal import butter, chirp, sosfiltfilt
 
+from sprung.benchmarks.naming_rigs import RIGS, TRAVEL, RigKind
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.motion import element_motion
 from sprung.model.diagnosis.report.report import Finding
@@ -31,31 +31,11 @@ from sprung.model.laws.along import force_along
 from sprung.model.system import System, parse_system
 
 Array = NDArray[np.float64]
-Stepped = Callable[[float, float, float], float]  # deflection m, rate m/s, step s -> force N; keeps its memory
 RATE, SECONDS, FINER = 200.0, 20.0, 16
-TRAVEL = 0.02  # m
 MOTIONS = ("sine", "sweep", "random", "quake")
 ANOTHER = 0.6  # times the amplitude, at which a look-alike has to predict as well
 AS_WELL = 2.0  # times its own error: chance, and shapes that a smaller motion shows otherwise
 CHANCE = 1e-3
-
-
-@dataclass(frozen=True)
-class SimulatedRig:
-    """A component with its memory, and its true values by the names that a report has for them."""
-
-    step: Stepped
-    truth: Mapping[str, float] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class RigKind:
-    """One simulated component beside a spring and a damper."""
-
-    named: frozenset[str]  # effects that are right; empty: nothing is there
-    made: Callable[[np.random.Generator], SimulatedRig]
-    signal: bool = False  # follows a measured signal
-    hysteretic: bool = False  # the same loop has several names
 
 
 @dataclass(frozen=True)
@@ -106,7 +86,7 @@ def judged(rig: RigKind, motion: str, seed: list[int]) -> dict[str, Any]:
         return line | {"judged": "missed" if report.unexplained.share > 0 or rig.named else "right"}
     if report.verdict == "unknown_physics":
         return line | {"judged": "unknown"}
-    line["values"] = beside_truth(rig, drawn, found)
+    line["values"] = beside_truth(rig, drawn, found, 0.5 * float(d.max() + d.min()))
     families = [set((f.family or f.effect).split(" or ")) for f in found if f.p_value is None or f.p_value < CHANCE]
     if all(family & rig.named for family in families):
         return line | {"judged": "right"}
@@ -119,13 +99,17 @@ def judged(rig: RigKind, motion: str, seed: list[int]) -> dict[str, Any]:
     return line | {"judged": "wrong"}
 
 
-def beside_truth(rig: RigKind, drawn: int, findings: list[Finding]) -> dict[str, list[float]]:
-    """True value, value and deviation of what a finding of the true law quotes; laws that follow a signal have none."""
+def beside_truth(rig: RigKind, drawn: int, findings: list[Finding], middle: float) -> dict[str, list[float]]:
+    """True value, value and deviation of what a finding of the true law quotes; laws that follow a signal have none.
+
+    middle: of the travel, m, from which a report counts how far a stop is.
+    """
     if rig.signal:
         return {}
     random = np.random.default_rng(drawn)
     _linear(random)
-    truth = rig.made(random).truth
+    shown = {"gap": -middle, "gap_compression": middle}
+    truth = {name: value + shown.get(name, 0.0) for name, value in rig.made(random).truth.items()}
     said = {p.name: p for f in findings if f.effect in rig.named for p in (*f.parameters, *f.quoted)}
     return {name: [value, said[name].value, said[name].std] for name, value in truth.items() if name in said}
 
@@ -207,227 +191,3 @@ sensors: {{cell: {{kind: force, element: damper, csv: F, noise: 1.0}}}}
 
 BENCH = _bench("", "")
 SIGNALLED = _bench(", depends_on: [valve]", "signals: {valve: {csv: u, unit: A}}")
-
-
-# --- laws of the catalogue ---------------------------------------------------------------------------------------
-
-
-def _sign(rate: float, smoothing: float = 5e-4) -> float:
-    return math.tanh(rate / smoothing)
-
-
-def _nothing(random: np.random.Generator) -> SimulatedRig:
-    return SimulatedRig(lambda x, v, h: 0.0)
-
-
-def _coulomb(random: np.random.Generator) -> SimulatedRig:
-    force = random.uniform(60, 300)
-    return SimulatedRig(lambda x, v, h: force * _sign(v), {"breakaway_force": force})
-
-
-def _stribeck(random: np.random.Generator) -> SimulatedRig:
-    force, static, fall = random.uniform(60, 200), random.uniform(1.5, 2.2), random.uniform(0.01, 0.04)
-    return SimulatedRig(
-        lambda x, v, h: force * (1 + (static - 1) * math.exp(-((v / fall) ** 2))) * _sign(v),
-        {"force": force, "static_force": static * force, "stribeck_rate": fall},
-    )
-
-
-def _moved() -> Callable[[float], float]:
-    """How far a deflection has come since the last step: a memory follows the way, not the rate at a step's end."""
-    last: float | None = None
-
-    def since(x: float) -> float:
-        nonlocal last
-        way = 0.0 if last is None else x - last
-        last = x
-        return way
-
-    return since
-
-
-def _presliding(random: np.random.Generator, excess: tuple[float, float]) -> SimulatedRig:
-    force, reach, fall = random.uniform(80, 300), random.uniform(2e-4, 1e-3), random.uniform(0.02, 0.05)
-    static = force * (1 + random.uniform(*excess))
-    stiffness, z, moved = force / reach, 0.0, _moved()
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal z
-        way = moved(x)
-        limit = (force + (static - force) * math.exp(-((way / h / fall) ** 2))) / stiffness
-        target = math.copysign(limit, way)
-        z = target + (z - target) * math.exp(-abs(way) / limit)
-        return stiffness * z
-
-    return SimulatedRig(step, {"yield_force": force, "yield_displacement": reach})
-
-
-def _bouc_wen(random: np.random.Generator) -> SimulatedRig:
-    force, reach, n = random.uniform(100, 500), random.uniform(5e-4, 2e-3), random.uniform(1.0, 2.0)
-    z, moved = 0.0, _moved()  # of the yield displacement
-
-    def grows(z: float, way: float) -> float:
-        rounded: float = abs(z) ** (n - 1) * (0.7 * abs(way) * z + 0.3 * way * abs(z))
-        return (way - rounded) / reach
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal z
-        way = moved(x)
-        first = grows(z, way)
-        z += 0.5 * (first + grows(z + first, way))
-        return force * z
-
-    return SimulatedRig(step, {"yield_force": force, "yield_displacement": reach})
-
-
-def _slider(gap: float, stiffness: float, slip: float) -> Stepped:
-    """A slider of a slip force behind a spring and a gap."""
-    u, last = 0.0, 0.0
-    most = 0.5 * gap + slip / stiffness
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal u, last
-        u = min(max(u + x - last, -most), most)
-        last = x
-        return stiffness * math.copysign(max(abs(u) - 0.5 * gap, 0.0), u)
-
-    return step
-
-
-def _backlash(random: np.random.Generator) -> SimulatedRig:
-    gap, stiffness, slip = random.uniform(3e-3, 8e-3), random.uniform(3e5, 1e6), random.uniform(500, 1500)
-    return SimulatedRig(_slider(gap, stiffness, slip), {"slip_force": slip, "lost_motion": gap})
-
-
-def _pinched(random: np.random.Generator) -> SimulatedRig:
-    force, width, depth = random.uniform(300, 800), random.uniform(2e-3, 5e-3), random.uniform(0.4, 0.8)
-    slider = _slider(0.0, force / random.uniform(5e-4, 2e-3), force)
-    return SimulatedRig(lambda x, v, h: slider(x, v, h) * (1 - depth * math.exp(-((x / width) ** 2))))
-
-
-def _gas_spring(random: np.random.Generator) -> SimulatedRig:
-    force, length = random.uniform(300, 900), TRAVEL * random.uniform(1.6, 3.0)
-    return SimulatedRig(lambda x, v, h: force * (1 - (1 + x / length) ** -1.3))
-
-
-def _valve(random: np.random.Generator) -> SimulatedRig:
-    knee, share, c = random.uniform(0.03, 0.06), random.uniform(0.1, 0.3), random.uniform(1500, 3000)
-    return SimulatedRig(
-        lambda x, v, h: c * math.copysign(min(abs(v), knee) + share * max(abs(v) - knee, 0.0), v), {"knee": knee}
-    )
-
-
-# --- what no law of the catalogue is -----------------------------------------------------------------------------
-
-
-def _magneto_rheological(random: np.random.Generator) -> SimulatedRig:
-    """Kwok et al. (2006): a tanh of rate and sign of the deflection."""
-    force, slope, wide = random.uniform(100, 300), random.uniform(15, 40), random.uniform(0.4, 0.9)
-    return SimulatedRig(lambda x, v, h: force * math.tanh(slope * v + wide * math.copysign(1.0, x)))
-
-
-def _menegotto_pinto(random: np.random.Generator) -> SimulatedRig:
-    """Steel (Giuffre, Menegotto and Pinto): branches between asymptotes, rounder after the first reversal."""
-    k, slip, b, r = random.uniform(2e5, 5e5), random.uniform(500, 1500), random.uniform(0.02, 0.06), 18.0
-    reach = slip / k
-    x0 = f0 = last_x = last_f = 0.0
-    x1, f1, way = reach, slip, 0
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal x0, f0, x1, f1, way, r, last_x, last_f
-        moved = x - last_x
-        if moved and (way == 0 or moved * way < 0):
-            first, way = way == 0, 1 if moved > 0 else -1
-            x0, f0 = last_x, last_f
-            if not first:
-                r = 3.0
-            line = way * slip * (1 - b)
-            x1 = (line - f0 + k * x0) / (k - b * k)
-            f1 = line + b * k * x1
-        e = (x - x0) / (x1 - x0)
-        rounded: float = e / (1 + abs(e) ** r) ** (1 / r)
-        last_x, last_f = x, f0 + (f1 - f0) * (b * e + (1 - b) * rounded)
-        return last_f
-
-    return SimulatedRig(step)
-
-
-def _self_centring(random: np.random.Generator) -> SimulatedRig:
-    """A flag-shaped loop, as of shape-memory alloys: loading and unloading plateaus on each side."""
-    k, reach, share = random.uniform(2e5, 4e5), random.uniform(2e-3, 4e-3), random.uniform(0.3, 0.6)
-    force = last = 0.0
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal force, last
-        force, last = force + k * (x - last), x
-        size, way = abs(x), math.copysign(1.0, x)
-        upper = min(k * size, k * reach + 0.05 * k * (size - reach)) if size > 0 else 0.0
-        lower = min(k * size, share * k * reach + 0.05 * k * (size - share * reach))
-        force = way * min(max(way * force, lower), upper)
-        return force
-
-    return SimulatedRig(step)
-
-
-def _rubber(random: np.random.Generator) -> SimulatedRig:
-    """Berg's friction with branches of relaxation over four decades, as of a fractional derivative."""
-    slip, half = random.uniform(60, 150), random.uniform(4e-4, 1e-3)
-    rates, strengths = np.geomspace(1e-2, 10, 7), random.uniform(4e3, 8e3) * np.ones(7)
-    branch, xs, fs, force, last, way = np.zeros(7), 0.0, 0.0, 0.0, 0.0, 0.0
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal branch, xs, fs, force, last, way
-        moved = x - last
-        last = x
-        if moved * way < 0:
-            xs, fs = x - moved, force
-        way = moved or way
-        y, a = x - xs, fs / slip
-        if y > 0:
-            force = fs + y * (slip - fs) / (half * (1 - a) + y)
-        elif y < 0:
-            force = fs + y * (slip + fs) / (half * (1 + a) - y)
-        branch = (branch + strengths * moved) * np.exp(-h * 2 * np.pi * rates)
-        return force + float(branch.sum())
-
-    return SimulatedRig(step)
-
-
-def _oil(random: np.random.Generator) -> SimulatedRig:
-    """Relief valves of different settings, compressible oil, and a chamber that cavitates in compression."""
-    c, after = random.uniform(8e3, 2e4), random.uniform(0.05, 0.15)
-    relief, other, stiff, least = random.uniform(600, 1200), random.uniform(300, 600), 2e6, 1.4
-    force = 0.0
-
-    def step(x: float, v: float, h: float) -> float:
-        nonlocal force
-        opens = relief if force > 0 else other
-        flow = force / c + math.copysign(max(abs(force) - opens, 0.0) / (after * c), force)
-        force = max(force + h * stiff * (v - flow), -least * other)
-        return force
-
-    return SimulatedRig(step)
-
-
-_FRICTION = frozenset({"coulomb_friction", "stribeck", "dahl", "lugre"})
-_HYSTERESIS = frozenset({"bouc_wen", "dahl", "lugre"})
-_ANY = _FRICTION | _HYSTERESIS
-RIGS: dict[str, RigKind] = {
-    "nothing": RigKind(frozenset(), _nothing),
-    "coulomb": RigKind(frozenset({"coulomb_friction"}), _coulomb, hysteretic=True),
-    "stribeck": RigKind(frozenset({"stribeck"}), _stribeck, hysteretic=True),
-    "dahl": RigKind(frozenset({"dahl"}), lambda random: _presliding(random, (0.0, 0.0)), hysteretic=True),
-    "lugre": RigKind(frozenset({"lugre"}), lambda random: _presliding(random, (0.4, 1.0)), hysteretic=True),
-    "bouc_wen": RigKind(frozenset({"bouc_wen"}), _bouc_wen, hysteretic=True),
-    "friction_backlash": RigKind(frozenset({"friction_backlash"}), _backlash, hysteretic=True),
-    "pinched_hysteresis": RigKind(frozenset({"pinched_hysteresis"}), _pinched, hysteretic=True),
-    "gas_spring": RigKind(frozenset({"gas_spring"}), _gas_spring),
-    "damper_blowoff": RigKind(frozenset({"damper_blowoff"}), _valve),
-    "friction by current": RigKind(frozenset({"coulomb_friction"}), _coulomb, signal=True, hysteretic=True),
-    "hysteresis by current": RigKind(frozenset({"bouc_wen"}), _bouc_wen, signal=True, hysteretic=True),
-    "magneto-rheological after Kwok": RigKind(_ANY, _magneto_rheological, hysteretic=True),
-    "steel after Menegotto and Pinto": RigKind(frozenset({"bouc_wen"}), _menegotto_pinto, hysteretic=True),
-    "self-centring": RigKind(frozenset(), _self_centring, hysteretic=True),
-    "rubber after Berg": RigKind(_HYSTERESIS | {"series_stiffness"}, _rubber, hysteretic=True),
-    "oil that cavitates": RigKind(frozenset({"damper_blowoff", "bouc_wen", "series_stiffness"}), _oil),
-}

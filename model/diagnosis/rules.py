@@ -312,6 +312,9 @@ class ComponentRules:
     refined_latest: float = rule(
         1.4, "times that, up to which a refined delay is one; chosen: not its limit", 1.2, 1.49
     )
+    stops: float = rule(
+        0.2, "of the spring, that a stop of two sides is stiff; chosen: softer, it mends a law", 0.1, 0.4
+    )
     lost: float = rule(0.05, "of the stiffness that a spring keeps within its gap; chosen", 0.02, 0.1)
     slips: float = rule(0.05, "of the time; chosen: what slips less has shown its gap only", 0.02, 0.1)
     lowest_knee: float = rule(0.3, "of the median rate; chosen: a valve that opens below acts as friction", 0.2, 0.5)

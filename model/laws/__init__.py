@@ -41,13 +41,14 @@ from sprung.model.laws.sensor_faults import (
     SENSOR_NOISE,
     SENSOR_STUCK,
 )
-from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS
+from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, PROGRESSIVE_STOP
 from sprung.model.laws.structure import MISSING_CONNECTION, SUSPENDED_MASS, WRONG_POSITION
 from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,
     BUMP_STOP,
+    PROGRESSIVE_STOP,
     CLEARANCE,
     COULOMB_FRICTION,
     DAMPER_BLOWOFF,

@@ -30,7 +30,13 @@ def _cubic(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
     return found
 
 
-CUBIC_STIFFNESS = ElementLaw(
+def _off_centre(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    k3, k2 = p
+    found: FloatArray = (k3 * motion.deflection + k2) * motion.deflection**2
+    return found
+
+
+_CUBIC_STIFFNESS = ElementLaw(
     name="cubic_stiffness",
     title="progressive (cubic) spring",
     parameters=(ParameterSpec("k3", "N/m^3", -1e15, 1e15, "cubic coefficient; negative: softening", _typical_cubic),),
@@ -41,6 +47,18 @@ CUBIC_STIFFNESS = ElementLaw(
     looks_like="stiffness grows smoothly with amplitude; odd harmonics; no hysteresis",
     confused_with=("bump_stop", "clearance"),
     sentence="the spring stiffens with the cube of its deflection, k3 = {k3}",
+)
+CUBIC_STIFFNESS = with_wider_form(
+    _CUBIC_STIFFNESS,
+    ParameterSpec("k2", "N/m^2", -1e12, 1e12, "quadratic coefficient: it is soft elsewhere", lambda seen: 0.0),
+    force=_off_centre,
+    formula="k3 * d**3 + k2 * d**2",
+    shapes=lambda seen: grid([_typical_cubic(seen)], [0.0]),
+    absent=(0.0, 0.0),
+    sentence="the spring stiffens with its deflection, k3 = {k3}, and is softest off the middle, k2 = {k2}",
+    strength=None,
+    prior_cost=RARE,
+    screened=False,
 )
 
 
@@ -104,6 +122,46 @@ BUMP_STOP = with_wider_form(
     prior_cost=RARE,
     screened=False,
     widened=_either_side,
+)
+
+
+def _progressive_stop(motion: Motion, p: Values, element: SpringDamper) -> FloatArray:
+    gap, stiffness, gap_compression, stiffness_compression, exponent = p
+    d = motion.deflection
+    extended, compressed = np.maximum(d - gap, 0.0), np.maximum(-d - gap_compression, 0.0)
+    found: FloatArray = (
+        stiffness * gap * (extended / gap) ** exponent
+        - stiffness_compression * gap_compression * (compressed / gap_compression) ** exponent
+    )
+    return found
+
+
+PROGRESSIVE_STOP = ElementLaw(
+    name="progressive_stop",
+    title="progressive stop",
+    parameters=(
+        _BUMP_STOP.parameters[0],
+        ParameterSpec("stiffness", "N/m", 0.0, 1e12, "force over depth, a gap's length deep", lambda s: s.stiffness),
+        replace(_BUMP_STOP.parameters[0], name="gap_compression", meaning="free travel in compression"),
+        ParameterSpec("stiffness_compression", "N/m", 0.0, 1e12, "the same in compression", lambda s: s.stiffness),
+        ParameterSpec("exponent", "1", 1.0, 4.0, "power of the depth", lambda seen: 2.0),
+    ),
+    force=_progressive_stop,
+    shapes=lambda seen: grid(_reach(seen), [seen.stiffness], _reach(seen), [seen.stiffness], [2.0]),
+    absent=(1.0, 0.0, 1.0, 0.0, 2.0),
+    formula=(
+        "stiffness * gap * (max(d - gap, 0) / gap)**exponent"
+        " - stiffness_compression * gap_compression * (max(-d - gap_compression, 0) / gap_compression)**exponent"
+    ),
+    looks_like="the error appears only in the largest deflections, is elastic, and grows there ever faster",
+    confused_with=("bump_stop", "cubic_stiffness"),
+    sentence=(
+        "a stop that grows with the power {exponent} of its depth is touched beyond {gap} of extension and "
+        "{gap_compression} of compression"
+    ),
+    strength=None,
+    prior_cost=RARE,
+    screened=False,
 )
 
 

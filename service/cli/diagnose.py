@@ -96,7 +96,7 @@ def text(report: Report) -> str:
     if report.summary:
         lines.append(report.summary)
     for finding in report.findings:
-        values = ", ".join(f"{p.name} {p.value:.4g} ± {p.std:.2g} {p.unit}" for p in finding.parameters)
+        values = ", ".join(f"{p.name} {p.words()}" for p in finding.parameters)
         lines.append(finding.sentence or f"{finding.location}: {finding.effect} ({values})")
         if finding.advice:
             lines.append(f"  {finding.advice}")

@@ -35,6 +35,8 @@ MINOR = {"smoothing", "n"}
 
 def quantity(p: LawParameter) -> str:
     """ "395 ± 6 N": rounded to the standard deviation; small lengths and speeds in millimetres."""
+    if not p.determined:
+        return "not determined"
     value, std, unit = p.value, p.std, "" if p.unit in {"", "-", "1"} else p.unit
     if unit in {"m", "m/s"} and max(abs(value), std) < 0.1:
         value, std, unit = 1e3 * value, 1e3 * std, "m" + unit
@@ -53,7 +55,7 @@ def finding_words(finding: Finding) -> str:
     """One finding: place, law, numbers."""
     name = effect_words(finding.family or finding.effect)
     main = [p for p in finding.parameters if p.name not in MINOR]
-    if len(main) == 1:
+    if len(main) == 1 and main[0].determined:
         return f"{name} of {quantity(main[0])}"
     numbers = ", ".join(f"{p.name} {quantity(p)}" for p in main)
     return f"{name}, {numbers}" if numbers else name

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.benchmarks.naming import MOTIONS, RIGS, forces, judged, levels, moved
+from sprung.benchmarks.naming import MOTIONS, forces, judged, levels, moved
+from sprung.benchmarks.naming_rigs import RIGS
 
 SEED = 20_261
 

@@ -86,7 +86,7 @@ def test_laws_that_contain_commoner_ones_must_beat_them():
     rare = {law.name for law in CATALOGUE if law.prior_cost == RARE}
     assert rare == {
         *("air_spring", "fractional_stiffness", "anti_roll_bar", "wheel_flat", "rail_joints"),
-        *("stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring"),
+        *("stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring", "progressive_stop"),
         *("missing_connection", "suspended_mass"),
     }
 
@@ -94,5 +94,14 @@ def test_laws_that_contain_commoner_ones_must_beat_them():
 def test_laws_of_rigs_are_no_candidates_for_a_vehicle():
     """What needs the force of the element itself to be told from its look-alikes."""
     kept = {law.name for law in CATALOGUE if isinstance(law, ElementLaw) and not law.screened}
-    assert kept == {"stribeck", "dahl", "lugre", "pinched_hysteresis", "friction_backlash", "gas_spring", "preload"}
+    assert kept == {
+        "stribeck",
+        "dahl",
+        "lugre",
+        "pinched_hysteresis",
+        "friction_backlash",
+        "gas_spring",
+        "progressive_stop",
+        "preload",
+    }
     assert find_law("bouc_wen").wider.prior_cost == RARE

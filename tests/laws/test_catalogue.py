@@ -20,7 +20,12 @@ SPRING = SpringDamper(4.3e5, 2.0e4)
 RATE = 1000.0
 LAWS = tuple(law for law in CATALOGUE if isinstance(law, ElementLaw))
 ids = [law.name for law in LAWS]
-ONE_SIDED = {"damper_asymmetry", "gas_spring", "preload"}  # whose force backwards is not the opposite
+ONE_SIDED = {
+    "damper_asymmetry",
+    "progressive_stop",
+    "gas_spring",
+    "preload",
+}  # whose force backwards is not the opposite
 FEEDING = {"time_varying_stiffness"}  # a spring that stiffens while it is compressed gives more than it took
 
 

@@ -13,7 +13,7 @@ from sprung.model.diagnosis.component.fit import ComponentFit, fitted, refined
 from sprung.model.diagnosis.component.formula import formula_search
 from sprung.model.diagnosis.component.given import identified_laws
 from sprung.model.diagnosis.component.measured import ComponentRecord, component_records, turned_round
-from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Lag
+from sprung.model.diagnosis.component.piece import HYSTERESIS, SURFACE, Lag, Piece
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.search import (
     Progress as Told,
@@ -24,6 +24,7 @@ from sprung.model.diagnosis.component.search import (
     Step,
     search,
 )
+from sprung.model.diagnosis.component.smooth import smooth_serves
 from sprung.model.diagnosis.component.words import (
     finding_of,
     late_finding,
@@ -128,7 +129,7 @@ def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
     least = _least(judged.found.steps, one.task.rules)
     carried = bool(judged.found.steps) and share is not None and share >= least
-    if alone or (left and not carried):
+    if alone or (left and not carried) or smooth_serves(judged.final, len(one.given.pieces)):
         tell("what is left, as a formula")
         told = _with_formula(judged)
         if told is not None:
@@ -151,7 +152,8 @@ def _only_one_loop(judged: Judged) -> bool:
 
 def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
     """Share of the excess power that laws explain if they are the component's; several imitate much that is none."""
-    return rules.named if len(steps) < 2 else 1 - rules.together
+    one = len(steps) < 2 and not any(isinstance(p, Piece) and p.imitates for p in (s.chosen.last for s in steps))
+    return rules.named if one else 1 - rules.together
 
 
 def _established(judged: Judged) -> Judged:
@@ -167,7 +169,7 @@ def _established(judged: Judged) -> Judged:
     final = refined(task, first.fit.model)
     one = replace(judged, found=replace(judged.found, steps=steps[:1]), final=final, floor=final.floor)
     alone = one.errors.explained()
-    return one if alone is not None and alone >= task.rules.named else judged
+    return one if alone is not None and alone >= _least(steps[:1], task.rules) else judged
 
 
 def _with_formula(judged: Judged) -> Judged | None:

@@ -84,6 +84,7 @@ class PieceKind:
 
 
 STATIC = PieceKind("static", dissipates=False)
+ELASTIC = PieceKind("elastic", dissipates=False)  # a curve over the deflection alone
 FRICTION = PieceKind("friction", dissipates=True)
 HYSTERESIS = PieceKind("hysteresis", dissipates=True)
 
@@ -109,6 +110,7 @@ class Piece:
     acting: ElementLaw | None = None  # law of the columns, where that is another than the one that is named
     acting_parameters: Parameters | None = None
     believed: Believed = lambda fitted: True  # whether the record can have shown these values
+    imitates: bool = False  # much that is none: it has to leave as little as several laws together
     at_low_rates: str = ""  # law that is not sought at low rates, since it acts as this one does there
 
     @property

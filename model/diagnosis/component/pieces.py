@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.diagnosis.component.piece import (
+    ELASTIC,
     FRICTION,
     HYSTERESIS,
     FittedPiece,
@@ -86,7 +87,23 @@ def _loose_within(fitted: FittedPiece) -> bool:
 
 def _held_within(fitted: FittedPiece) -> bool:
     """With no force before it, a stop is the spring, and has a clearance."""
-    return bool(fitted.element.stiffness > fitted.rules.lost * fitted.strengths[0])
+    return bool(fitted.element.stiffness > fitted.rules.lost * np.max(fitted.strengths))
+
+
+def _softest_within(fitted: FittedPiece) -> bool:
+    """A spring with its softest point, -k2 / (3 k3), in the travel: farther off, it is no such spring."""
+    travel = 0.5 * float(np.ptp(fitted.deflection))
+    return bool(abs(fitted.values["k2"]) < 3 * abs(fitted.values["k3"]) * travel)
+
+
+def _stops(fitted: FittedPiece) -> bool:
+    """A stop of two sides, where it is touched deepest, is no softer than a part of the spring: else it mends that."""
+    middle = 0.5 * (fitted.deflection.max() + fitted.deflection.min())
+    d = fitted.deflection - middle
+    depths = np.maximum([d.max() - fitted.shape[0], -d.min() - fitted.shape[1]], 0.0)
+    power = fitted.values.get("exponent", 1.0) - 1
+    hardest = np.max(fitted.strengths * (depths / np.array(fitted.shape[:2])) ** power)
+    return _held_within(fitted) and bool(hardest > fitted.rules.stops * fitted.element.stiffness)
 
 
 def _wider(name: str) -> ElementLaw:
@@ -287,7 +304,29 @@ _SERIES = Piece(
 
 # --- springs ----------------------------------------------------------------------------------------------------
 
-_CUBIC = Piece(_law("cubic_stiffness"), (), _none, lambda seen: [], (0,), lambda a, s, e: (a[0],), lambda p: ())
+_CUBIC = Piece(
+    _law("cubic_stiffness"),
+    (),
+    _none,
+    lambda seen: [],
+    (0,),
+    lambda a, s, e: (a[0],),
+    lambda p: (),
+    kind=ELASTIC,
+)
+_CUBIC_OFF_CENTRE = Piece(
+    _wider("cubic_stiffness"),
+    (),
+    _none,
+    lambda seen: [],
+    (0, 0),
+    lambda a, s, e: (a[0], a[1]),
+    lambda p: (),
+    kind=ELASTIC,
+    plain=1,
+    believed=_softest_within,
+    imitates=True,
+)
 _BUMP_STOP = Piece(
     _law("bump_stop"),
     ("gap",),
@@ -296,7 +335,34 @@ _BUMP_STOP = Piece(
     (1,),
     lambda a, s, e: (s[0], a[0]),
     lambda p: (p[0],),
+    kind=ELASTIC,
     believed=_held_within,
+)
+_TWO_STOPS = Piece(
+    _wider("bump_stop"),
+    ("gap", "gap_compression"),
+    lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.7, 0.85])] * 2),
+    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2,
+    (1, 1),
+    lambda a, s, e: (s[0], a[0], s[1], a[1]),
+    lambda p: (p[0], p[2]),
+    kind=ELASTIC,
+    plain=1,
+    believed=_stops,
+    imitates=True,
+)
+_PROGRESSIVE_STOP = Piece(
+    _law("progressive_stop"),
+    ("gap", "gap_compression", "exponent"),
+    lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.75])] * 2, [1.5, 2.5]),
+    lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2 + [(1.0, 3.5)],  # nearer, it is a progressive spring
+    (1, 1),
+    lambda a, s, e: (s[0], a[0], s[1], a[1], s[2]),
+    lambda p: (p[0], p[2], p[4]),
+    kind=ELASTIC,
+    plain=2,
+    believed=_stops,
+    imitates=True,
 )
 _CLEARANCE = Piece(
     _law("clearance"),
@@ -306,6 +372,7 @@ _CLEARANCE = Piece(
     (1,),
     lambda a, s, e: (s[0],),
     lambda p: (p[0],),
+    kind=ELASTIC,
     believed=_loose_within,
 )
 _GAS_SPRING = Piece(
@@ -316,6 +383,7 @@ _GAS_SPRING = Piece(
     (1,),
     lambda a, s, e: (a[0], s[0], _POLYTROPIC),
     lambda p: (p[1],),
+    kind=ELASTIC,
     plain=1,
 )
 
@@ -363,7 +431,10 @@ PIECES: tuple[Piece, ...] = (
     _ASYMMETRY_OF_VALVES,
     _SERIES,
     _CUBIC,
+    _CUBIC_OFF_CENTRE,
     _BUMP_STOP,
+    _TWO_STOPS,
+    _PROGRESSIVE_STOP,
     _CLEARANCE,
     _GAS_SPRING,
     _FRACTIONAL,

@@ -43,7 +43,7 @@ def finding_of(
     rival = step.rivals[0] if step.rivals else None
     freedom = len(piece.signs) + len(piece.shapes)
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
-    told = ", ".join(f"{q.name.replace('_', ' ')} {value_words(q)}" for q in shown[:3])
+    told = ", ".join(f"{q.name.replace('_', ' ')} {q.words()}" for q in shown[:3])
     formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
     sentence = f"{element}: {f'a force {formula}' if formula else piece.title}, {told}"
     if memory:
@@ -131,15 +131,6 @@ def _forces_at_rates(fit: ComponentFit) -> tuple[LawParameter, ...]:
     return tuple(rows)
 
 
-def value_words(parameter: LawParameter) -> str:
-    """61.2 +- 0.8 N, to the digits that the deviation supports."""
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    if not np.isfinite(parameter.std) or parameter.std <= 0:
-        return f"{parameter.value:.4g}{unit}"
-    digits = max(2, int(np.ceil(np.log10(max(abs(parameter.value), parameter.std) / parameter.std))) + 1)
-    return f"{parameter.value:.{min(digits, 6)}g} +- {parameter.std:.2g}{unit}"
-
-
 def preload_finding(element: str, value: float, sigma: float) -> Finding:
     """A static force: gas, weight or setting of the rig.  Never a fault."""
     parameter = LawParameter("force", value, sigma, "N")
@@ -149,7 +140,7 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
         (parameter,),
         None,
         None,
-        sentence=f"{element}: a static preload of {value_words(parameter)}",
+        sentence=f"{element}: a static preload of {parameter.words()}",
     )
 
 
@@ -199,7 +190,7 @@ def late_finding(sensor: str, element: str, value: float, sigma: float, step: St
     """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics."""
     size = LawParameter("time", abs(1e3 * value), 1e3 * sigma, "ms")
     near, way = _family(SENSOR_LAG.name, alike), "later" if value > 0 else "earlier"
-    sentence = f"{sensor}: the force comes {value_words(size)} {way} than the motion of {element}"
+    sentence = f"{sensor}: the force comes {size.words()} {way} than the motion of {element}"
     if near is not None:
         sentence += f" ({near.replace('_', ' ')} fit almost equally well)"
     rival = next(iter(step.rivals), None)

@@ -148,10 +148,10 @@ def _cost(state: Investigation, fit: Fit, index: int) -> float:
     """What the further parameters of a widened law cost in evidence."""
     term, place = fit.point.terms[index], fit.place(index)
     more = slice(len(state.fit.point.terms[index].parameters), None)
-    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[place][more], 0)) / np.abs(term.slopes[more])
+    told = fit.covariance[place, place][more, more] / np.outer(term.slopes[more], term.slopes[more])
     logs = [spec.log for spec in term.law.parameters[more]]
     rules = state.problem.rules.evidence
-    return occam_cost(logs, term.scales[more], sigma, rules) + rules.rarity * term.law.prior_cost
+    return occam_cost(logs, term.scales[more], told, rules) + rules.rarity * term.law.prior_cost
 
 
 def _starts(base: Fit, index: int) -> Iterator[Point]:

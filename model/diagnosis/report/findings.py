@@ -10,7 +10,7 @@ from sprung.model.diagnosis.investigation.course import Found, InputFault, Noise
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.report.report import Finding, LawParameter
-from sprung.model.diagnosis.report.sentences import sentence_of, with_deviation
+from sprung.model.diagnosis.report.sentences import sentence_of
 from sprung.model.diagnosis.report.values import formula_of, law_parameters
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import ReportRules
@@ -134,7 +134,7 @@ def _experiment(term: Term) -> str:
 def _input_finding(fault: InputFault) -> Finding:
     spec = fault.term.law.parameters[0]
     parameter = LawParameter(spec.name, fault.term.parameters[0], fault.std, spec.unit)
-    words = fault.term.law.sentence.format(**{spec.name: with_deviation(parameter)})
+    words = fault.term.law.sentence.format(**{spec.name: parameter.words()})
     return Finding(
         location=fault.term.location,
         effect=fault.term.law.name,
@@ -151,7 +151,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
     if fault.value is not None and fault.effect.parameter is not None:
         name, unit = fault.effect.parameter
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
-    sentence = fault.effect.told(fault.site, with_deviation(parameters[0]) if parameters else "")
+    sentence = fault.effect.told(fault.site, parameters[0].words() if parameters else "")
     share = 100 * (1 - fault.after / fault.before)
     return Finding(
         location=fault.site.location,

@@ -45,6 +45,21 @@ class LawParameter:
     std: float
     unit: str
 
+    @property
+    def determined(self) -> bool:
+        """Whether the recording tells it; not where the deviation exceeds the value: then any other may be true."""
+        return not self.std > abs(self.value)
+
+    def words(self) -> str:
+        """395 +- 6 N, to the digits that the deviation supports."""
+        if not self.determined:
+            return "not determined"
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        if not math.isfinite(self.std) or self.std <= 0:
+            return f"{self.value:.4g}{unit}"
+        digits = max(2, math.ceil(math.log10(max(abs(self.value), self.std) / self.std)) + 1)
+        return f"{self.value:.{min(digits, 6)}g} +- {self.std:.2g}{unit}"
+
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedLaw:
@@ -202,6 +217,9 @@ class Report:
 
 def plain(value: Any) -> Any:
     """A value as JSON can hold it: dataclasses by their fields; None stands for a number that is not finite."""
+    if isinstance(value, LawParameter):
+        told = {"name": value.name, "value": plain(value.value), "std": plain(value.std), "unit": value.unit}
+        return told if value.determined else told | {"determined": False}
     if is_dataclass(value):
         return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):

@@ -5,23 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.diagnosis.investigation.course import Outcome
-from sprung.model.diagnosis.report.report import Finding, LawParameter
+from sprung.model.diagnosis.report.report import Finding
 from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import StructureLaw
 
 
-def with_deviation(parameter: LawParameter) -> str:
-    """395 +- 6 N, to the digits that the deviation supports."""
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
-    if not np.isfinite(parameter.std) or parameter.std <= 0:
-        return f"{parameter.value:.4g}{unit}"
-    digits = max(2, int(np.ceil(np.log10(max(abs(parameter.value), parameter.std) / parameter.std))) + 1)
-    return f"{parameter.value:.{min(digits, 6)}g} +- {parameter.std:.2g}{unit}"
-
-
 def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
-    values = {p.name: with_deviation(p) for p in finding.parameters}
+    values = {p.name: p.words() for p in finding.parameters}
     try:
         words = _told(finding) if finding.formula else term.law.sentence.format(**values)
     except (KeyError, IndexError):
@@ -39,7 +30,7 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
 
 def _told(finding: Finding) -> str:
     """A formula with its values."""
-    values = ", ".join(f"{p.name} = {with_deviation(p)}" for p in finding.parameters)
+    values = ", ".join(f"{p.name} = {p.words()}" for p in finding.parameters)
     hidden = f" with z' = {finding.memory}" if finding.memory else ""
     return f"a force that no law of the catalogue explains, by regression {finding.formula}{hidden} ({values})"
 

@@ -271,8 +271,9 @@ def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> l
 def cost(fit: Fit, count: int, rules: EvidenceRules = RULES.evidence) -> float:
     """What the last `count` law parameters cost in evidence."""
     term = fit.point.terms[-1]
-    sigma = np.sqrt(np.maximum(np.diag(fit.covariance)[-count:], 0)) / np.abs(term.slopes) if count else np.zeros(0)
-    total = occam_cost([spec.log for spec in term.law.parameters], term.scales, sigma, rules)
+    block = fit.covariance[len(fit.covariance) - count :, len(fit.covariance) - count :]
+    logs = [spec.log for spec in term.law.parameters]
+    total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
         total += unusual_cost(value / scale, spec.usual, rules)
     return total

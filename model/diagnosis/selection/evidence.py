@@ -10,10 +10,11 @@ little louder, and a plain sum of logarithms lets their number outvote the signa
 weighed by power: of the sum of all gains, they take away at most the share in which chi^2 rises there of what it
 falls elsewhere.  So a fall of chi^2 is never evidence against a model.
 
-Evidence of a model, up to constants:   gain - sum over law parameters of 2 log(width / (sigma sqrt(2 pi)))
+Evidence of a model, up to constants:   gain - log det(I + W C^-1 W),   W = diag(width / sqrt(2 pi))
 
-(Laplace's approximation with a flat prior of `width`, MacKay 2003, chapter 28): a parameter costs what the recording
-tells about it, so a shape that does not matter costs nothing, where BIC would charge log n for it.
+with C the covariance of the law's parameters (Laplace's approximation with priors of `width`, MacKay 2003, chapter 28),
+which is 2 log(width / (sigma sqrt(2 pi))) of a single one: a parameter costs what the recording tells about it, so a
+shape that does not matter costs nothing, where BIC would charge log n for it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from scipy import stats
 
 from sprung.model.diagnosis.rules import RULES, EvidenceRules
 from sprung.model.signals import FloatArray
+
+_SINGULAR = 1e-13  # share of a variance, below which rounding is all that there is
 
 
 def block_edges(bins: int, rules: EvidenceRules = RULES.evidence) -> np.ndarray:
@@ -101,15 +104,31 @@ def monotone_gains(gains: Sequence[float], left: Sequence[float], rules: Evidenc
 
 
 def occam_cost(
-    logarithmic: Sequence[bool], scales: Sequence[float], sigma: FloatArray, rules: EvidenceRules = RULES.evidence
+    logarithmic: Sequence[bool],
+    scales: Sequence[float],
+    covariance: FloatArray,
+    rules: EvidenceRules = RULES.evidence,
 ) -> float:
-    """What free parameters cost: each by how much narrower the recording makes it than its prior was."""
-    total = 0.0
-    for log, scale, s in zip(logarithmic, scales, sigma, strict=True):
-        width = rules.log_width if log else rules.widths * scale
-        if s > 0:
-            total += max(0.0, 2 * float(np.log(width / (s * np.sqrt(2 * np.pi)))))
-    return total
+    """What free parameters cost: by how much narrower the recording makes them, together, than their priors were.
+
+    Numbers of which it tells a product alone, such as a stiffness and what it yields over, are told nothing one by one
+    and cost as much as the one number that the product is: the log determinant of I + W C^-1 W, W the priors' widths.
+
+    covariance: of the parameters as they are searched, logarithms of those of unknown order, (p, p).
+    """
+    widths = [rules.log_width if log else rules.widths * scale for log, scale in zip(logarithmic, scales, strict=True)]
+    variance = np.diag(covariance)
+    free = np.isfinite(variance) & (variance > 0)
+    told = covariance[np.ix_(free, free)]
+    prior = np.diag(np.array(widths)[free] ** 2 / (2 * np.pi))
+    return max(0.0, _log_det(told + prior) - _log_det(told))
+
+
+def _log_det(covariance: FloatArray) -> float:
+    """Of a covariance whose entries may differ by many orders."""
+    size = np.sqrt(np.diag(covariance))
+    shares = np.linalg.eigvalsh(covariance / np.outer(size, size))
+    return float(2 * np.sum(np.log(size)) + np.sum(np.log(np.maximum(shares, _SINGULAR))))
 
 
 def unusual_cost(relative: float, usual: tuple[float, float], rules: EvidenceRules = RULES.evidence) -> float:

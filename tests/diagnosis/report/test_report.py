@@ -46,3 +46,14 @@ def test_a_finding_says_only_what_is_known_of_it() -> None:
 def test_a_variant_is_told_where_there_is_one() -> None:
     assert "variant" not in IdentifiedLaw("k1", "bump_stop", ()).to_dict()
     assert IdentifiedLaw("car", "flexible_mode", (), "bending").to_dict()["variant"] == "bending"
+
+
+def test_a_number_whose_deviation_exceeds_it_is_told_as_not_determined() -> None:
+    beta = LawParameter("beta", 3.5e13, 6.3e14, "m^-n")
+    assert not beta.determined
+    assert beta.words() == "not determined"
+    assert plain(beta)["determined"] is False
+    force = LawParameter("yield_force", 63.0, 8.4, "N")
+    assert force.words() == "63 +- 8.4 N"
+    assert "determined" not in plain(force)
+    assert LawParameter("loop_area", 5.0, float("nan"), "J").determined

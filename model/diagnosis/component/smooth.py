@@ -1,0 +1,62 @@
+"""Laws over the deflection, held against a smooth spring: several of them imitate any curve.
+
+Stops, gaps and progressive springs are curves over the deflection.  A sum of them, or one of many numbers, comes close
+to any other curve, so that a good fit alone does not make them the component's.  A polynomial of as many numbers has
+none of their knees: they are named where they beat it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.diagnosis.component.fit import ComponentFit, refined
+from sprung.model.diagnosis.component.motion import ElementMotion
+from sprung.model.diagnosis.component.piece import ELASTIC, Piece, Seen, Shape, SliderSurface
+from sprung.model.diagnosis.selection.evidence import effective_count, level_gain
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class SmoothSpring(SliderSurface):
+    """A polynomial of the deflection, from its square on: the spring has the rest."""
+
+    title: str = "a smooth spring"
+    key: str = "smooth spring"
+    powers: int = 1
+
+    @property
+    def signs(self) -> tuple[int, ...]:
+        return (0,) * self.powers
+
+    def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
+        x = (motion.deflection - motion.middle) / Seen.of(motion).travel
+        return np.column_stack([x**power for power in range(2, self.powers + 2)])
+
+
+def smooth_serves(fit: ComponentFit, first: int) -> bool:
+    """Whether a smooth spring of as many numbers serves as well as the laws over the deflection, from `first` on.
+
+    Asked of several such laws, and of one with knees that imitates much; others have too few numbers to imitate
+    anything, and a progressive spring off centre is such a smooth spring itself.
+    """
+    model, rules = fit.model, fit.task.rules
+    curves = [i for i in range(first, len(model.pieces)) if model.pieces[i].kind is ELASTIC]
+    bent = [piece for i in curves if isinstance(piece := model.pieces[i], Piece) and piece.shapes]
+    if not bent or (len(curves) < 2 and not bent[0].imitates):
+        return False
+    quick = fit.task.every(max(1, len(fit.task.force) // rules.search))
+    laws, rest = refined(quick, model), model
+    for index in reversed(curves):
+        rest = rest.without(index)
+    smooth = refined(quick, rest.plus(SmoothSpring(powers=sum(_numbers(fit, i) for i in curves)), ()))
+    gain = level_gain(smooth.error, laws.error, effective_count(laws.residual[: quick.split]))
+    return gain < rules.naming_margin or smooth.held_out <= laws.held_out
+
+
+def _numbers(fit: ComponentFit, index: int) -> int:
+    """Numbers of a law that act: a stop that is never touched has none."""
+    strengths = fit.strengths_of(index)
+    acting = int(np.sum(strengths != 0.0))
+    return acting + max(0, len(fit.model.shapes[index]) - (len(strengths) - acting))
