@@ -32,6 +32,18 @@ def test_no_rig_is_called_something_else_or_clear(name: str, motion: str) -> Non
     assert line["judged"] in ("right", "unknown"), line
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "name",
+    ["one-sided stop", "stops at unequal travel", "progressive stop", "valve beside a stop", "spring off centre"],
+)
+def test_stops_and_springs_lie_within_their_deviations(name: str) -> None:
+    line = tried(name, "random")
+    values = line["values"]
+    assert isinstance(values, dict) and values, line
+    assert all(abs(value - truth) < 3 * std for truth, value, std in values.values()), values
+
+
 def test_steel_starts_along_its_spring_and_ends_near_its_yield_force() -> None:
     random = np.random.default_rng(1)
     step = RIGS["steel after Menegotto and Pinto"].made(random).step
