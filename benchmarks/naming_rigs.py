@@ -143,7 +143,8 @@ def _stopped(gap: float, hard: float, gap_compression: float, hard_compression: 
 
     def step(x: float, v: float, h: float) -> float:
         over, under = max(x - gap, 0.0) / gap, max(-x - gap_compression, 0.0) / gap_compression
-        return hard * gap * over**power - hard_compression * gap_compression * under**power
+        force: float = hard * gap * over**power - hard_compression * gap_compression * under**power
+        return force
 
     return step
 
