@@ -150,6 +150,7 @@ class PlausibleRules:
     lines: int = rule(4, "of them at most; chosen", 2, 8)
     bins: int = rule(2, "on either side of a line; derived: they hold 92 % of a sine between two bins", 1, 4)
     harmonics: int = rule(30, "of a line that a non-linear answer may have; chosen", 15, 60)
+    apart: float = rule(3.0, "deviations from what it is without, of a gain or a mass; derived: one in 400", 2.0, 4.0)
     close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
 
 

@@ -24,6 +24,9 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
+_ROUND = 0.05  # of a linearisation of a vehicle, that a law's force along a motion and what it does take
+
+
 @dataclass(frozen=True)
 class SmoothedInputs:
     """Inputs as the sensors ask for them within their noise."""
@@ -69,6 +72,8 @@ class Problem:
         """Shown sensor signals, (F, S), the model, and the forces of its laws."""
         forward = self.forward(point, inputs, known)
         forces = law_forces(forward, point, inputs)
+        if self.work is not None and forces is not None:
+            self.work.add(_ROUND * forces.rounds * self.part.grid.samples)
         return self.shown(forward, forces), forward, forces
 
     def shown(self, forward: Forward, forces: LawForces | None) -> ComplexArray:

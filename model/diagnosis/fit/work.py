@@ -4,14 +4,17 @@ from __future__ import annotations
 
 
 class WorkBudget:
-    """Samples of all models that were linearised, and how many may be.  May be shared among threads."""
+    """Samples of all models that were linearised, and how many may be.  May be shared among threads.
+
+    Solving a law's loop counts as a share of that for every time the law is asked for its force over the record.
+    """
 
     def __init__(self, most: float) -> None:
         self.most = most
         self.done = 0.0
 
     def add(self, samples: float) -> None:
-        """One more linearisation."""
+        """One more linearisation, or as much of one as a loop takes."""
         self.done += samples
 
     @property

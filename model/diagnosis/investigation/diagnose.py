@@ -54,7 +54,7 @@ from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.evidence import chance
 from sprung.model.diagnosis.selection.holdout import HeldOut
-from sprung.model.diagnosis.selection.plausible import doubt, harmonic, out_of_range
+from sprung.model.diagnosis.selection.plausible import doubt, hardly_there, harmonic, out_of_range
 from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.system import System
 
@@ -225,7 +225,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
     tried = with_wider_rivals(state, tried)
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
-    worthy = [t for t in tried if t.finished and t.evidence > 0 and not _minor(state, t)]
+    there = [t for t in tried if not hardly_there(t.fit, t.term, plausible)]
+    worthy = [t for t in there if t.finished and t.evidence > 0 and not _minor(state, t)]
     plain = [t for t in worthy if any(t is one for one in believed)]
     trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions

@@ -7,11 +7,10 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.selection.plausible import SIMULATED
 from sprung.model.laws import ElementLaw, reversal_step
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
-
-_NUMERICAL = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
 
 
 def figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
@@ -55,7 +54,7 @@ def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ..
 def law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
-    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), _NUMERICAL * np.abs(term.parameters))
+    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), SIMULATED * np.abs(term.parameters))
     hidden = not term.law.named
     parameters = tuple(
         LawParameter(spec.name, float(value), float(s), spec.unit)

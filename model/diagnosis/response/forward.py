@@ -285,10 +285,11 @@ class Forward:
             return None
         start = np.column_stack(self.start_force) if self.start_force else loop.law(loop.d0, loop.v0)
         force, settled = fixed_point(lambda force: loop.law(*loop.motion(force)), start, tolerance)
-        if settled or not self.patient or self.plant.floats:
+        newton = None if settled or not self.patient or self.plant.floats else newton_step(loop)
+        if newton is None:
             return loop.answer(force, settled)
         for begin in (start,) if self.start_force else (start, np.zeros_like(start)):
-            found, settled = fixed_point(newton_step(loop), begin, tolerance, PATIENCE)
+            found, settled = fixed_point(newton, begin, tolerance, PATIENCE)
             if settled:
                 return loop.answer(found)
         return loop.answer(force, converged=False)

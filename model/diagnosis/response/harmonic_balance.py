@@ -44,6 +44,7 @@ class LawForces:
     deflections: ComplexArray  # what they add to the deflections, periodic part, (F, E)
     q: ComplexArray  # what they add to the degrees of freedom, periodic part, (F, n)
     motion: FloatArray  # polynomial motion that they add, (DEGREE + 1, n)
+    rounds: int = 0  # how often a law was asked for its force over the whole record
 
     def index(self, term: Term) -> int:
         """Which of the laws a term is, whatever its values."""
@@ -80,6 +81,7 @@ class HarmonicBalance:
         self.lines = np.array([plant.line_motion(port) for port in self.wide])  # (m, 2, DEGREE + 1, n)
         self.line_d = np.einsum("bkpn,an->kpab", self.lines, self.wide @ H)
         self.powers = self.grid.fine_monomials
+        self.rounds = 0  # how often a law was asked for its force
 
     def _drive(self, d0: FloatArray, v0: FloatArray) -> None:
         self.d0, self.v0 = d0, v0
@@ -93,15 +95,18 @@ class HarmonicBalance:
 
     def law(self, d: FloatArray, v: FloatArray) -> FloatArray:
         """Forces along a motion (4N, m), without what the plant carries."""
-        time = self.grid.start + self.grid.fine_time
-        d, v = np.clip(d, -self.reach[0], self.reach[0]), np.clip(v, -self.reach[1], self.reach[1])
-        columns = [
-            force_along(t.element_law, t.parameters, d[:, i], v[:, i], time, self.elements[i])
-            - t.equivalent[0] * d[:, i]
-            - t.equivalent[1] * v[:, i]
-            for i, t in enumerate(self.terms)
-        ]
-        return np.column_stack(columns)
+        return np.column_stack([self.law_of(i, d, v) for i in range(len(self.terms))])
+
+    def law_of(self, index: int, d: FloatArray, v: FloatArray) -> FloatArray:
+        """Force of one of the laws along a motion (4N, m) of all, (4N,)."""
+        self.rounds += 1
+        term, time = self.terms[index], self.grid.start + self.grid.fine_time
+        d, v = (
+            np.clip(x[:, index], -reach[index], reach[index]) for x, reach in zip((d, v), self.reach, strict=True)
+        )
+        force = force_along(term.element_law, term.parameters, d, v, time, self.elements[index])
+        found: FloatArray = force - term.equivalent[0] * d - term.equivalent[1] * v
+        return found
 
     def answer(self, force: FloatArray, converged: bool = True) -> LawForces:
         """What forces (4N, m) do to the system."""
@@ -112,7 +117,10 @@ class HarmonicBalance:
         motion = np.einsum("bkpn,kb->pn", self.lines, line[:2])
         sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
         q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
-        return LawForces(self.terms, self.ports, d, v, force, converged, sensors, q @ plant.structure.H.T, q, motion)
+        deflections = q @ plant.structure.H.T
+        return LawForces(
+            self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.rounds
+        )
 
     def _compliance(self, ports: FloatArray) -> ComplexArray:
         """Deflection along the ports per force along them, also above the record's Nyquist frequency.

@@ -16,6 +16,8 @@ from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import BodyLaw, ElementLaw, SupportLaw, reversal_step
 from sprung.model.signals import FloatArray
 
+SIMULATED = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
+
 
 def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """Why a fitted term is not believed, in words; None: nothing speaks against it."""
@@ -39,6 +41,15 @@ def out_of_range(term: Term) -> str | None:
             unit = "" if spec.unit == "1" else f" {spec.unit}"
             return f"{spec.name} {value:.3g}{unit} lies outside {low:g} to {high:g}"
     return None
+
+
+def hardly_there(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> bool:
+    """Whether the last term of a fit, with one parameter, does not differ from its absence by its stated deviation."""
+    if len(term.parameters) != 1 or not np.isfinite(term.law.absent[0]):
+        return False
+    value = term.parameters[0]
+    stated = np.hypot(np.sqrt(max(fit.covariance[-1, -1], 0.0)), SIMULATED * abs(value))
+    return bool(abs(value - term.law.absent[0]) < rules.apart * stated)
 
 
 def _saturates(fit: Fit, term: Term, rules: PlausibleRules) -> bool:

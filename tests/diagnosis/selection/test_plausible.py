@@ -10,7 +10,7 @@ import pytest
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.selection.plausible import doubt, excitation_lines, harmonic, out_of_range
+from sprung.model.diagnosis.selection.plausible import doubt, excitation_lines, hardly_there, harmonic, out_of_range
 from sprung.model.laws import find_law
 
 GRID = Grid(4000, 0.01)
@@ -67,6 +67,21 @@ def test_a_broad_excitation_has_no_harmonics() -> None:
 def test_gains_and_masses_that_stand_for_something_else_are_not_believed(law, values, believed) -> None:
     reason = out_of_range(Term(find_law(law), "x", values))
     assert (reason is None) == believed
+
+
+@pytest.mark.parametrize(
+    ("law", "values", "deviation", "hardly"),
+    [
+        ("sensor_gain", (1.0006,), 1e-5, True),  # a simulation is no better than a thousandth
+        ("sensor_gain", (1.008,), 1e-5, False),
+        ("mass_change", (1.02,), 0.01, True),
+        ("sensor_bias", (0.02,), 0.001, False),
+        ("coulomb_friction", (20.0, 0.01), 30.0, False),  # several values at once: what they explain tells
+    ],
+)
+def test_what_is_as_if_it_were_not_there_is_no_finding(law, values, deviation, hardly) -> None:
+    fit = SimpleNamespace(covariance=np.diag([1.0, deviation**2]))
+    assert hardly_there(fit, Term(find_law(law), "x", values)) == hardly
 
 
 @pytest.mark.parametrize(("knee", "believed"), [(0.2, True), (0.004, False)])
