@@ -78,9 +78,7 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
             tell(0.92, "the budget of work is spent: no further candidate is fitted")
         if len(state.found) == len(before.found):
             break
-        if not state.found[-1].trial.named:
-            tell(0.3 + 0.17 * number, "laws with names in the place of a force without")
-            state = by_names(before, state, lambda plain: with_findings(plain, tell))
+        state = by_names(before, state, lambda plain: with_findings(plain, tell), tell)
         state = without_idle(state)
         if _still_strange(state, before.fit) or another_structure(state):
             break  # what comes next would be names for what another structure does

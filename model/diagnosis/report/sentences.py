@@ -22,8 +22,9 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
     if finding.family is not None:
         words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
-    bias = _worst_bias(outcome)
-    if bias is not None:
+    found = outcome.investigation.found
+    bias = _worst_bias(outcome, "without it" if len(found) == 1 else "without these findings")
+    if bias is not None and found[0].trial.term.key[:2] == term.key[:2]:  # what all of them did together is said once
         sentence += f"; {bias}"
     return sentence
 
@@ -35,7 +36,7 @@ def _told(finding: Finding) -> str:
     return f"a force that no law of the catalogue explains, by regression {finding.formula}{hidden} ({values})"
 
 
-def _worst_bias(outcome: Outcome) -> str | None:
+def _worst_bias(outcome: Outcome, without: str) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
     course, final = outcome.investigation, outcome.final
     sigma = deviations(course.system, final)
@@ -50,4 +51,4 @@ def _worst_bias(outcome: Outcome) -> str | None:
     side = "high" if change > 0 else "low"
     if np.exp(shift[worst]) > course.options.rules.report.no_longer:
         return f"{course.system.parameters[worst].name} is then no longer needed"
-    return f"without it {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"
+    return f"{without} {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"

@@ -101,9 +101,7 @@ class HarmonicBalance:
         """Force of one of the laws along a motion (4N, m) of all, (4N,)."""
         self.rounds += 1
         term, time = self.terms[index], self.grid.start + self.grid.fine_time
-        d, v = (
-            np.clip(x[:, index], -reach[index], reach[index]) for x, reach in zip((d, v), self.reach, strict=True)
-        )
+        d, v = (np.clip(x[:, index], -reach[index], reach[index]) for x, reach in zip((d, v), self.reach, strict=True))
         force = force_along(term.element_law, term.parameters, d, v, time, self.elements[index])
         found: FloatArray = force - term.equivalent[0] * d - term.equivalent[1] * v
         return found
@@ -118,9 +116,7 @@ class HarmonicBalance:
         sensors = np.einsum("fsb,fb->fs", plant.sensor_of_force @ self.wide.T, spectrum)
         q = -np.einsum("fnm,fm->fn", plant.receptance, spectrum @ (self.wide @ plant.structure.H))
         deflections = q @ plant.structure.H.T
-        return LawForces(
-            self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.rounds
-        )
+        return LawForces(self.terms, self.ports, d, v, force, converged, sensors, deflections, q, motion, self.rounds)
 
     def _compliance(self, ports: FloatArray) -> ComplexArray:
         """Deflection along the ports per force along them, also above the record's Nyquist frequency.
