@@ -65,3 +65,15 @@ def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch):
     signals = prepare(system, simulate(seconds=12).values, 100.0).signals
     with pytest.raises(DiagnosisError, match="numbers diverge; check units"):
         baseline(system, signals, declared_noise(system, signals), 700)
+
+
+def test_a_long_step_of_a_law_keeps_its_direction():
+    """A loop's exponent and the logarithm of its beta move along a valley: one of them cut short leaves it."""
+    loop = Term(find_law("bouc_wen"), "secondary", (5e5, 3e4, 2.0), scales=(1e5, 1e4, 1.0))
+    short, long = (loop.advanced(np.array([1e3, -2.6, -0.46]) * share) for share in (0.1, 1.0))
+    changes = [
+        (moved.parameters[0] - 5e5, np.log(moved.parameters[1] / 3e4), moved.parameters[2] - 2.0)
+        for moved in (short, long)
+    ]
+    assert changes[1][1] == pytest.approx(-1.0)
+    np.testing.assert_allclose(np.array(changes[1]) / changes[1][1], np.array(changes[0]) / changes[0][1])
