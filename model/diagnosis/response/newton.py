@@ -88,9 +88,10 @@ def answered(hold: Hold, gains: FloatArray, missing: FloatArray, memory: float) 
     many = int(np.clip(_AT_ONCE / states**3, 4, total // 4))
     inverse = np.linalg.inv(np.eye(missing.shape[1]) - gains @ hold[2])  # (T, m, m)
     rows, right = inverse @ gains, (inverse @ missing[:, :, None])[:, :, 0]
-    if _DEARER * total < before * many:
-        return _joined(hold, gains, missing, (rows, right), many)
-    return _marched(hold, (rows, right), before)
+    with np.errstate(all="ignore"):  # steps that diverge are not taken
+        if _DEARER * total < before * many:
+            return _joined(hold, gains, missing, (rows, right), many)
+        return _marched(hold, (rows, right), before)
 
 
 def _marched(hold: Hold, solved: tuple[FloatArray, FloatArray], before: int) -> FloatArray:
@@ -144,7 +145,9 @@ def _joined(
     for one in maps:
         whole = one[:, :-1] @ whole
         whole[:, -1] += one[:, -1]
-    x = [np.linalg.solve(np.eye(states) - whole[:, :-1], whole[:, -1])]
+    if not np.all(np.isfinite(whole)):  # nothing comes back to itself
+        return np.full_like(right, np.nan)
+    x = [np.linalg.lstsq(np.eye(states) - whole[:, :-1], whole[:, -1], rcond=None)[0]]
     for one in maps[:-1]:
         x.append(one[:, :-1] @ x[-1] + one[:, -1])
     now, result = np.array(x)[:, :, None], np.empty((len(first) * length, right.shape[1]))

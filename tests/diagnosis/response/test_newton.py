@@ -45,3 +45,9 @@ def test_what_forgets_quickly_is_answered_alike_by_stretches_from_rest() -> None
     missing = random.standard_normal((STEPS, 1))
     quick = answered(hold, gains, missing, 20 / (0.5 * 2 * np.pi * 1.3 * STEP))
     np.testing.assert_allclose(quick, answered(hold, gains, missing, 1e9), atol=1e-6)
+
+
+def test_what_grows_beyond_all_bounds_is_told_by_its_numbers() -> None:
+    transition, begin, end = held(1.3, 0.02)
+    found = answered((2 * transition, begin, end), np.zeros((STEPS, 1, 2)), np.ones((STEPS, 1)), 1e9)
+    assert not np.all(np.isfinite(found))
