@@ -25,7 +25,7 @@ from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, cha
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.hours import full_hours
 from sprung.benchmarks.keeping import keep, kept
-from sprung.model.identification.deviations import CARGO, deviations
+from sprung.model.identification.deviations import CARGO, OWN, deviations
 from sprung.model.identification.identify import Identifier
 from sprung.model.signals import Conditions, Deviating, Estimate, FloatArray
 from sprung.model.system import System, load_system
@@ -76,16 +76,17 @@ class Pool:
     root: FloatArray  # information = root root'
     error: FloatArray  # Cholesky factor of the parameters' covariance given the deviations, (P, P)
     given: FloatArray
-    spread: FloatArray  # covariance of what describes the load, (X, X)
+    spread: FloatArray  # covariance of what describes the load and how bodies are built, (X, X)
     covariance: FloatArray  # of the parameters, (P, P)
 
 
-def pool(some: Sequence[Estimate], cargo: int) -> Pool:
+def pool(some: Sequence[Estimate], prior: FloatArray) -> Pool:
     """`POOLED` windows like `some`, each as often as the others: what a clock that is off by milliseconds does at the
     edges of one window averages out over a ride.
 
-    cargo: how many of the deviations, the last ones, describe the load.
+    prior: standard deviations (X,) of the last deviations, which describe the load and how bodies are built.
     """
+    cargo = len(prior)
     window, said = some[0], [one.deviating for one in some if one.deviating is not None]
     precision = [np.linalg.inv(of.given) for of in said]
     given: FloatArray = np.linalg.inv(np.mean(precision, axis=0)) / POOLED
@@ -98,7 +99,7 @@ def pool(some: Sequence[Estimate], cargo: int) -> Pool:
     values, vectors = np.linalg.eigh(information)
     root = np.asarray(vectors * np.sqrt(values.clip(0)), dtype=np.float64)
     error = np.asarray(np.linalg.cholesky(given), dtype=np.float64)
-    spread = np.asarray(np.linalg.inv(information[-cargo:, -cargo:]), dtype=np.float64)
+    spread = np.asarray(np.linalg.inv(information[-cargo:, -cargo:] + np.diag(prior**-2)), dtype=np.float64)
     of_cargo = like.cross[:, -cargo:]
     return Pool(
         window, like, information, root, error, given, spread, given + of_cargo @ spread @ of_cargo.T,
@@ -152,6 +153,8 @@ def live(
     drift = rng.normal(0, service.gain_drift, len(parts)) / MONTH
     season = rng.uniform(0, 2 * np.pi)
     began = SETTLED_DAYS + rng.uniform(0, 1) if fault else np.inf
+    built = np.array([part.std for part in parts if part.kind in OWN])
+    built *= np.random.default_rng([seed, 9]).standard_normal(len(built))
     lost = np.zeros(len(names))
     if fault:
         lost[names.index(fault)] = np.log(FAULTS[fault.rpartition(".")[2]])
@@ -169,7 +172,8 @@ def live(
         )
         truth = truth + lost * (clock >= began * DAY)
         off = np.array([_off(part, i, clocks, drift, clock) for i, part in enumerate(parts)])
-        off[-len(windows[0].spread) :] = boarded(rng, service, empty)
+        off[[part.kind in CARGO for part in parts]] = boarded(rng, service, empty)
+        off[[part.kind in OWN for part in parts]] = built
         estimate = drawn(rng, windows[rng.integers(len(windows))], truth, off)
         conditions = Conditions(rng.uniform(*service.cruise), air + rng.normal(0, 0.3) if measured else np.nan)
         state = tracker.update(state, estimate, round((clock + 0.5 * ride) * 1e9), conditions)
@@ -219,9 +223,9 @@ class Lives:
 
     @cached_property
     def pools(self) -> list[Pool]:
-        cargo = sum(part.kind in CARGO for part in deviations(self.system))
+        prior = np.array([part.std for part in deviations(self.system) if part.kind not in ("gain", "delay")])
         found = library(self.system, self.windows, self.seed)
-        return [pool([found[(k + i) % len(found)] for i in range(ALIKE)], cargo) for k in range(len(found))]
+        return [pool([found[(k + i) % len(found)] for i in range(ALIKE)], prior) for k in range(len(found))]
 
     def ours(self, number: int) -> bool:
         return number % self.part[1] == self.part[0] - 1

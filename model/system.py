@@ -67,6 +67,7 @@ class System:
     file: SystemFile
     catalogue: tuple[Law, ...] = CATALOGUE
     whole: bool = False  # whether laws of bodies and of the structure are part of the mechanics; see `whole_system`
+    as_drawn: bool = False  # whether bodies are as the file says, see `built`
 
     def __reduce__(self) -> tuple[Callable[..., System], tuple[object, ...]]:
         """To another process goes the file: the bundled laws are there already, and functions do not travel."""
@@ -266,6 +267,18 @@ class System:
         std = LOAD_STD if most is None else max(0.5 * np.log1p(most / mass), 0.05)
         least = None if body.load is None else body.load.min
         return LoadState(f"{name}.load", name, mass, declared, float(std), least, most)
+
+    @cached_property
+    def built(self) -> tuple[str, ...]:
+        """Bodies of which windows tell how they are built otherwise than the file says, see `model.simulate.loading`.
+
+        Those that carry others and roll or pitch, unless their mass is fixed or estimated; none where laws act.
+        """
+        if self.as_drawn or self.laws or self.on_track or not self.file.inputs:
+            return ()
+        told = {load.body for load in self.loads} | {p.element for p in self.parameters if p.quantity == "mass"}
+        turning = {n: b for n, b in self.file.bodies.items() if b.roll_inertia or b.pitch_inertia}
+        return tuple(name for name, body in turning.items() if name not in told and not body.mass.fixed)
 
     @cached_property
     def doubtful_masses(self) -> dict[str, float]:

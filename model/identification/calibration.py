@@ -99,7 +99,7 @@ class DeviationSensitivity:
     def __init__(self, model: WindowModel) -> None:
         system = model.system
         self.model, self.deviations = model, deviations(system)
-        self.inputs = len(system.inputs)
+        self.inputs, self.measured = len(system.inputs), 2 * len(system.channels)  # gains and delays come first
         time = np.arange(model.samples) / system.sample_rate
         self.slope = torch.as_tensor(CubicSpline(time, np.eye(model.samples))(time, 1))
         drive, share = [], []
@@ -111,7 +111,7 @@ class DeviationSensitivity:
         self.drive = torch.as_tensor(drive)  # of every input channel
         self.share = torch.as_tensor(np.array(share).reshape(-1, len(omega)).T.copy())  # of its drive, (F, inputs)
         self._dropped: dict[bytes, Tensor] = {}
-        self.redundancy = Redundancy(system, model.samples, len(self.deviations))
+        self.redundancy = Redundancy(system, model.samples, self.measured)
 
     def motions(self, data: WindowBatch) -> tuple[tuple[Tensor, Tensor], tuple[Tensor, Tensor]]:
         """Values and rates (B, T, W/2) of the drives as gains change them, and as delays do."""
@@ -140,7 +140,7 @@ class DeviationSensitivity:
         return self.model.smoothed(values, compliance, noise, data, after.outputs)
 
     def evidence(self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]) -> Evidence:
-        """At the log-ratios that the chord step `after` of `at` leads to.
+        """At the log-ratios that the chord step `after` of `at` leads to; of gains and delays, and zero of others.
 
         by_drive: what each drive makes the whitened signals show, (B, F, R, W/2), along each of `motions`.
         """
@@ -171,7 +171,9 @@ class DeviationSensitivity:
         of_inputs = self.redundancy.evidence(data.inputs, self.slope, self._bins)
         if of_inputs is not None:
             information, score = information + of_inputs[0], score + of_inputs[1]
-        return Evidence(-with_x.double(), *self._relative(information, score))
+        information, score = self._relative(information, score)
+        pad, more = torch.nn.functional.pad, len(self.deviations) - self.measured
+        return Evidence(pad(-with_x.double(), (0, more)), pad(information, (0, more, 0, more)), pad(score, (0, more)))
 
     def _bins(self, signals: Tensor) -> Tensor:
         """Weighed bins of signals (B, T, X), (B, F, X)."""
@@ -181,7 +183,7 @@ class DeviationSensitivity:
         """Without what no record can tell: one gain, or one delay, that all channels share changes nothing."""
         C = len(self.model.system.channels)
         for part in (slice(0, C), slice(C, 2 * C)):
-            common = torch.zeros(len(self.deviations), 1, dtype=information.dtype)
+            common = torch.zeros(self.measured, 1, dtype=information.dtype)
             common[part] = 1.0
             along = information @ common  # (B, H, 1)
             size = common.mT @ along  # (B, 1, 1)
@@ -195,12 +197,12 @@ class DeviationSensitivity:
     def columns(
         self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor | None]:
-        """Whitened sensitivities of the compressed signals (B, F, R, H), and of the dropped ones (B, F, X, H)."""
+        """Whitened sensitivities of the compressed signals (B, F, R, 2 C), and of the dropped ones (B, F, X, 2 C)."""
         model = self.model
         kind = torch.complex64
         B, F, R = at.whiten.shape[:3]
         C = self.inputs + len(data.present)
-        out = torch.zeros(B, F, R, len(self.deviations), dtype=kind)
+        out = torch.zeros(B, F, R, self.measured, dtype=kind)
         # A reading is (1 + g) y(t - tau): the true motion below is that much smaller and earlier.
         share = self.share[:, None].to(kind)
         for first, sign, shown in zip((0, C), (-1, 1), by_drive, strict=True):
@@ -215,7 +217,7 @@ class DeviationSensitivity:
         if not len(dropped):
             return out, None
         dropped = dropped * model.weight[:, None, None].to(kind)
-        over = torch.zeros(B, F, dropped.shape[1], len(self.deviations), dtype=kind)
+        over = torch.zeros(B, F, dropped.shape[1], self.measured, dtype=kind)
         over[..., columns] = dropped * shown[:, :, None]
         over[..., C + columns] = dropped * late[:, :, None]
         return out, over

@@ -13,8 +13,10 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFau
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
-Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side"]
+Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side", "own_mass", "own_roll",
+               "own_pitch", "reach_x", "reach_y"]  # fmt: skip
 CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre", "side")  # another after every stop
+OWN: tuple[Kind, ...] = ("own_mass", "own_roll", "own_pitch", "reach_x", "reach_y")  # of a body, always the same
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,8 @@ class Deviation:
 
 
 def deviations(system: System) -> tuple[Deviation, ...]:
-    """Gains of all channels, delays of all channels, what describes the loads of bodies with passengers or goods."""
+    """Gains of all channels, delays of all channels, what describes the loads of bodies with passengers or goods, and
+    how bodies are built otherwise than the file says."""
     tracks = any(isinstance(source, TrackInput) for source in system.file.inputs.values())
     if tracks or not system.bodies:
         return ()  # unmeasured tracks and component tests have identifiers of their own

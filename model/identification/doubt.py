@@ -105,7 +105,8 @@ def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: boo
     P, stated = len(system.parameters), deviations(system)
     model = WindowModel(system, system.window)
     runs = simulate_runs(system, np.zeros((_WINDOWS, P)), system.window, np.random.default_rng(0))
-    X = len(model.simulator.loading) if loads else 0
+    loading = model.simulator.loading
+    X = len(loading) if tracked else loading.of_loads if loads else 0
     with torch.no_grad():
         data = model.batch(model.knots(runs.values), runs.values, np.ones(len(system.sensors), dtype=bool))
         at = model.linearise(torch.zeros(_WINDOWS, P + X, dtype=torch.float64), data)
@@ -115,8 +116,7 @@ def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: boo
         shown = [one.slope(one.outputs(LinearSimulator(System(file))) - here) for file in wrong]
         information = one.information().sum(axis=0) * (_RIDE / _WINDOWS if tracked else 1.0)
     pull = np.stack(shown, axis=1) / _STEP * (_RIDE / _WINDOWS if tracked else 1.0)
-    of_loads = [term.std for term in model.simulator.loading.terms][:X]
-    spread = np.array([PRIOR_STD] * P + of_loads + [d.std for d in stated[:measured]])
+    spread = np.array([PRIOR_STD] * P + [term.std for term in loading.terms][:X] + [d.std for d in stated[:measured]])
     moved = np.linalg.solve(information + np.diag(spread**-2.0), pull)
     C = len(system.channels)
     beside = np.zeros((len(stated), len(wrong)))
@@ -171,13 +171,11 @@ class _UsualRide:
 
 
 def _unstated(system: System) -> dict[str, float]:
-    """Bodies whose mass no file doubts: neither loads, nor estimated, nor fixed."""
+    """Bodies whose mass no file doubts, nor windows tell: neither loads, nor estimated, nor fixed."""
     told = {load.body for load in system.loads} | {p.element for p in system.parameters if p.quantity == "mass"}
-    return {
-        name: MASS_STD
-        for name, body in system.file.bodies.items()
-        if name not in told and name not in system.doubtful_masses and body.mass.std is None and not body.mass.fixed
-    }
+    told |= {*system.built, *system.doubtful_masses}
+    bodies = system.file.bodies.items()
+    return {n: MASS_STD for n, b in bodies if n not in told and b.mass.std is None and not b.mass.fixed}
 
 
 def _masses(file: SystemFile, doubtful: dict[str, float]) -> Iterator[SystemFile]:

@@ -171,7 +171,7 @@ class Explainer:
         if start is not None:
             point[:, : 2 * self.channels] = start[: 2 * self.channels]
         before = np.full(len(windows), np.inf)
-        loads = np.full(len(windows), bool(self.system.loads))
+        loads = np.full(len(windows), bool(self.system.loads or self.system.built))
         for _ in range(ROUNDS + 1):
             parts = self._refined(windows[active], point[active], loads[active])
             going = []
@@ -206,7 +206,7 @@ class Explainer:
                 start = None if self.start is None else self.start(restored)
                 inner = restored[:, edge : self.samples - edge]
                 refined = self.refiner(inner.shape[1]).refine(
-                    inner, start, loads=with_loads, weigh=np.ones(len(rows), dtype=bool), iterations=6
+                    inner, start, loads=with_loads, built=with_loads, weigh=np.ones(len(rows), dtype=bool), iterations=6
                 )
                 for k, row in enumerate(rows):
                     out[row] = refined.take(np.array([k]))

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sprung.model.mechanics import DEFLECTION, FORCE
+from sprung.model.mechanics import ACCELERATION, DEFLECTION, FORCE
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.linear import ElementValues, LinearSimulator
@@ -25,6 +25,7 @@ class FrequencyModel:
         order = {0: 2, 1: 1, 2: 0}  # derivatives that a sensor takes of the motion
         factors = [self.jw ** order.get(int(kind), 0) for kind in simulator.kind]
         self.motion_sensing = torch.stack(factors, dim=1)[:, :, None] * simulator.S.to(self.jw.dtype)  # (F, S, n)
+        self.accelerometers = torch.as_tensor(simulator.kind == ACCELERATION)[:, None]
         self.element_sensors = bool((simulator.kind >= DEFLECTION).any())
 
     def stiffness(self, values: ElementValues) -> Tensor:
@@ -44,6 +45,8 @@ class FrequencyModel:
     def sensing(self, values: ElementValues) -> Tensor:
         """Sensors per degree of freedom, (B, F, S, n)."""
         motion = self.motion_sensing.expand(len(values.mass), -1, -1, -1)
+        if values.reach is not None:
+            motion = motion * torch.where(self.accelerometers, values.reach[:, None, None], 1.0)
         return motion + self.element_response(values, self.simulator.H) if self.element_sensors else motion
 
     def element_response(self, values: ElementValues, deflection: Tensor) -> Tensor:

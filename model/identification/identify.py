@@ -22,7 +22,6 @@ from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
 from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.simulate.drives import ORDERS, drives_of
-from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
 
@@ -71,7 +70,8 @@ class Identifier:
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
             start = self.estimator.estimate(windows, self.workers, loads=loads).log_ratio
         between = time.perf_counter()
-        refined = self._refiner(windows.shape[1]).refine(windows, start, states=states, loads=loads, weigh=weigh)
+        refiner, built = self._refiner(windows.shape[1]), explain and bool(self.system.built)
+        refined = refiner.refine(windows, start, states=states, loads=loads, built=built, weigh=weigh)
         found = self._estimates(refined, states)
         if not explain:
             found = [self._doubted(estimate) for estimate in found]
@@ -88,7 +88,9 @@ class Identifier:
     def _estimates(self, refined: Refined, states: bool, point: FloatArray | None = None) -> list[Estimate]:
         """point: deviations (H,) that were taken back from the samples before."""
         P = len(self.system.tracked)
-        deviating = [_deviating(refined, b, P, self.system, point) for b in range(len(refined.log_ratio))]
+        spread = prior_std(self.system)[len(self.system.parameters) :]
+        channels = len(self.system.channels)
+        deviating = [_deviating(refined, b, P, channels, spread, point) for b in range(len(refined.log_ratio))]
         return estimates(refined, P, states, deviating)
 
     def _doubted(self, estimate: Estimate) -> Estimate:
@@ -218,15 +220,19 @@ def identifiability(system: System, seed: int = 0) -> FloatArray:
     return found
 
 
-def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArray | None) -> Deviating | None:
-    """What window `b` says about deviations; loads that were refined with the parameters are profiled apart."""
-    whole, loaded = bool(refined.weighed[b]), refined.log_ratio.shape[1] > P
+def _deviating(
+    refined: Refined, b: int, P: int, channels: int, spread: FloatArray, point: FloatArray | None
+) -> Deviating | None:
+    """What window `b` says about deviations; loads that were refined with the parameters are profiled apart.
+
+    spread: standard deviations of the priors of what follows gains and delays.
+    """
+    X = refined.log_ratio.shape[1] - P  # of loads and bodies' own that were refined along
+    whole, loaded = bool(refined.weighed[b]), X > 0
     if not (whole or loaded):
         return None
-    C = len(system.channels)
-    H = 2 * C + len(load_terms(system))
-    # in the refined values, not of the window
-    prior = prior_std(system)[len(system.parameters) :] ** -2 / max(refined.chi_square[b], 1.0)
+    C, H = channels, 2 * channels + len(spread)
+    prior = spread[:X] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
     at = np.zeros(H) if point is None else point.copy()
     covariance = refined.covariance[b]
     cross = refined.cross[b] if whole else np.zeros((len(covariance), H))
@@ -234,7 +240,7 @@ def _deviating(refined: Refined, b: int, P: int, system: System, point: FloatArr
     score = refined.score[b].copy() if whole else np.zeros(H)
     given = covariance[:P, :P]
     if loaded:
-        loads = slice(2 * C, H)
+        loads = slice(2 * C, 2 * C + X)
         at[loads] = refined.log_ratio[b, P:]
         inverse = np.linalg.inv(covariance[P:, P:])
         per_load = covariance[:P, P:] @ inverse  # (P, loads)

@@ -100,9 +100,10 @@ class WindowModel:
             none = none.new_zeros(len(masses), *none.shape[1:])
             J = torch.cat([J, self.by_inertia(values, transfer, whiten, states, data, (masses, none), moved[0])], dim=3)
         if x.shape[1] > len(s.m_of):
-            terms = s.loading.exponents, s.loading.pattern
-            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0])
-            J = torch.cat([J, of_load if by_load is None else of_load + by_load], dim=3)
+            X = x.shape[1] - len(s.m_of)
+            terms = s.loading.exponents[:X], s.loading.pattern[:X]
+            of_load = self.by_inertia(values, transfer, whiten, states, data, terms, moved[0], s.loading.reach[:X])
+            J = torch.cat([J, of_load if by_load is None else of_load + by_load[..., :X]], dim=3)
         J = as_rows(J)
         across_products = basis @ J.mT
         across = torch.cholesky_solve(across_products, factor)
@@ -245,7 +246,8 @@ class WindowModel:
         compliance = _inverse(f.stiffness(values))
         kind = compliance.dtype
         Q = self.signal_rows(data, kind)
-        sensing = Q @ (f.sensing(values) if f.element_sensors else f.motion_sensing)
+        plain = not f.element_sensors and values.reach is None
+        sensing = Q @ (f.motion_sensing if plain else f.sensing(values))
         per_load = sensing @ compliance
         per_force = -per_load @ s.H.T.to(kind)
         dynamic = self.frequency.dynamic(values)
@@ -307,10 +309,11 @@ class WindowModel:
         data: WindowBatch,
         terms: tuple[Tensor, Tensor],
         moved: Tensor,
+        reach: Tensor | None = None,
     ) -> Tensor:
         """Whitened sensitivities to masses and loads, exponents (X, n) and couplings (X, n, n), (B, F, R, X).
 
-        moved: what the noise of the drives moves of the coordinates, (B, F, n).
+        moved: what the noise of the drives moves of the coordinates, (B, F, n).  reach: (X, n), see `Loading.reach`.
         """
         s = self.simulator
         A, b_value, b_rate = s.continuous(values)
@@ -320,7 +323,12 @@ class WindowModel:
         )
         smooth = self.spectra(acceleration) + self.frequency.jw[:, None] ** 2 * moved
         force = by_inertia(smooth, values.mass, values.coupling, *terms)
-        return -(whiten @ transfer.per_load) @ force
+        found = -(whiten @ transfer.per_load) @ force
+        if reach is not None and bool(reach.any()):  # what accelerometers show of the angles themselves
+            at = torch.nonzero(reach)  # rows: a term, and its coordinate
+            Q = self.signal_rows(data, found.dtype) @ (s.S * self.frequency.accelerometers).to(found.dtype)
+            found[..., at[:, 0]] += (whiten @ Q[:, at[:, 1]]) * smooth[:, :, None, at[:, 1]]
+        return found
 
 
 def prior_std(system: System) -> FloatArray:

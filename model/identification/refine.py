@@ -93,6 +93,7 @@ class Refines(Protocol):
         iterations: int = ...,
         states: bool = False,
         loads: bool = False,
+        built: bool = False,
         weigh: BoolArray | None = None,
     ) -> Refined:
         """See `Refiner.refine`."""
@@ -123,18 +124,21 @@ class Refiner:
         iterations: int = 12,
         states: bool = False,
         loads: bool = False,
+        built: bool = False,
         weigh: BoolArray | None = None,
     ) -> Refined:
         """Refine from `start` (B, P), nominal by default; windows (B, T, C) with NaN columns for absent sensors.
 
-        loads: the system's loads are refined, too, and follow the P parameters in what is returned.
+        loads: the system's loads are refined, too, and follow the P parameters in what is returned; built: and so are
+        bodies' own values, after the loads.
         weigh: windows (B,) whose evidence on gains, delays and loads is computed as well.
         """
         wanted = torch.as_tensor(np.zeros(len(windows), dtype=bool) if weigh is None else weigh)
         present: BoolArray = ~np.asarray(np.isnan(windows[:, :, len(self.system.inputs) :]).any(axis=1))
         everything = np.arange(len(windows))
         knots = np.concatenate(share(lambda at: self.model.knots(windows[at]), chunks(everything), self.workers))
-        size = len(self.system.parameters) + (len(self.model.simulator.loading) if loads else 0)
+        loading = self.model.simulator.loading
+        size = len(self.system.parameters) + (len(loading) if built else loading.of_loads if loads else 0)
         deviations = len(self.calibration.deviations) if weigh is not None else 0
         progress = _Progress.begin(start, present.shape, size, self.model.states_count, deviations)
 

@@ -63,7 +63,7 @@ def without_laws(system: System) -> System:
         name: element.model_copy(update={"laws": tuple(law for law in element.laws if set(law) <= of_structure)})
         for name, element in system.file.elements.items()
     }
-    return System(system.file.model_copy(update={"elements": bare}), system.catalogue, whole=True)
+    return System(system.file.model_copy(update={"elements": bare}), system.catalogue, whole=True, as_drawn=True)
 
 
 class LawRefiner:
@@ -84,6 +84,7 @@ class LawRefiner:
         iterations: int = ITERATIONS,
         states: bool = False,
         loads: bool = False,
+        built: bool = False,  # where laws act bodies are as the file says
         weigh: BoolArray | None = None,
     ) -> Refined:
         """Refine from log-ratios `start` (B, `system.tracked`), those of the file by default; see `Refiner.refine`."""

@@ -43,6 +43,7 @@ class ElementValues:
     damping: Tensor  # N s/m, shape (B, E)
     mass: Tensor  # kg or kg m^2 per degree of freedom, shape (B, n)
     coupling: Tensor | None = None  # K of the mass matrix sqrt(m) (1 + K) sqrt(m), (B, n, n); None: diagonal
+    reach: Tensor | None = None  # what accelerometers show of each coordinate, times this, (B, n); None: 1
 
     @property
     def inertia(self) -> Tensor:
@@ -154,7 +155,7 @@ class LinearSimulator:
 
     def element_values(self, log_ratio: Tensor) -> ElementValues:
         """theta = nominal exp(log_ratio) put in place; log_ratio (B, P), or (B, P + X) with what describes the loads,
-        see `model.simulate.loading`."""
+        see `model.simulate.loading`; those that are left out at the end are zero."""
         log_ratio, load = log_ratio[:, : len(self.k_of)], log_ratio[:, len(self.k_of) :]
         k = self.nominal_k * torch.exp(log_ratio @ self.k_of)
         c = self.nominal_c * torch.exp(log_ratio @ self.c_of)
@@ -163,8 +164,10 @@ class LinearSimulator:
             m = m * torch.exp(log_ratio @ self.m_of)
         if not load.shape[1]:
             return ElementValues(k, c, m)
+        load = torch.nn.functional.pad(load, (0, len(self.loading) - load.shape[1]))
         k = k * torch.exp(load @ self.loading.stiffness)
-        return ElementValues(k, c, m * self.loading.factors(load), self.loading.coupling(load))
+        loading = self.loading
+        return ElementValues(k, c, m * loading.factors(load), loading.coupling(load), loading.lengthened(load))
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:
         """A (B, N, N), input columns of the knots' values and rates, each (B, N, W/2)."""
@@ -182,7 +185,8 @@ class LinearSimulator:
     def _outputs(self, values: ElementValues, dynamics: Tensor) -> tuple[Tensor, Tensor]:
         """C (B, S, N) and D (B, S, W) of the sensors."""
         n = values.mass.shape[1]
-        rows = self.motion_sensing + self.acceleration @ dynamics[:, n:]
+        accelerations = dynamics[:, n:] if values.reach is None else dynamics[:, n:] * values.reach.unsqueeze(2)
+        rows = self.motion_sensing + self.acceleration @ accelerations
         if self.force_sensing is not None:
             force = torch.cat([values.stiffness, values.damping], dim=1) @ self.force_sensing
             rows = rows + force.reshape(rows.shape)

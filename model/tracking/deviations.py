@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.special import expit
 
-from sprung.model.identification.deviations import CARGO, Deviation
+from sprung.model.identification.deviations import CARGO, OWN, Deviation
 from sprung.model.signals import BoolArray, Deviating, FloatArray, IntArray
 from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.middle import median
@@ -58,6 +58,7 @@ class DeviationModel:
     directions: FloatArray  # shape (V, H)
     loads: BoolArray  # True at the masses of loads, shape (H,)
     cargo: BoolArray  # True at all that describes loads, their masses included, shape (H,)
+    own: BoolArray  # True at how bodies are built, which never changes, shape (H,)
 
     @property
     def size(self) -> int:
@@ -101,6 +102,16 @@ class DeviationModel:
         return np.flatnonzero(self.cargo)
 
     @cached_property
+    def along(self) -> BoolArray:
+        """True at what every window is refined with beside its parameters, (H,)."""
+        return self.cargo | self.own
+
+    @cached_property
+    def along_at(self) -> IntArray:
+        """Where that is."""
+        return np.flatnonzero(self.along)
+
+    @cached_property
     def loads_at(self) -> IntArray:
         """Where the masses of loads are."""
         return np.flatnonzero(self.loads)
@@ -137,11 +148,12 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
     group = np.array([d.group for d in deviations], dtype=np.int64)
     late = np.array([kind == "delay" for kind in kinds], dtype=bool)
     together = late[:, None] & late[None, :] & (group[:, None] == group[None, :])
+    constant = np.array([kind in OWN for kind in kinds], dtype=bool)
     own = np.eye(H)
     shared = np.where(together, GROUP_SHARE, 0.0) + own * np.where(late, 1 - GROUP_SHARE, 1.0)
     own_walk = {"gain": GAIN_WALK, "delay": OWN_WALK, **CARGO_WALK}
-    walk = np.diag([own_walk[kind] ** 2 for kind in kinds]).reshape(H, H) + together * CLOCK_WALK**2
-    rows = [*own]
+    walk = np.diag([own_walk.get(kind, 0.0) ** 2 for kind in kinds]).reshape(H, H) + together * CLOCK_WALK**2
+    rows = [*own[~constant]]
     for number in np.unique(group[late]):
         members = (late & (group == number)).astype(float)
         if members.sum() > 1:
@@ -153,7 +165,8 @@ def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
             rows.append(members.astype(float))
     loads = np.array([kind == "load" for kind in kinds], dtype=bool)
     cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
-    return DeviationModel(kinds, shared * np.outer(std, std), walk, np.array(rows).reshape(len(rows), H), loads, cargo)
+    directions = np.array(rows).reshape(len(rows), H)
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, directions, loads, cargo, constant)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -325,9 +338,21 @@ def explained(belief: Belief, found: Deviating) -> float:
     return max(0.0, gained) / max(found.freedom, 1.0)
 
 
+def level_variance(belief: Belief, model: DeviationModel, cross: FloatArray) -> FloatArray:
+    """Variances of the levels (P,) as all windows take them, however bodies are built: what is not known of that moves
+    windows, by `cross` (P, H) per deviation, and what is believed of the levels alike."""
+    variance = belief.level_variance
+    if not model.own.any():
+        return variance
+    at, p = np.flatnonzero(model.own), belief.size
+    rows, cross = at + 2 * p, cross[:, at]
+    with_levels, among = belief.covariance[:p, rows], belief.covariance[rows][:, rows]
+    return np.asarray((variance + (cross * (cross @ among - 2 * with_levels)).sum(axis=1)).clip(1e-12))
+
+
 def loaded(belief: Belief, model: DeviationModel, found: Deviating, share: float) -> Belief:
-    """Belief after a window that speaks of loads only."""
-    at = model.cargo_at
+    """Belief after a window that speaks of loads, and of how bodies are built, only."""
+    at = model.along_at
     rows = at + len(belief.mean) - model.size
     M = found.information[at][:, at] * share
     u = found.score[at] * share - M @ (belief.mean[rows] - found.point[at])
@@ -392,17 +417,16 @@ def boarded(
 
 def moved(belief: Belief, model: DeviationModel, found: Deviating) -> bool:
     """Whether a window's loads are none that the belief allows: something was put on, or let down, on the way."""
-    at = model.cargo_at
+    at, along = model.cargo_at, model.along_at
     if not len(at):
         return False
     values, vectors = np.linalg.eigh(found.information[at][:, at])
     told = values > 1e-9 * max(float(values[-1]), 1e-300)
-    root = vectors[:, told] * np.sqrt(values[told])  # information = root root', of what the window tells
-    rows = at + len(belief.mean) - model.size
-    seen = root.T @ (found.point[at] - belief.mean[rows]) + (vectors[:, told].T @ found.score[at]) / np.sqrt(
-        values[told]
-    )
-    spread = np.eye(len(seen)) + root.T @ belief.covariance[rows][:, rows] @ root
+    root = vectors[:, told] / np.sqrt(values[told])  # of what the window tells; bodies are built as believed
+    rows = along + len(belief.mean) - model.size
+    M = root.T @ found.information[at][:, along]
+    seen = M @ (found.point[along] - belief.mean[rows]) + root.T @ found.score[at]
+    spread = np.eye(len(seen)) + M @ belief.covariance[rows][:, rows] @ M.T
     return bool(seen @ np.linalg.solve(spread, seen) > LOST_LOAD**2)
 
 
@@ -410,5 +434,5 @@ def unsure(belief: Belief, model: DeviationModel) -> Belief:
     """Belief after a parameter was lost: it may have been a sensor, whose deviation is open to a third of its prior."""
     H = model.size
     covariance = belief.covariance.copy()
-    covariance[-H:, -H:] += model.prior / 9 * ~(model.cargo[:, None] | model.cargo[None, :])
+    covariance[-H:, -H:] += model.prior / 9 * ~(model.along[:, None] | model.along[None, :])
     return replace(belief, covariance=covariance)

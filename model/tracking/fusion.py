@@ -140,8 +140,8 @@ class Fusion:
             moved = self._moved(calibration.cross, belief)
             doubt = 1 + float((moved**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
             belief = dev.loaded(belief, model, found, share / doubt)  # its load is that of gains and delays as stated
-            gains = np.where(model.cargo, found.cross, calibration.cross)
-            found = replace(found, cross=gains, point=np.where(model.cargo, found.point, 0.0))
+            gains = np.where(model.along, found.cross, calibration.cross)
+            found = replace(found, cross=gains, point=np.where(model.along, found.point, 0.0))
             return belief, calibration, found, None, True
         apart = (time_ns - int(calibration.recent[-1])) * 1e-9
         weight = min(1.0, apart / self.settings.window)
@@ -163,11 +163,10 @@ class Fusion:
         fresh = (variance + open_) * measured.factor / window.share
 
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
-        reach = OUTLYING * np.sqrt(belief.level_variance + variance * measured.factor)
+        foreseen = dev.level_variance(belief, self.model, window.cross)
+        reach = OUTLYING * np.sqrt(foreseen + variance * measured.factor)
         plausible = np.clip(value, belief.level - reach, belief.level + reach)
-        watch, jumped = innovation.update(
-            state.innovation, value - belief.level, belief.level_variance + fresh, mask & known
-        )
+        watch, jumped = innovation.update(state.innovation, value - belief.level, foreseen + fresh, mask & known)
         if jumped.any():
             belief = kalman.reopen(belief, jumped, settings.process)
             if self.model.size:
@@ -175,7 +174,7 @@ class Fusion:
         cross = window.cross if self.model.size else None
         belief, step = kalman.correct(
             belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross,
-            silent=None if window.weighed or cross is None else ~self.model.cargo,
+            silent=None if window.weighed or cross is None else ~self.model.along,
         )  # fmt: skip
         return _Filtered(belief, measured, watch, fresh, plausible, step.bounded)
 
@@ -252,7 +251,7 @@ class Fusion:
         """Whether known deviations move this window so far that mean sensitivities are not good enough for it."""
         if not self.model.size or (estimate.deviating is not None and estimate.deviating.whole):
             return False
-        moved = state.calibration.cross @ np.where(self.model.cargo, 0, state.belief.mean[-self.model.size :])
+        moved = state.calibration.cross @ np.where(self.model.along, 0, state.belief.mean[-self.model.size :])
         return bool(np.any(np.abs(moved) > BENT * np.sqrt(estimate.covariance.diagonal())))
 
     def armed(self, state: TrackerState) -> bool:
@@ -294,7 +293,7 @@ class Fusion:
 
     def _moved(self, cross: FloatArray, belief: kalman.Belief) -> FloatArray:
         """What gains and delays, as believed, move log-ratios by, (P,)."""
-        return np.asarray(cross @ np.where(self.model.cargo, 0.0, belief.mean[-self.model.size :]))
+        return np.asarray(cross @ np.where(self.model.along, 0.0, belief.mean[-self.model.size :]))
 
     def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
@@ -343,7 +342,11 @@ class Fusion:
         base = calibration.base_cross + gained[:, None] * (cross - calibration.base_cross)
         calibration = replace(calibration, base_cross=base)
         learned = ~self.model.cargo & self.armed(state)
-        return dev.followed(calibration, self.model, belief, learned) if self._refining(state) else calibration
+        if self._refining(state):
+            return dev.followed(calibration, self.model, belief, learned)
+        # How bodies are built never changes: baselines were learned with what is known of it by now.
+        built = np.where(self.model.own, belief.mean[-self.model.size :], calibration.reference)
+        return replace(calibration, reference=built)
 
     def baseline(self, state: TrackerState) -> FloatArray:
         """Log-ratio to nominal of the vehicle's own healthy state, shape (P,); NaN before any window."""
@@ -361,12 +364,13 @@ class Fusion:
 
         baseline: that of the state, (P,), where the caller knows it.
         """
-        level, std = state.belief.level, np.sqrt(state.belief.level_variance)
+        level = state.belief.level
         whole = level - (self.baseline(state) if baseline is None else baseline)
         own = whole
         if state.weather is not None:
             own = whole - weathers.shared(state.weather, self.weather) + weathers.usual(state.weather, self.weather)
-        spread = np.sqrt(std**2 + state.changes.baseline_variance)
+        variance = dev.level_variance(state.belief, self.model, state.calibration.base_cross)
+        spread = np.sqrt(variance + state.changes.baseline_variance)
         return Drift(np.expm1(own), np.exp(own) * spread, np.expm1(whole))
 
 

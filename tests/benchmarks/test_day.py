@@ -10,7 +10,7 @@ from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.timetable import Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
 from sprung.benchmarks.through import through
-from sprung.model.identification.deviations import deviations
+from sprung.model.identification.deviations import CARGO, deviations
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
 from sprung.service.engine import load_engine
@@ -22,18 +22,20 @@ CARRIED = np.array([0.2, -0.05, -0.02, 0.01, -0.02])
 @pytest.fixture(scope="module")
 def windows():
     found = library(load_system(), 6, 3)
-    return [day.pool([found[k], found[k - 1]], len(CARRIED)) for k in range(len(found))]
+    prior = np.array([part.std for part in deviations(load_system()) if part.kind not in ("gain", "delay")])
+    return [day.pool([found[k], found[k - 1]], prior) for k in range(len(found))]
 
 
 def test_estimates_scatter_about_the_truth_as_they_state(windows):
     system, rng = load_system(), np.random.default_rng(1)
     truth, off = rng.normal(0, 0.1, 24), np.zeros(len(deviations(system)))
-    off[-5:] = CARRIED
+    at = [part.kind in CARGO for part in deviations(system)]
+    off[at] = CARRIED
     drawn = [day.drawn(rng, windows[0], truth, off) for _ in range(400)]
-    errors = np.array([e.log_ratio for e in drawn]) - truth
-    scores = errors / np.sqrt(np.diag(drawn[0].covariance))
+    errors = np.array([e.log_ratio - e.deviating.cross @ (e.deviating.point - off) for e in drawn]) - truth
+    scores = errors / np.sqrt(np.diag(drawn[0].deviating.given))
     assert np.sqrt(np.mean(scores**2)) == pytest.approx(1.0, abs=0.1)
-    loads = np.array([e.deviating.point[-5:] for e in drawn]) - CARRIED
+    loads = np.array([e.deviating.point[at] for e in drawn]) - CARRIED
     assert np.all(np.abs(loads.mean(axis=0)) < 4 * loads.std(axis=0) / np.sqrt(400))
     gains = [e.deviating.information @ (off - e.deviating.point) for e in drawn]
     slopes = np.array([e.deviating.score for e in drawn]) - gains  # at the true deviations: no slope on average
