@@ -206,6 +206,12 @@ def spoken(parameter: str) -> str:
     return f"{quantity} of all {f'{group} ' if group else ''}elements"
 
 
+def told(alarm: Alarm | AlarmRow) -> str:
+    """What an alarm is about; what the measurements do not tell it from comes first, for a sensor is checked sooner."""
+    rivals = alarm.alternatives if isinstance(alarm, Alarm) else ()
+    return " or ".join([*rivals, spoken(alarm.parameter or "")])
+
+
 def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
     """Severity of an alarm of all elements of a kind, `*.damping` or `primary_*.damping`, to which one belongs."""
     return next(

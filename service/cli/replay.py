@@ -26,7 +26,7 @@ from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import AHEAD, now_ns, to_iso
-from sprung.service.views import VehicleView, alarm_dict, load_parameters, spoken, vehicle_view, window_dict
+from sprung.service.views import VehicleView, alarm_dict, load_parameters, told, vehicle_view, window_dict
 from sprung.service.worker import ProcessLimits
 
 SLACK_SECONDS = 3.0  # to start
@@ -215,8 +215,9 @@ def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
     for alarm in view.active:
         change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
         std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f} %"
-        what = spoken(alarm.parameter or "") or "windows no longer fit the model"
-        lines.append(f"{alarm.severity}: {what}{change}{std} since {to_iso(alarm.onset)}")
+        what = told(alarm) or "windows no longer fit the model"
+        apart = "; the measurements do not tell which" if alarm.alternatives else ""
+        lines.append(f"{alarm.severity}: {what}{change}{std} since {to_iso(alarm.onset)}{apart}")
     return "\n".join([*lines, *measurement_lines(view.measurements())])
 
 

@@ -28,6 +28,10 @@ def alarm_event(base: str, vehicle: str, change: AlarmChange, now: int) -> dict[
     alarm = change.alarm
     element, _, quantity = (alarm.parameter or "").rpartition(".")
     advice = ADVICE["common" if alarm.kind == "change" and "*" in element else alarm.kind]
+    if alarm.alternatives:
+        advice = (
+            f"The measurements do not tell it from {' or '.join(alarm.alternatives)}: check the sensor first. {advice}"
+        )
     data = {
         "vehicle": vehicle,
         "alarm": {
@@ -42,6 +46,7 @@ def alarm_event(base: str, vehicle: str, change: AlarmChange, now: int) -> dict[
             "onset": to_iso(alarm.onset),
             "raised": to_iso(alarm.opened),
             "recovered": optional_iso(alarm.closed),
+            "alternatives": list(alarm.alternatives),
         },
         "iso13374": {"block": "SD", "function": BLOCKS["SD"]},
         "advisory": advice.format(element=element or vehicle) if change.what != "closed" else None,
@@ -86,7 +91,7 @@ def sentence(event: dict[str, Any]) -> str:
     if event["type"].startswith("sprung.alarm."):
         alarm = data["alarm"]
         kind = {"misfit": "windows no longer fit the model"}.get(alarm["kind"], alarm["kind"])
-        what = spoken(alarm["parameter"] or "") or kind
+        what = " or ".join([*alarm.get("alternatives", ()), spoken(alarm["parameter"] or "") or kind])
         size = "" if alarm["change"] is None else f" {100 * alarm['change']:+.1f} %"
         return f"{data['vehicle']}: {alarm['severity']} {event['type'].rsplit('.', 1)[1]}: {what}{size}"
     if event["type"] == REPORT_READY:

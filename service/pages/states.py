@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
-from sprung.service.views import VehicleView, spoken
+from sprung.service.views import VehicleView, told
 
 MOSTLY = 0.5  # share of the windows from which something is worth a hint
 
@@ -72,10 +72,9 @@ def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> lis
             if together
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
-        rivals = next((a.alternatives for a in view.active if a.parameter == worst.parameter), ())
-        unclear = f"The measurements do not tell it from {' or '.join(rivals)}. " if rivals else ""
-        text = f"{unclear}{what} {ask}"
-        found.append(Hint(level, f"{spoken(worst.parameter or '')} has changed{size}{many}", text))
+        now = next((a for a in view.active if (a.kind, a.parameter) == (worst.kind, worst.parameter)), worst)
+        unclear = "The measurements do not tell which: check the sensor first. " if told(now) != told(worst) else ""
+        found.append(Hint(level, f"{told(now)} has changed{size}{many}", f"{unclear}{what} {ask}"))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
         found.append(Hint("warning", "Windows no longer fit the model", text))

@@ -9,7 +9,7 @@ import json
 import socketserver
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -18,17 +18,20 @@ import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.system import System
+from sprung.model.tracking.state import Alarm
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
+from sprung.service.notify.events import alarm_event, sentence
 from sprung.service.notify.notices import PAUSES, Notices
 from sprung.service.notify.senders import signature
 from sprung.service.settings import Settings
 from sprung.service.store import Store
+from sprung.service.store.fleet import AlarmChange
 from sprung.service.store.lists import list_deliveries
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.views import spoken
+from sprung.service.views import spoken, told
 from tests.service_fakes import make_window
 
 SECRET = "whsec_" + base64.b64encode(b"a secret of many letters").decode()
@@ -218,3 +221,14 @@ def test_alarms_of_all_elements_are_told_in_words() -> None:
     assert spoken("*.damping") == "damping of all elements"
     assert spoken("primary_*.stiffness") == "stiffness of all primary elements"
     assert spoken("secondary_2l.damping") == "secondary_2l.damping"
+
+
+def test_a_change_that_may_be_a_sensor_s_is_told_with_the_sensor_first() -> None:
+    alarm = Alarm(
+        "change", "primary_11l.damping", 1, 2, "warning", -0.153, 0.012, -0.153, alternatives=("bogie1_1l.gain",)
+    )
+    event = alarm_event("", "car-17", AlarmChange("opened", alarm, None), now_ns())
+    assert sentence(event) == "car-17: warning opened: bogie1_1l.gain or primary_11l.damping -15.3 %"
+    assert event["data"]["advisory"].startswith("The measurements do not tell it from bogie1_1l.gain: check the sensor")
+    assert told(alarm) == "bogie1_1l.gain or primary_11l.damping"
+    assert told(replace(alarm, alternatives=())) == "primary_11l.damping"
