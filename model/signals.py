@@ -109,6 +109,16 @@ class MeasurementFault:
     std: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class BuiltOtherwise:
+    """What windows tell of a body that is not what the system file states."""
+
+    body: str
+    what: str  # "mass", "roll inertia" ...
+    change: float  # relative to the file
+    std: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Deviating:
     """What a window says about H deviations from the system file (gains, delays, loads) beside the P parameters.

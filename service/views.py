@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from fnmatch import fnmatchcase
 from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
-from sprung.model.signals import FloatArray, MeasurementFault, Window
+from sprung.model.signals import BuiltOtherwise, FloatArray, MeasurementFault, Window
 from sprung.model.system import System
 from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.tracker import Alarm, TrackerState
@@ -86,6 +86,7 @@ class VehicleView:
     per_sensor: Mapping[str, float]  # nrmse of the newest window, absent sensors left out
     sensors: tuple[MeasurementFault, ...] = ()  # what was found wrong with measurements
     load: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # kg beside the empty mass, std, by body
+    built: tuple[BuiltOtherwise, ...] = ()  # how bodies are built otherwise than the system file says
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -150,6 +151,7 @@ class VehicleView:
                 for f in self.sensors
             ],
             "load": {body: list(pair) for body, pair in self.load.items()},
+            "built": [asdict(one) for one in self.built],
         }
 
 
@@ -185,6 +187,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         _of_sensors(engine, last),
         engine.tracker.sensors(state),
         body_loads(engine, state),
+        engine.tracker.built(state),
     )
 
 

@@ -16,7 +16,13 @@ from sprung.model.system import System
 Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side", "own_mass", "own_roll",
                "own_pitch", "reach_x", "reach_y"]  # fmt: skip
 CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre", "side")  # another after every stop
-OWN: tuple[Kind, ...] = ("own_mass", "own_roll", "own_pitch", "reach_x", "reach_y")  # of a body, always the same
+OWN: dict[Kind, str] = {  # of a body, always the same
+    "own_mass": "mass",
+    "own_roll": "roll inertia over mass",
+    "own_pitch": "pitch inertia over mass",
+    "reach_x": "distance of its accelerometers along x",
+    "reach_y": "distance of its accelerometers along y",
+}
 
 
 @dataclass(frozen=True, slots=True)

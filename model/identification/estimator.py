@@ -141,7 +141,8 @@ class Estimator:
         self.system, self.net, self.digest = system, net.double().eval(), digest
         self.samples = net.architecture.samples
         self.features = ForceBalance(system, self.samples)
-        self.load_prior = torch.as_tensor([term.std for term in load_terms(system)], dtype=torch.float64)
+        stds = [term.std for term in load_terms(system)][: self.features.simulator.loading.of_loads]
+        self.load_prior = torch.as_tensor(stds, dtype=torch.float64)
         with torch.no_grad():
             self.noise_taken = self.net.noise_taken()
 

@@ -105,11 +105,11 @@ class ForceBalance:
 
     def _by_load(self, a: Tensor, spring: Tensor) -> Tensor:
         """Change of the forces with each term of a load, (B, 2F, n, X), from accelerations and springs' forces."""
-        s = self.simulator
+        s, X = self.simulator, self.simulator.loading.of_loads
         mass = s.nominal_m.expand(len(a), -1)
-        forces = by_inertia(a, mass, None, s.loading.exponents, s.loading.pattern)
+        forces = by_inertia(a, mass, None, s.loading.exponents[:X], s.loading.pattern[:X])
         if bool(s.loading.stiffness.any()):
-            forces = forces + torch.einsum("bfe,xe,en->bfnx", spring, s.loading.stiffness, s.H)
+            forces = forces + torch.einsum("bfe,xe,en->bfnx", spring, s.loading.stiffness[:X], s.H)
         return forces
 
     def _motion(self, sensors: FloatArray) -> Tensor:

@@ -164,9 +164,8 @@ class LinearSimulator:
             m = m * torch.exp(log_ratio @ self.m_of)
         if not load.shape[1]:
             return ElementValues(k, c, m)
-        load = torch.nn.functional.pad(load, (0, len(self.loading) - load.shape[1]))
-        k = k * torch.exp(load @ self.loading.stiffness)
         loading = self.loading
+        k = k * torch.exp(load @ loading.stiffness[: load.shape[1]])
         return ElementValues(k, c, m * loading.factors(load), loading.coupling(load), loading.lengthened(load))
 
     def continuous(self, values: ElementValues) -> tuple[Tensor, Tensor, Tensor]:

@@ -134,26 +134,27 @@ class Loading:
         return sum(term.kind not in OWN_STD for term in self.terms)
 
     def factors(self, load: Tensor) -> Tensor:
-        """What masses and inertias are multiplied by, (B, n), for terms (B, X)."""
-        return torch.exp(load @ self.exponents)
+        """What masses and inertias are multiplied by, (B, n), for terms (B, X), or the first of them."""
+        return torch.exp(load @ self.exponents[: load.shape[1]])
 
     def lengthened(self, load: Tensor) -> Tensor | None:
         """What accelerometers show of each coordinate, times this, (B, n); None where all are where the file says."""
-        return 1 + load @ self.reach if self.reaches else None
+        return 1 + load @ self.reach[: load.shape[1]] if self.reaches else None
 
     def coupling(self, load: Tensor) -> Tensor | None:
         """K of the mass matrix sqrt(m) (1 + K) sqrt(m), (B, n, n); None where no centre can move."""
         if not self.couples:
             return None
-        return torch.einsum("bx,xij->bij", load.clamp(-_MOST, _MOST), self.pattern)
+        return torch.einsum("bx,xij->bij", load.clamp(-_MOST, _MOST), self.pattern[: load.shape[1]])
 
     def terms_of(self, linear: Tensor) -> Tensor:
-        """Terms (B, X) of loads that change masses and couplings by `linear` (B, X) times their slopes at none."""
-        factors = (1 + linear @ self.exponents).clamp(1 - _MOST, 1 / (1 - _MOST))  # (B, n)
-        terms = factors.log() @ torch.linalg.pinv(self.exponents)
+        """The first X terms (B, X), which change masses and couplings by `linear` (B, X) times their slopes at none."""
+        exponents, pattern = self.exponents[: linear.shape[1]], self.pattern[: linear.shape[1]]
+        factors = (1 + linear @ exponents).clamp(1 - _MOST, 1 / (1 - _MOST))  # (B, n)
+        terms = factors.log() @ torch.linalg.pinv(exponents)
         root = factors.sqrt()
-        scale = torch.einsum("xij,bi,bj->bx", self.pattern, 1 / root, 1 / root)
-        pairs = self.pattern.sum(dim=(1, 2))
+        scale = torch.einsum("xij,bi,bj->bx", pattern, 1 / root, 1 / root)
+        pairs = pattern.sum(dim=(1, 2))
         return torch.where(pairs > 0, (linear * scale / pairs.clamp_min(1)).clamp(-_MOST, _MOST), terms)
 
 

@@ -38,6 +38,7 @@ CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
 CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4, "side": 1e-4}
 OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
 NAMED = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is inside what electronics may do
+BUILT = 0.01  # a body that is closer than that to its file is as the file says
 JUMPED = {"gain": 0.01, "delay": 3e-4, "load": 0.004}  # a smaller jump is followed and not told
 CREPT = {"gain": 0.03, "delay": 2e-3}  # one that came slowly is an alarm from here on: electronics age by 2 % a month
 KNOWN_SHARE = 0.2  # of that is the standard deviation of one that is known

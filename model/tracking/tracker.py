@@ -11,8 +11,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from sprung.model.identification.deviations import Deviation, named
-from sprung.model.signals import Conditions, Estimate, FloatArray, MeasurementFault
+from sprung.model.identification.deviations import OWN, Deviation, named
+from sprung.model.signals import BuiltOtherwise, Conditions, Estimate, FloatArray, MeasurementFault
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import coverage, inflation, innovation, misfit
@@ -259,6 +259,18 @@ class Tracker:
         std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + bent**2)
         chosen = far & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
+
+    def built(self, state: TrackerState) -> tuple[BuiltOtherwise, ...]:
+        """What windows tell of how bodies are built otherwise than the system file says."""
+        H = self.model.size
+        found = []
+        for h in np.flatnonzero(self.model.own).tolist():
+            value = float(state.belief.mean[-H:][h])
+            std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._doubt[1][h, h]))
+            if abs(value) > max(dev.BUILT, 3 * std):
+                deviation = self.deviations[h]
+                found.append(BuiltOtherwise(deviation.name, OWN[deviation.kind], float(np.expm1(value)), std))
+        return tuple(found)
 
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
         """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""

@@ -228,6 +228,10 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
         value = "" if fault.get("value") is None else f" {fault['value']:.4g}"
         std = "" if fault.get("std") is None else f" ± {fault['std']:.2g}"
         lines.append(f"sensor: {fault['channel']} {fault['kind']}{value}{std}")
+    lines += [
+        f"system file: {one['body']} is {100 * one['change']:+.1f} % ± {100 * one['std']:.1f} % in {one['what']}"
+        for one in found.get("built", [])
+    ]
     loads = found.get("load") or {}
     return lines + [f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal" for body, (mass, std) in loads.items()]
 

@@ -95,7 +95,7 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
     x = np.tile(np.concatenate([np.zeros(24), described()]), (48, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(4))
     kinds = [d.kind for d in deviations(system)]
-    at, along = ([i for i, kind in enumerate(kinds) if kind in of] for of in (CARGO, CARGO + OWN))
+    at, along = ([i for i, kind in enumerate(kinds) if kind in of] for of in (CARGO, (*CARGO, *OWN)))
     total, pull = np.zeros((5, 5)), np.zeros(5)
     for estimate in Identifier(system).examine(runs.values, np.zeros(48, dtype=bool)):
         said = estimate.deviating

@@ -10,10 +10,12 @@ def test_wrong_sensors_and_loads_are_told_below_the_table():
             {"channel": "car_1l", "kind": "stuck", "value": None, "std": None},
         ],
         "load": {"car": [-4038.3, 360.9]},
+        "built": [{"body": "bogie1", "what": "pitch inertia over mass", "change": -0.0312, "std": 0.004}],
     }
     assert measurement_lines(found) == [
         "sensor: bogie1_1l gain 1.051 ± 0.0034",
         "sensor: car_1l stuck",
+        "system file: bogie1 is -3.1 % ± 0.4 % in pitch inertia over mass",
         "load: car -4038 ± 361 kg against nominal",
     ]
     assert measurement_lines({"sensors": [], "load": {}}) == []
