@@ -111,8 +111,8 @@ class Loading:
                 z, angle = dofs.index(f"{term.body}.z"), dofs.index(f"{term.body}.{COUPLED[term.kind]}")
                 pattern[i, z, angle] = pattern[i, angle, z] = 1.0
             else:
-                angle = term.kind.removesuffix("_inertia").removeprefix("own_")
-                exponents[i, dofs.index(f"{term.body}.{angle}")] = 1.0
+                axis = term.kind.removesuffix("_inertia").removeprefix("own_")
+                exponents[i, dofs.index(f"{term.body}.{axis}")] = 1.0
         stiffness = np.zeros((len(self.terms), len(mechanics.stiffness)))
         for e, element in enumerate(system.file.elements.values()):
             for i, term in enumerate(self.terms):
