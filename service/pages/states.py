@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+from sprung.model.tracking.tracker import Alarm
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
@@ -52,7 +53,17 @@ def hints(
             "system file and the sensors; a diagnosis below names the likely cause."
         )
         found.append(Hint("warning", "Windows do not fit", text))
-    return found + _parameters(row, view, whole)
+    return found + _parameters(row, view, whole) + _built(view)
+
+
+def _built(view: VehicleView) -> list[Hint]:
+    if not view.built:
+        return []
+    listed = "; ".join(
+        f"{one.body} {100 * one.change:+.1f} % ± {100 * one.std:.1f} % in {one.what}" for one in view.built
+    )
+    text = f"As the windows tell it: {listed}. It is allowed for; correct the file when the vehicle has been weighed."
+    return [Hint("info", "Not quite as the system file says", text)]
 
 
 def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> list[Hint]:
@@ -73,7 +84,10 @@ def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> lis
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
         now = next((a for a in view.active if (a.kind, a.parameter) == (worst.kind, worst.parameter)), worst)
-        unclear = "The measurements do not tell which: check the sensor first. " if told(now) != told(worst) else ""
+        rivals = now.alternatives if isinstance(now, Alarm) else ()
+        unclear = (
+            f"The measurements do not tell it from {' or '.join(rivals)}: check the sensor first. " if rivals else ""
+        )
         found.append(Hint(level, f"{told(now)} has changed{size}{many}", f"{unclear}{what} {ask}"))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from sprung.model.signals import BuiltOtherwise
 from sprung.model.system import load_system
 from sprung.model.tracking.state import Alarm
 from sprung.service.pages.drawing import Mark
@@ -47,5 +48,13 @@ def test_what_an_alarm_cannot_be_told_from_is_said() -> None:
     view = replace(VIEW, alarms=(DAMPER,))
     active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None)]
     said = hints(ROW, view, active, [], False, sensor_marks(SYSTEM, view))
-    assert "do not tell it from bogie1_1l.gain" in said[0].text
+    assert said[0].title == "bogie1_1l.gain or primary_11l.damping has changed by -10.0 %"
+    assert "do not tell it from bogie1_1l.gain: check the sensor first" in said[0].text
     assert not any("Sensor suspect" in hint.title for hint in said)
+
+
+def test_a_body_that_is_not_as_its_file_says_is_told() -> None:
+    view = replace(VIEW, alarms=(), built=(BuiltOtherwise("bogie1", "mass", 0.024, 0.006),))
+    (said,) = hints(ROW, view, [], [], False, sensor_marks(SYSTEM, view))
+    assert said.level == "info"
+    assert "bogie1 +2.4 % ± 0.6 % in mass" in said.text
