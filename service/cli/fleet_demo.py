@@ -8,8 +8,10 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from urllib.request import urlopen
 
 from sprung.service.errors import UserError
 from sprung.service.fleet import local_postgres as postgres
@@ -33,6 +35,7 @@ def run(vehicles: int, port: int) -> int:
             environment["SPRUNG_STORE"] = stack.enter_context(postgres.server(durable=True)).database()
         started: list[subprocess.Popen[bytes]] = []
         stack.callback(_end, started)
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
 
         def start(*arguments: str) -> None:
             command = [sys.executable, "-m", "sprung", *arguments]
@@ -44,18 +47,39 @@ def run(vehicles: int, port: int) -> int:
         if not reason and ray_installed():
             start("fleet", "serve", "--port", str(port + 100), "--workers", "2", "--cores", "0.5")
             server = f"http://127.0.0.1:{port + 100}"
-        for number in range(vehicles):
-            name = f"demo-{number + 1:04d}"
-            where = f"{folder}/{name}.db"
-            ways = ("--server", server, "--recordings", pages)
-            start("edge", str(RECORDING), "--vehicle", name, *ways, "--speed", SPEED, "--spool", where)
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+        print("sprung fleet demo: the vehicles start once the services answer", file=sys.stderr, flush=True)
         try:
+            wait_ready({pages, server}, started)
+            for number in range(vehicles):
+                name = f"demo-{number + 1:04d}"
+                where = f"{folder}/{name}.db"
+                ways = ("--server", server, "--recordings", pages)
+                start("edge", str(RECORDING), "--vehicle", name, *ways, "--speed", SPEED, "--spool", where)
             while started[0].poll() is None:
                 time.sleep(0.5)
         except KeyboardInterrupt:
             pass
     return 0
+
+
+def wait_ready(services: set[str], started: Sequence[subprocess.Popen[bytes]]) -> None:
+    """Return when every service says that it is ready: what a vehicle makes before would only wait on board.
+
+    Raises UserError when one of the processes that were started ends before.
+    """
+    while services:
+        if any(process.poll() is not None for process in started):
+            raise UserError("a service of the fleet ended before it was ready; its last lines say why")
+        services = {service for service in services if not _ready(service)}
+        time.sleep(0.5)
+
+
+def _ready(service: str) -> bool:
+    try:
+        with urlopen(f"{service}/health/ready", timeout=5):
+            return True
+    except OSError:  # nobody there yet, or not ready
+        return False
 
 
 def _end(started: list[subprocess.Popen[bytes]]) -> None:
