@@ -229,7 +229,8 @@ EXPORT fmi2Status fmi2GetEventIndicators(fmi2Component c, fmi2Real z[], size_t n
   return fmi2OK;
 }
 
-/* co-simulation: Runge-Kutta 4 in steps of at most INTERNAL_STEP, inputs continued with the slopes that were set */
+/* co-simulation: Runge-Kutta 4 in steps of at most INTERNAL_STEP, inputs continued with the slopes that were set, and
+   displacements of supports, where none was, with their velocity: held, they would jump from step to step */
 EXPORT fmi2Status fmi2SetRealInputDerivatives(fmi2Component c, const fmi2ValueReference vr[], size_t n,
                                               const fmi2Integer order[], const fmi2Real value[]) {
   Instance *m = c;
@@ -258,6 +259,8 @@ EXPORT fmi2Status fmi2DoStep(fmi2Component c, fmi2Real time, fmi2Real step, fmi2
   m->time = time;
   int parts = (int)ceil(step / INTERNAL_STEP);
   if (parts < 1) parts = 1;
+  for (int i = 0; i < NU; i++)
+    if (m->slope[i] == 0.0 && rate_of[i] >= 0) m->slope[i] = m->u[rate_of[i]];
   double h = step / parts, a[ROOM(NX)], b[ROOM(NX)], k[ROOM(NX)], d[ROOM(NX)], at[ROOM(NX)];
   for (int j = 0; j < parts; j++) {
     double since = j * h;

@@ -21,6 +21,7 @@ import numpy as np
 from sprung.model.exchange.equations import EquationSite, identifier, linear, output, sites
 from sprung.model.exchange.statespace import ExchangeError, state_space
 from sprung.model.laws import CLOCK_LEAD
+from sprung.model.mechanics import Mechanics
 from sprung.model.simulate.ride import with_values
 from sprung.model.system import System
 
@@ -93,6 +94,7 @@ def _equations(system: System, laws: list[EquationSite]) -> str:
         f"#define NP {len(names)}",
         f"#define INTERNAL_STEP {_internal_step(system)!r}",
         f"static const double defaults[] = {{{', '.join(repr(v) for _, v, _ in parameters(system, laws)) or '0'}}};",
+        f"static const int rate_of[] = {{{', '.join(str(of) for of in _rates(m)) or '0'}}};",
         "static void motion(double time, const double *x, const double *u, const double *p, double *d, double *v,",
         "                   double *f, double *a, double *dz) {",
         "  (void)time, (void)p;",
@@ -158,6 +160,12 @@ def _entry_points(system: System, memories: int) -> list[str]:
         *(f"  y[{s}] = {text};" for s, text in enumerate(shown)),
         "}",
     ]
+
+
+def _rates(mechanics: Mechanics) -> list[int]:
+    """For every drive the one that is its rate, -1 where none is."""
+    supports = set(mechanics.support_drive.tolist())
+    return [i + 1 if i in supports else -1 for i in range(mechanics.drives)]
 
 
 def _internal_step(system: System) -> float:
