@@ -35,12 +35,22 @@ def test_dry_friction_is_found_named_and_sized():
 
 
 def test_what_a_recording_does_not_tell_apart_is_called_a_family():
-    report = _diagnose(simulate(lambda d, v: 8 * np.tanh(v / 0.002), seed=21, seconds=30))
+    """A weak friction that turns slowly, and a valve that opens at a low rate."""
+    report = _diagnose(simulate(lambda d, v: 10 * np.tanh(v / 0.006), seed=21, seconds=30))
     (finding,) = report.findings
     assert finding.family is not None
-    assert set(finding.family.split(" or ")) == {"coulomb_friction", "bouc_wen"}
+    assert set(finding.family.split(" or ")) == {"coulomb_friction", "damper_blowoff"}
     assert "does not tell apart" in finding.sentence
     assert finding.advice is not None and "would tell them apart" in finding.advice
+
+
+def test_weak_friction_is_no_hysteresis_that_hardly_gives_way():
+    """Of a stiffness and what it yields over the recording tells the product alone, which is the friction."""
+    report = _diagnose(simulate(lambda d, v: 8 * np.tanh(v / 0.002), seed=21, seconds=30))
+    (finding,) = report.findings
+    assert (finding.effect, finding.family) == ("coulomb_friction", None)
+    assert abs(finding.parameters[0].value - 8) < 3 * finding.parameters[0].std < 4
+    assert finding.look_alikes["bouc_wen"] > 10
 
 
 @pytest.mark.slow

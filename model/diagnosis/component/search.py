@@ -264,9 +264,10 @@ def _accepted(
     # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
     told = [r for r in near if _determined(r.fit)]
     near = told or near
-    # beside a valve or a loop a lag is as well oil or rubber that gives way: only alone it is the channel's
+    # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
     alone = len(current.fit.model.pieces) == len(base.model.pieces)
-    near = [r for r in near if r.last is not LAG or (alone and _explains_all(r.fit, current.fit, rules))]
+    most = 1 - rules.by_lag if alone else rules.together
+    near = [r for r in near if r.last is not LAG or _leaves_nothing(r.fit, current.fit, most)]
     if not near:
         near = [r for r in ranked if r.last is not LAG and r.evidence > 0][:1]
     if not near:
@@ -295,13 +296,16 @@ def _plainest(near: list[Ranked], rules: ComponentRules) -> Ranked:
     return min(alike, key=lambda ranked: (ranked.last.plain, ranked.fit.model.count, ranked.fit.held_out))
 
 
-def _explains_all(lag: ComponentFit, before: ComponentFit, rules: ComponentRules) -> bool:
-    """Whether a lag leaves next to nothing: hysteresis, too, looks late, and no channel is blamed for a part of it."""
+def _leaves_nothing(lag: ComponentFit, before: ComponentFit, most: float) -> bool:
+    """Whether a lag leaves next to nothing: hysteresis, too, looks late, and no channel is blamed for a part of it.
+
+    most: of the power beyond noise that was left before it.
+    """
     floor = lag.floor**2
-    if before.held_out < rules.above * floor:
+    if before.held_out < before.task.rules.above * floor:
         return False
     return all(
-        after - floor < (1 - rules.by_lag) * max(was - floor, 0.0)
+        after - floor < most * max(was - floor, 0.0)
         for after, was in ((lag.error, before.error), (lag.held_out, before.held_out))
     )
 

@@ -272,6 +272,8 @@ def cost(fit: Fit, count: int, rules: EvidenceRules = RULES.evidence) -> float:
     """What the last `count` law parameters cost in evidence."""
     term = fit.point.terms[-1]
     block = fit.covariance[len(fit.covariance) - count :, len(fit.covariance) - count :]
+    if not term.law.named:  # amplitudes of one curve, which differ from each other's by convention: each by itself
+        block = np.diag(np.diag(block))
     logs = [spec.log for spec in term.law.parameters]
     total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):

@@ -37,6 +37,18 @@ def test_a_force_that_comes_late_is_the_channels_fault_and_no_series_stiffness()
     assert values["damper.damping"].value == pytest.approx(C, rel=0.01)
 
 
+@pytest.mark.slow
+def test_a_late_force_of_a_damper_with_friction_is_late_and_has_friction() -> None:
+    d, v = random_motion()
+    late = np.roll(K * d + C * v + 80 * np.tanh(v / 5e-3), 2 * SHIFT)[::FINER]
+    found = report(late, d[::FINER], noise=2.0)
+    said = {f.effect: f for f in found.findings if f.effect != "preload"}
+    assert said.keys() == {"sensor_lag", "coulomb_friction"}, found.summary
+    (time,), (force, *_) = said["sensor_lag"].parameters, said["coulomb_friction"].parameters
+    assert time.value == pytest.approx(2 * SHIFT / (RATE * FINER), abs=max(3 * time.std, 1e-4))
+    assert abs(force.value - 80) < 3 * force.std < 12
+
+
 def test_a_filter_of_the_force_is_a_lag() -> None:
     d, v = random_motion()
     filtered = sosfilt(butter(4, 70.0, fs=RATE * FINER, output="sos"), K * d + C * v)[::FINER]
