@@ -23,7 +23,7 @@ from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-_ROUND = 0.05  # of a linearisation of a vehicle, that a law's force along a motion and what it does take
+_ROUND = 0.01  # of a linearisation of a vehicle, that a law's force along a motion and what it does take
 
 
 @dataclass(frozen=True)

@@ -79,7 +79,7 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     begin, sample_rate = first / sample_rate + begin, sample_rate / factor
     start, stop, used = _affordable(system, values, sample_rate, begin, rules.longest)
     values, begin = values[start:stop], begin + start / sample_rate
-    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin)
+    prepared = _by_role(system, values, sample_rate, tuple(stuck), notes, begin, rules)
     signals, edge = passed(system, replace(prepared.signals, averaged=factor), rules)
     if edge:
         notes.append(
@@ -240,6 +240,7 @@ def _by_role(
     stuck: tuple[tuple[str, float], ...],
     notes: list[str],
     begin: float,
+    rules: RecordRules,
 ) -> Prepared:
     frozen = {name for name, _ in stuck}
     inputs = _inputs(system, values, 1 / sample_rate, frozen, notes)
@@ -253,6 +254,9 @@ def _by_role(
     if inputs.levelled is not None:
         kept = _second_derivative(inputs.displacement[0], inputs.levelled, 1 / sample_rate)
         sensors = _without_offsets(sensors, kept, system.mechanics.sensor_kind == ACCELERATION)
+    elif inputs.force_names and not inputs.support_names and _held(system, rules):
+        still = np.zeros(len(sensors))  # what does not go away has no acceleration in the long run
+        sensors = _without_offsets(sensors, still, system.mechanics.sensor_kind == ACCELERATION)
     empty = np.zeros((len(values), 0))
     signals = Signals(
         sample_rate=sample_rate,
@@ -270,6 +274,11 @@ def _by_role(
         speed=values[:, : len(system.inputs)] if system.on_track else empty,
     )
     return Prepared(signals, stuck, tuple(notes))
+
+
+def _held(system: System, rules: RecordRules) -> bool:
+    """Whether springs hold every mode of a system."""
+    return all(mode.frequency > rules.held for mode in system.mechanics.modes(system.bodies))
 
 
 def _moved(source: SupportInput, measured: dict[str, FloatArray], dt: float) -> tuple[FloatArray, FloatArray]:

@@ -23,7 +23,7 @@ from sprung.model.signals import FloatArray
 PATIENCE = 8  # steps in which the error has to halve
 _MEMORY = 1.5  # time constants of the slowest mode that a march begins earlier
 _STEP = 1e-3  # of a motion's deviation, for the slopes
-_MARCH = 10  # rounds of a law that a march takes as long as
+_MARCH = 30  # rounds of a law that a march takes as long as
 _AT_ONCE = 1e5  # stretches times states cubed that take as long as calling for them
 _DEARER = 2.0  # times that a step of them from every state takes what one from rest takes
 

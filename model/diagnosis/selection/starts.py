@@ -23,7 +23,16 @@ def starts_of(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
         return [hit.start]
     if isinstance(hit.term.law, StructureLaw):
         return structure_starts(problem, base, hit)
-    return [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+    starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
+    if _astray(problem, base) and _strengths(hit.term.law):  # what a gross law drove the parameters to
+        starts.append(joint_start(problem, base, hit, nominal=True))
+    return starts
+
+
+def _astray(problem: Problem, base: Fit) -> bool:
+    """Whether parameters are far off nominal."""
+    far: float = np.max(np.abs(base.point.theta), initial=0.0)
+    return far > problem.rules.selection.astray
 
 
 def start_of(base: Fit, hit: Candidate) -> Point:
@@ -47,9 +56,8 @@ def structure_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]
 
     The same at nominal parameters, where the present ones are far off: what a gross part drove them to.
     """
-    far = np.max(np.abs(base.point.theta), initial=0.0) > problem.rules.selection.astray
     starts = []
-    for nominal in (False, True)[: 2 if far else 1]:
+    for nominal in (False, True)[: 2 if _astray(problem, base) else 1]:
         start = start_of(base, hit)
         start = replace(start, theta=np.zeros_like(start.theta)) if nominal else start
         beside = joint_start(problem, base, hit, nominal)

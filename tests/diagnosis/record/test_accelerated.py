@@ -70,3 +70,23 @@ def test_an_acceleration_beside_other_motions_is_fused_with_them(beside):
     omega = 2 * np.pi * np.array([1.0, 10.0, 40.0])
     both, one = declared_noise(system, signals), declared_noise(plain, less)
     assert (both.support_variance(omega) < one.support_variance(omega)).all()
+
+
+SHAKEN = """
+name: shaken mass
+sample_rate: 100
+window: 100
+bodies: {mass: {mass: 40.0}}
+inputs: {shaker: {kind: force, body: mass, csv: f, noise: 0.1}}
+elements: {spring: {upper: mass, lower: ground, stiffness: STIFFNESS, damping: 30.0}}
+sensors: {a: {kind: acceleration, body: mass, csv: a, noise: 0.01}}
+"""
+
+
+@pytest.mark.parametrize(("stiffness", "kept"), [("2.0e+4", False), ("1.0e-3", True)])
+def test_an_offset_of_an_accelerometer_is_no_motion_of_what_springs_hold(stiffness: str, kept: bool):
+    system = parse_system(SHAKEN.replace("STIFFNESS", stiffness))
+    values = np.random.default_rng(2).standard_normal((4000, 2))
+    offset = prepare(system, values + np.array([0.0, 0.7]), 100.0).signals.sensors
+    plain = prepare(system, values, 100.0).signals.sensors
+    np.testing.assert_allclose(offset, plain + 0.7 * kept, atol=1e-9)
