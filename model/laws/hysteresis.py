@@ -211,7 +211,7 @@ _BOUC_WEN = ElementLaw(
     parameters=(
         ParameterSpec("alpha", "N/m", 0.0, 1e12, "stiffness of the hysteretic part", lambda s: 0.2 * s.stiffness),
         ParameterSpec(
-            "beta", "m^-n", 1e-6, 1e18, "inverse of the yield deflection^n, times 2/3", lambda s: 0.0, log=True
+            "beta", "m^-n", 1e-6, 1e60, "inverse of the yield deflection^n, times 2/3", lambda s: 0.0, log=True
         ),
         ParameterSpec("n", "1", 1.0, 8.0, "sharpness of the yielding", lambda seen: 1.0),
     ),

@@ -7,6 +7,7 @@ from dataclasses import replace
 from sprung.model.laws.base import RARE, ParameterSpec, SensorLaw
 from sprung.model.laws.channel import SensorResponse
 
+OF_CHANNEL = "unit of the channel"  # of a parameter
 _SECONDS = ParameterSpec("time", "s", -1.0, 1.0, "delay of the signal; negative: early", lambda seen: 0.005)
 
 
@@ -60,7 +61,7 @@ SENSOR_LAG = replace(_LATE, forms={"first order": _FIRST_ORDER, "first order and
 SENSOR_BIAS = SensorLaw(
     name="sensor_bias",
     title="offset",
-    parameters=(ParameterSpec("offset", "unit of the channel", -1e12, 1e12, "shown minus true", lambda seen: 0.0),),
+    parameters=(ParameterSpec("offset", OF_CHANNEL, -1e12, 1e12, "shown minus true", lambda seen: 0.0),),
     absent=(0.0,),
     looks_like="a constant in one channel",
     confused_with=("damper_asymmetry",),

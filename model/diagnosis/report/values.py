@@ -9,6 +9,7 @@ from sprung.model.diagnosis.report.report import FitFigures, LawParameter, Repor
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.selection.plausible import SIMULATED
 from sprung.model.laws import ElementLaw, reversal_step
+from sprung.model.laws.sensor_faults import OF_CHANNEL
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -56,8 +57,14 @@ def law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], Floa
     block = _with_corner(fit, term, fit.covariance[place, place])
     sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), SIMULATED * np.abs(term.parameters))
     hidden = not term.law.named
+    units = {channel.name: channel.unit for channel in fit.forward.system.channels}
     parameters = tuple(
-        LawParameter(spec.name, float(value), float(s), spec.unit)
+        LawParameter(
+            spec.name,
+            float(value),
+            float(s),
+            units.get(term.location, spec.unit) if spec.unit == OF_CHANNEL else spec.unit,
+        )
         for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
         if not hidden
     )

@@ -1,0 +1,27 @@
+"""Values of laws with deviations and units, as they are reported."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.report.values import law_parameters
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import find_law
+from tests.diagnosis_cases import quarter_car
+
+
+@pytest.mark.parametrize(("law", "unit"), [("sensor_bias", "m/s^2"), ("sensor_gain", "1"), ("sensor_lag", "s")])
+def test_an_offset_is_told_in_the_unit_of_its_channel(law: str, unit: str) -> None:
+    term = Term(find_law(law), "car_a", (0.9,))
+    fit: Any = SimpleNamespace(
+        point=SimpleNamespace(terms=(term,)),
+        place=lambda index: slice(0, 1),
+        covariance=np.eye(1),
+        forward=SimpleNamespace(system=quarter_car()),
+    )
+    parameters, _ = law_parameters(fit, 0)
+    assert [one.unit for one in parameters] == [unit]
