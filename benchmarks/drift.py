@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -328,7 +329,5 @@ def _false_alarm_figures(covariances: FloatArray, months: float, rng: np.random.
 
 
 if __name__ == "__main__":
-    import json
-
     for figure in run():
         print(json.dumps(figure), flush=True)

@@ -12,7 +12,9 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +74,6 @@ def run(recording: Path = RECORDING, *, repeats: int = 3, lengths: str = "1,10")
 def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[str, Any]:
     """In the child: replay into a store, `times` after one another, and measure."""
     import resource
-    import time
 
     from sprung.service import feed, reading
     from sprung.service.compute import Compute
@@ -109,7 +110,6 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
 
 def _longer(open_recording: Any, times: int) -> Any:
     """`open_recording` whose recordings go on: the file again and again, its time moved on by its length."""
-    from dataclasses import replace
 
     def opened(*arguments: Any, **options: Any) -> Any:
         recording = open_recording(*arguments, **options)

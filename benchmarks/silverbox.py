@@ -22,6 +22,7 @@ from sprung.benchmarks.generator.laws import LAWS
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import System, load_system
 from sprung.replay.record import Record, load_record
+from sprung.service.report import write_report
 
 Array = NDArray[np.float64]
 Model = tuple[float, float, float, Callable[[float, float], float]]  # mass, damping, stiffness, force of the laws
@@ -64,8 +65,6 @@ def diagnosis_of(system: System, record: Record, name: str, out: Path | None) ->
     """The report on a record as JSON; `out` also receives its page and pictures."""
     report = diagnose(system, record, options=Options(file=name))
     if out is not None:
-        from sprung.service.report import write_report
-
         write_report(report, system, out)
     return report.to_dict()
 

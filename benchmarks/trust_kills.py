@@ -16,6 +16,7 @@ from typing import Any, Protocol
 from sprung.benchmarks.trust_ride import SYSTEM_FILE, RestlessRide
 from sprung.benchmarks.trust_service import Served, audit, clients, settled
 from sprung.benchmarks.trust_zygote import DONE, GO, Forked, Zygote
+from sprung.service.times import to_iso
 
 QUICK, SLOW, SOON = 2.0, 12.0, 8.0  # s after readiness in half of the kills, in most others; after the start in a fifth
 CHAIN = 4  # kills of one replay before it may end
@@ -248,8 +249,6 @@ def _content(path: Path) -> dict[str, Any]:
 
 
 def _starts(path: Path) -> set[str]:
-    from sprung.service.times import to_iso
-
     return {to_iso(row[0]) for row in rows(path, "SELECT start_ns FROM windows")}
 
 

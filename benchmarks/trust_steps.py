@@ -8,9 +8,17 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from alembic import command
+from alembic.config import Config
+from sqlalchemy import create_engine, insert, text
+
 from sprung.benchmarks.trust_kills import Kills, ReplayKills, ServiceKills, StepKills, count, integrity, rows
 from sprung.benchmarks.trust_ride import RestlessRide
 from sprung.benchmarks.trust_zygote import Zygote
+from sprung.service.backup import back_up, restore
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
+from sprung.service.store.schema import models, recordings, vehicles, windows
 
 LIVED_IN_WINDOWS = 4000
 OPEN = """
@@ -53,10 +61,6 @@ if not (settings.data_dir / "sprung.db").exists():
 def _migration(folder: Path, _ride: RestlessRide, zygote: Zygote) -> Kills:
     def prepare(place: Path) -> None:
         """A store of the first version, with vehicles."""
-        from alembic import command
-        from alembic.config import Config
-        from sqlalchemy import create_engine, text
-
         engine = create_engine(f"sqlite:///{place}/sprung.db")
         config = Config()
         config.set_main_option("script_location", "sprung.service:migrations")
@@ -120,9 +124,6 @@ def _restore(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
     lived_in = _lived_in(folder, ride)
     source = folder / "b.tar"
     if not source.exists():
-        from sprung.service.backup import back_up
-        from sprung.service.settings import Settings
-
         back_up(Settings(data_dir=lived_in), source)
 
     def judge(place: Path, done: bool) -> dict[str, int]:
@@ -139,11 +140,6 @@ def _restore(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
 
 def _lived_in(folder: Path, _ride: RestlessRide) -> Path:
     """A data folder with a few thousand windows and an upload."""
-    from sqlalchemy import insert
-
-    from sprung.service.store import open_store
-    from sprung.service.store.schema import models, recordings, vehicles, windows
-
     place = folder / "lived-in"
     if (place / "done").exists():
         return place
@@ -170,9 +166,6 @@ def _copy(source: Path, target: Path) -> None:
 
 
 def _restores(place: Path) -> bool:
-    from sprung.service.backup import restore
-    from sprung.service.settings import Settings
-
     trial = place / "trial"
     shutil.rmtree(trial, ignore_errors=True)
     with contextlib.suppress(ValueError, OSError):
