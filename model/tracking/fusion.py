@@ -283,8 +283,9 @@ class Fusion:
         if not self.model.size:
             return value, estimate.covariance, np.zeros((len(value), 0))
         here = belief.mean[-self.model.size :]
-        if found is None:
-            found_at, cross, covariance = np.zeros(len(here)), calibration.cross, estimate.covariance
+        if found is None:  # loads were refined along, but not what the window says of them: its covariance holds that
+            cross = np.where(self.model.along, 0.0, calibration.cross)
+            found_at, covariance = np.zeros(len(here)), estimate.covariance
         else:
             found_at, cross, covariance = found.point, found.cross, found.given
         if found is None or not found.whole:

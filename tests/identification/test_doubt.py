@@ -140,6 +140,21 @@ def test_bodies_that_are_not_quite_those_of_the_file_blind_no_tracker(off):
         assert told["pitch inertia over mass"].change == pytest.approx(apart, abs=0.015)
 
 
+def test_how_bodies_are_built_is_not_told_by_what_is_usual_of_springs():
+    """Springs and dampers all 30 % above their file: no window tells that from lighter bodies, and no prior does."""
+    system = bogie()
+    tracker = make_tracker(system)
+    runs = simulate_runs(system, np.full((80, len(system.parameters)), 0.3), 100, np.random.default_rng(10))
+    state = tracker.initial_state()
+    for k, estimate in enumerate(Identifier(system).examine(runs.values, np.arange(80) % 2 == 0)):
+        state = tracker.update(state, estimate, 10**18 + k * 10**9)
+    assert tracker.built(state) == ()
+    mean, std = tracker.posterior(state)
+    assert np.abs((mean - 0.3) / std).max() < 2
+    assert np.abs(mean - 0.3).max() < 0.015
+    assert std.min() > 0.015
+
+
 def test_what_is_fixed_or_stated_is_not_doubted_beside():
     certain = parse_system(QUARTER_CAR.format(mass="{value: 40.0, fixed: true}"))
     assert mass_doubt(certain, loads=True, tracked=True).none
