@@ -13,11 +13,10 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray, MeasurementFau
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
-Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side", "own_mass", "own_roll",
-               "own_pitch", "reach_x", "reach_y"]  # fmt: skip
+Kind = Literal["gain", "delay", "load", "roll_inertia", "pitch_inertia", "centre", "side", "own_roll", "own_pitch",
+               "reach_x", "reach_y"]  # fmt: skip
 CARGO: tuple[Kind, ...] = ("load", "roll_inertia", "pitch_inertia", "centre", "side")  # another after every stop
 OWN: dict[Kind, str] = {  # of a body, always the same
-    "own_mass": "mass",
     "own_roll": "roll inertia over mass",
     "own_pitch": "pitch inertia over mass",
     "reach_x": "distance of its accelerometers along x",

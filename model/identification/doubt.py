@@ -171,9 +171,9 @@ class _UsualRide:
 
 
 def _unstated(system: System) -> dict[str, float]:
-    """Bodies whose mass no file doubts, nor windows tell: neither loads, nor estimated, nor fixed."""
+    """Bodies whose mass no file doubts: neither loads, nor estimated, nor fixed."""
     told = {load.body for load in system.loads} | {p.element for p in system.parameters if p.quantity == "mass"}
-    told |= {*system.built, *system.doubtful_masses}
+    told |= {*system.doubtful_masses}
     bodies = system.file.bodies.items()
     return {n: MASS_STD for n, b in bodies if n not in told and b.mass.std is None and not b.mass.fixed}
 
@@ -197,8 +197,8 @@ def _together(system: System) -> Iterator[SystemFile]:
 
 
 def _inertias(system: System) -> Iterator[SystemFile]:
-    """The file with one inertia after the other larger, of the bodies whose mass no file doubts."""
-    for name in _unstated(system):
+    """The file with one inertia after the other larger, of the bodies whose mass no file doubts, nor windows tell."""
+    for name in _unstated(system).keys() - set(system.built):
         body = system.file.bodies[name]
         for kind in INERTIAS:
             if getattr(body, kind):

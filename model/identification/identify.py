@@ -24,8 +24,6 @@ from sprung.model.signals import BoolArray, Deviating, Estimate, FloatArray
 from sprung.model.simulate.drives import ORDERS, drives_of
 from sprung.model.system import System
 
-_LEFT = 1e-4  # of the parameters' prior, so that those of which a window tells nothing do not divide by zero
-
 
 @dataclass(slots=True)
 class Identifier:
@@ -234,6 +232,7 @@ def _deviating(
     if not (whole or loaded):
         return None
     C, H = channels, 2 * channels + len(spread)
+    prior = spread[:X] ** -2 / max(refined.chi_square[b], 1.0)  # in the refined values, not of the window
     at = np.zeros(H) if point is None else point.copy()
     covariance = refined.covariance[b]
     cross = refined.cross[b] if whole else np.zeros((len(covariance), H))
@@ -243,13 +242,14 @@ def _deviating(
     if loaded:
         loads = slice(2 * C, 2 * C + X)
         at[loads] = refined.log_ratio[b, P:]
-        told, score[loads] = _of_loads(refined, b, P, spread[:X])
-        per_load = covariance[:P, P:] @ np.linalg.inv(covariance[P:, P:])  # (P, loads)
+        inverse = np.linalg.inv(covariance[P:, P:])
+        per_load = covariance[:P, P:] @ inverse  # (P, loads)
         moved = cross[P:, : 2 * C]  # of the loads per gain or delay
-        information[: 2 * C, : 2 * C] += moved.T @ told @ moved
-        information[: 2 * C, loads] = -moved.T @ told
+        information[: 2 * C, : 2 * C] += moved.T @ inverse @ moved
+        information[: 2 * C, loads] = -moved.T @ inverse
         information[loads, : 2 * C] = information[: 2 * C, loads].T
-        information[loads, loads] = told
+        information[loads, loads] = inverse - np.diag(prior)
+        score[loads] = prior * refined.log_ratio[b, P:]
         given = given - per_load @ covariance[P:, :P]
         cross = cross[:P] - np.pad(per_load @ moved, ((0, 0), (0, H - 2 * C)))
         cross[:, loads] = per_load
@@ -261,20 +261,3 @@ def _deviating(
         cross, score = cross * scale, score * scale
         information = information * np.outer(scale, scale)
     return Deviating(at, given, cross[:P], information, score, float(refined.freedom[b]), whole)
-
-
-def _of_loads(refined: Refined, b: int, P: int, spread: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Information (X, X) of a window on what was refined along, whatever the parameters, and slope (X,) of its
-    log-likelihood there, without the priors that it was refined with.
-
-    That of the parameters, too: the scale of all forces, masses and parameters together, is told by no window, and
-    thousands of windows would add up what a weak prior about each parameter says of it.
-    """
-    wide = max(refined.chi_square[b], 1.0)
-    prior = np.concatenate([np.full(P, PRIOR_STD), spread]) ** -2 / wide
-    whole = np.linalg.inv(refined.covariance[b]) - np.diag(prior)
-    pull = prior * refined.log_ratio[b]  # where the refinement ended the data pull as much as the priors
-    weakened = whole[:P, :P] + np.diag(_LEFT * prior[:P])
-    per_load = np.linalg.solve(weakened, whole[:P, P:])
-    told = whole[P:, P:] - whole[P:, :P] @ per_load
-    return 0.5 * (told + told.T), pull[P:] - per_load.T @ pull[:P]

@@ -12,10 +12,11 @@ of a relative change, and give a positive mass matrix for c^2 + s^2 < 1.
 An air spring that a valve keeps at its height has a pressure, and so a stiffness, in proportion to the weight on it: an
 element with `by_load: a` under the body is stiffer by exp(a l).
 
-Bodies below, bogies, are never quite those of their drawing, either.  Five numbers more are a body's own, the same in
-all windows: the logarithms of its mass (inertias along) and of its roll and pitch inertia beyond that, and how much
-further from its middle its accelerometers are, along x and along y, than the file says.  A wheel base that is a little
-longer is, in angles that are a little smaller, a smaller pitch inertia and accelerometers that are closer together.
+Bodies below, bogies, are never quite those of their drawing, either.  Four numbers more are a body's own, the same in
+all windows: the logarithms of its roll and pitch inertia, and how much further from its middle its accelerometers are,
+along x and along y, than the file says.  Their masses are the scale of all forces, which no window tells.  A wheel base
+that is a little longer is, in angles that are a little smaller, a smaller pitch inertia and accelerometers that are
+closer together.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ from sprung.model.mechanics import ACCELERATION
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
-Kind = Literal["load", "roll_inertia", "pitch_inertia", "centre", "side", "own_mass", "own_roll", "own_pitch",
-               "reach_x", "reach_y"]  # fmt: skip
+Kind = Literal["load", "roll_inertia", "pitch_inertia", "centre", "side", "own_roll", "own_pitch", "reach_x",
+               "reach_y"]  # fmt: skip
 COUPLED: dict[Kind, str] = {"centre": "pitch", "side": "roll"}  # what couples heave to which angle
 SPREAD_STD = 0.1  # of r and p: seated passengers have 0.6 times the inertia of a load spread like the body
 CENTRE_STD = 0.04  # of c: one metre off the middle of a car that carries 30 % is 0.03
@@ -42,7 +43,6 @@ REACHING: dict[Kind, str] = {"reach_x": "pitch", "reach_y": "roll"}  # the angle
 OWN_STD: dict[
     Kind, float
 ] = {  # of what a file does not know of a body: drawings and weighed prototypes agree to some per cent
-    "own_mass": 0.02,
     "own_roll": 0.03,
     "own_pitch": 0.03,
     "reach_x": 0.015,
@@ -84,8 +84,7 @@ def _own_terms(system: System) -> Iterator[LoadTerm]:
     shown = mechanics.S[mechanics.sensor_kind == ACCELERATION].any(axis=0)  # coordinates that accelerometers show
     for name in system.built:
         body = system.file.bodies[name]
-        kinds: list[Kind] = [] if body.mass.std is not None else ["own_mass"]
-        kinds += ["own_roll"] if body.roll_inertia is not None else []
+        kinds: list[Kind] = ["own_roll"] if body.roll_inertia is not None else []
         kinds += ["own_pitch"] if body.pitch_inertia is not None else []
         dofs = {kind: f"{name}.{angle}" for kind, angle in REACHING.items()}
         kinds += [kind for kind, dof in dofs.items() if dof in mechanics.dofs and shown[mechanics.dofs.index(dof)]]
@@ -103,7 +102,7 @@ class Loading:
         pattern = np.zeros((len(self.terms), len(dofs), len(dofs)))
         reach = np.zeros((len(self.terms), len(dofs)))
         for i, term in enumerate(self.terms):
-            if term.kind in ("load", "own_mass"):
+            if term.kind == "load":
                 exponents[i] = mechanics.body_of_dof == system.bodies.index(term.body)
             elif term.kind in REACHING:
                 reach[i, dofs.index(f"{term.body}.{REACHING[term.kind]}")] = 1.0

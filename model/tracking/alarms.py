@@ -34,7 +34,7 @@ MOST_OF = 0.75  # of the elements of a kind
 FEWEST = 4  # elements that can be said to move together
 RECOVERED = 0.6  # of the change that opens an alarm of a kind: below it is over
 MENDED = 0.2  # of a sensor's largest deviation: surely below it is over
-LOAD_KNOWN = 0.03  # standard deviation of a load that can be said to be beyond a limit; bogies leave it open by 0.02
+LOAD_KNOWN = 0.02  # standard deviation of a load that can be said to be beyond a limit
 WINDOWS = 6  # windows that a frozen or reversed channel needs to be told
 HARD = ("frozen", "saturated", "inverted", "swapped")
 

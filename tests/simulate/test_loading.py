@@ -124,14 +124,14 @@ def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
 
 def test_slopes_along_loads_of_air_springs_and_along_how_bogies_are_built_agree_with_finite_differences():
     system = parse_system(re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 0.8, ", MANCHESTER.read_text()))
-    x = np.tile(np.concatenate([np.zeros(24), described(), np.full(10, 0.02)]), (2, 1))
+    x = np.tile(np.concatenate([np.zeros(24), described(), np.full(8, 0.02)]), (2, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(6))
     model = Refiner(system).model
     data = model.batch(model.knots(runs.clean), runs.clean, np.ones(len(system.sensors), dtype=bool))
     x = torch.as_tensor(x)
     at = model.linearise(x, data)
     known = torch.linalg.qr(at.free.mT)[0]
-    for row in (24, 27, 28, *range(29, 34)):  # the last ones: how a bogie is built
+    for row in (24, 27, 28, *range(29, 33)):  # the last ones: how a bogie is built
         step = torch.zeros_like(x)
         step[:, row] = 1e-5
         up, down = (model.chord(at, x + sign * step, at.x0, data).residual for sign in (1, -1))
