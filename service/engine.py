@@ -76,9 +76,9 @@ class Engine:
         return bool(number * _SCATTERED % 2**32 < 2**32 // self.weighed_of)
 
     def load_state(self, data: dict[str, Any]) -> TrackerState:
-        """A stored tracker state; one of an older format starts anew rather than stopping the service."""
+        """A stored tracker state; one that cannot be read starts anew rather than stopping the service."""
         try:
-            return TrackerState.from_dict(data)
+            return self.tracker.whole(TrackerState.from_dict(data))
         except TrackerStateError as error:
             log.warning("a stored tracker state cannot be read (%s); the vehicle's baseline is learned anew", error)
             return self.tracker.initial_state()

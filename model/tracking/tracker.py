@@ -113,7 +113,7 @@ class Tracker:
         fit in a curve is passed over likewise, where curves are measured.
         """
         self._check(state, estimate)
-        state = self._whole(state)
+        state = self.whole(state)
         if state.time is not None and time_ns <= state.time:
             return state
         seen = coverage.update(state.coverage, usable=True)
@@ -146,8 +146,13 @@ class Tracker:
         told = jump if jump is not None and self._fusion.armed(state) else None
         return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), told, centre))
 
-    def _whole(self, state: TrackerState) -> TrackerState:
-        """One of an older format, or of a pooled prior that is gone, knows nothing of weather, pressures, centres."""
+    def whole(self, state: TrackerState) -> TrackerState:
+        """One of an older format, or of a pooled prior that is gone, knows nothing of weather, pressures, centres.
+
+        Errors: `TrackerStateError` for one that knows of more than this tracker.
+        """
+        if state.belief.deviations > self.model.size:
+            raise TrackerStateError("stored tracker state is of a version that followed more; start a new state")
         calibration, belief = dev.grown(state.calibration, state.belief, self.model)
         if calibration is not state.calibration:
             state = replace(state, calibration=calibration, belief=belief)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from fastapi.testclient import TestClient
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
+from sprung.model.tracking.tracker import Tracker
 from sprung.service.api.app import create_app
 from sprung.service.cli import main
 from sprung.service.core import build_core
@@ -87,3 +89,14 @@ def test_weights_that_are_not_used_are_said_so(tmp_path: Path, caplog: pytest.Lo
     load_engine(Settings(system=file, weights=tmp_path, data_dir=tmp_path))
     (line,) = [record.getMessage() for record in caplog.records]
     assert line.startswith(f"{tmp_path}: these weights are not used: quarter-car has laws")
+
+
+def test_states_of_versions_that_knew_less_or_more_stop_nothing(path: Path, tmp_path: Path) -> None:
+    engine = load_engine(Settings(system=path, data_dir=tmp_path))
+    now = engine.tracker
+    older = Tracker(now.parameters, now.settings, now.deviations[:-2])
+    state = engine.load_state(older.initial_state().to_dict())
+    assert len(state.calibration.reference) == now.model.size > older.model.size
+    assert [one.name for one in now.report(state)] == [p.name for p in engine.system.tracked]
+    downgraded = replace(engine, tracker=older).load_state(now.initial_state().to_dict())
+    assert len(older.report(downgraded)) == len(engine.system.tracked)
