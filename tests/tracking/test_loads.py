@@ -143,3 +143,24 @@ def test_a_system_file_says_where_conditions_are_measured():
     plain = "\n".join(line for line in FILE.split("\n") if not line.startswith(("speed", "temp", "yaw")))
     assert parse_system(plain).digest == system.digest  # how it runs makes no other vehicle
     assert not parse_system(plain).conditions(None).curving
+
+
+def test_windows_without_what_they_say_of_loads_are_not_moved_by_the_load_again():
+    """As a vehicle sends them: loads are refined with every window; every second one says what it knows of them."""
+    rng = np.random.default_rng(6)
+    tracker, load = follow(), np.log(1.2)
+    covariance = correlated(rng, STD)
+    root = np.linalg.cholesky(covariance)
+    both = covariance + SEEN**2 * np.outer(TAKES, TAKES)
+    state = tracker.initial_state()
+    for k in range(60):
+        carried = load + SEEN * rng.normal()
+        value = root @ rng.normal(size=24) + TAKES * (carried - load)
+        found = Deviating(
+            np.array([carried]), covariance, TAKES[:, None], np.array([[SEEN**-2]]), np.zeros(1), 300.0, True
+        )
+        told = estimate(value, both, deviating=found if k % 2 == 0 else None)
+        state = tracker.update(state, told, EPOCH + k * SECOND)
+    assert tracker.loads(state)["car"][0] == pytest.approx(load, abs=0.01)
+    assert worst(tracker, state) < 4.0
+    assert np.abs(tracker.posterior(state)[0]).max() < 0.02
