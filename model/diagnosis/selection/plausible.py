@@ -11,9 +11,10 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.record.signals import Part
+from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
-from sprung.model.laws import BodyLaw, ElementLaw, SupportLaw, reversal_step
+from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw, SupportLaw, reversal_step
 from sprung.model.signals import FloatArray
 
 SIMULATED = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
@@ -28,9 +29,20 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str 
         return "its corner is as wide as the rates of the motion: a damper that saturates"
     if isinstance(term.law, ElementLaw) and term.law.knees:
         return _unresolved(fit, term, rules)
+    if isinstance(term.law, (BodyLaw, StructureLaw)) and term.law.adds_motion:
+        return _unheard(fit.forward.part.grid, term)
     if isinstance(term.law, (BodyLaw, SupportLaw)):
         return harmonic(fit.forward.part, term, rules)
     return None
+
+
+def _unheard(grid: Grid, term: Term) -> str | None:
+    """A resonance above all that is compared: below it nothing parts it from a body that is heavier or softer."""
+    highest = grid.omega[grid.band][-1] / (2 * np.pi)
+    if "frequency" not in term.law.names:
+        return None
+    frequency = term.parameters[term.law.names.index("frequency")]
+    return f"{frequency:.3g} Hz is above the {highest:.3g} Hz that are compared" if frequency > highest else None
 
 
 def out_of_range(term: Term) -> str | None:

@@ -55,6 +55,18 @@ def test_a_broad_excitation_has_no_harmonics() -> None:
     assert harmonic(part, periodic(3.15)) is None
 
 
+@pytest.mark.parametrize("law", ["suspended_mass", "flexible_mode"])
+def test_a_resonance_above_what_is_compared_is_no_resonance(law: str) -> None:
+    fit = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID)))
+    found = find_law(law)
+    highest = GRID.omega[GRID.band][-1] / (2 * np.pi)
+    for factor, believed in ((0.9, True), (1.1, False)):
+        values = [1.0] * len(found.parameters)
+        values[found.names.index("frequency")] = factor * highest
+        term = Term(found, "floor", tuple(values), "z")
+        assert (doubt(fit, term) is None) == believed
+
+
 @pytest.mark.parametrize(
     ("law", "values", "believed"),
     [
