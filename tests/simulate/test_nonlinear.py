@@ -39,6 +39,7 @@ sensors:
 TRIALS = {  # strong effects at the strut of the toy
     "cubic_stiffness": (5e7,),
     "bump_stop": (0.002, 6e4),
+    "progressive_stop": (0.002, 3e4, 0.003, 2e4, 2.0),
     "clearance": (0.002,),
     "coulomb_friction": (60.0, 0.02),
     "damper_blowoff": (0.08, 0.3),
