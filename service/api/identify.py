@@ -62,7 +62,9 @@ def _read(core: Core, content: bytes, actor: Actor, states: bool, track: bool) -
     """What was sent, and what the vehicle's windows are identified with; runs in a thread."""
     head, values = read_window(content, core.engine)
     if track:
-        own_vehicle(actor, _needed(head.vehicle))
+        _needed(head.vehicle)
+    if head.vehicle is not None:  # named without being tracked, it is identified with its own model all the same
+        own_vehicle(actor, head.vehicle)
     engines, now = core.pipeline.engines, now_ns()
     served = engines.shared if head.vehicle is None else engines.lately(core.store, head.vehicle)
     start = start_of(head, now)  # wrong ones are refused also where nobody needs them
@@ -72,11 +74,10 @@ def _read(core: Core, content: bytes, actor: Actor, states: bool, track: bool) -
     return AskedWindow(values, served, head.vehicle, states, start if track else None)
 
 
-def _needed(vehicle: str | None) -> str:
+def _needed(vehicle: str | None) -> None:
     if vehicle is None:
         detail = "is needed to track"
         raise ApiProblem(422, f"vehicle {detail}", [{"field": "vehicle", "detail": detail}])
-    return vehicle
 
 
 def _answer(engine: Engine, vehicle: str | None, estimate: Estimate) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from sprung.service.api.scopes import NEEDS, need_of
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
+from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
 from sprung.service.logs import JsonLines, request_id
 from sprung.service.main import access_notice
 from sprung.service.settings import Settings
@@ -134,6 +135,29 @@ def test_a_fleets_token_sees_and_feeds_its_own_vehicles_only(client: TestClient,
     assert client.get(f"/jobs/{job}", headers=own).status_code == 200
     other, _ = core.tokens.create("south", ["read"], fleet="south-")
     assert client.get(f"/jobs/{job}", headers=bearer(other)).status_code == 404
+
+
+def test_no_route_takes_another_fleets_vehicle_by_its_name(client: TestClient, core: Core, system: System) -> None:
+    """Whatever is sent to: a route that is new must say here how its body names a vehicle."""
+    text, _ = core.tokens.create("north", ["ingest", "operate"], fleet="north-")
+    channels = {channel.name: [0.01] * system.window for channel in system.channels}
+    window = {"vehicle": "south-1", "sample_rate": 100.0, "channels": channels}
+    dropped = WindowEstimate(10**18, "dropped", "clipped", 0, False, None)
+    message = encode(Message("south-1", core.engine.digest, (dropped,)), "small")
+    upload = {"data": {"vehicle": "south-1"}, "files": {"file": ("a.mcap", b"x")}}
+    bodies: dict[str, list[dict[str, Any]]] = {
+        "/identify": [{"json": window}, {"json": window, "params": {"track": "true"}}],
+        "/ingest/estimates": [{"content": message, "headers": {"content-type": MEDIA_TYPE}}],
+        "/recordings": [upload],
+        "/diagnose": [upload, {"json": {"vehicle": "south-1"}}],
+    }
+    with_bodies = {path for method, path in routes(client) if method != "GET" and need_of(method, path).by_fleet}
+    assert {path for path in with_bodies if "{id}" not in path} == set(bodies)
+    for path, tried in bodies.items():
+        for sent in tried:
+            answer = client.post(path, **sent | {"headers": bearer(text) | sent.get("headers", {})})
+            assert answer.status_code == 403, (path, answer.text)
+    assert client.get("/events?vehicle=south-1", headers=bearer(text)).status_code == 403
 
 
 def test_without_any_token_only_this_machine_is_answered(engine: Engine, tmp_path: Path) -> None:
