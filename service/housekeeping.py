@@ -8,6 +8,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from sqlalchemy import ColumnElement, Connection
@@ -25,13 +26,24 @@ DAY = 86_400 * NANOSECONDS
 LONGEST_PAUSE = DAY  # by which a pause of the service ages what is kept
 
 
+@dataclass(frozen=True, slots=True)
+class _Mark:
+    """What is written down of the clock, ns."""
+
+    time_ns: int  # where it stands
+    wall_ns: int  # the host's clock then
+    owed_ns: int = 0  # by which the host's clock went back; it does not count when it is made up for
+
+
 class RetentionClock:
     """Time by which things age: it goes with the host's clock, but takes no leap.
 
-    While the service runs it advances as the monotonic clock does, however the host's clock is set meanwhile; over a
-    pause of the service it advances by a day at the most.  A clock that is forty days ahead after a rollover, or years
-    because a battery was empty, makes nothing old; a train that stood for months loses its data some days later than
-    it could.
+    While a process runs it advances as the monotonic clock does, however the host's clock is set meanwhile; over a
+    pause it advances by what the host's clock did since it was last written down, a day at the most.  A clock that is
+    forty days ahead after a rollover, or years because a battery was empty, makes nothing old, however often the
+    service starts; a train that stood for months loses its data some days later than it could.  Where the host's clock
+    went back, that much (a day at the most) of what it goes on later does not count: one that is now right and now
+    wrong does not add up either.
     """
 
     def __init__(
@@ -46,26 +58,37 @@ class RetentionClock:
         self._before = before
         self._wall = wall
         self._monotonic = monotonic
-        self._last: tuple[int, int] | None = None  # (this clock, monotonic)
+        self._last: tuple[int, _Mark] | None = None  # monotonic and what was known then
 
-    def now(self) -> int:
-        """ns since epoch; written down, so that the next process goes on from there."""
+    def now(self, keep: bool = True) -> int:
+        """ns since epoch; keep: written down, so that the next process goes on from there."""
         wall, monotonic = self._wall(), self._monotonic()
         if self._last is not None:
-            time_ns = self._last[0] + (monotonic - self._last[1])
+            since, mark = self._last
+            mark = _Mark(mark.time_ns + (monotonic - since), wall, mark.owed_ns)
         else:
-            kept = self._kept() or self._before()
-            time_ns = wall if kept is None else kept + min(max(wall - kept, 0), LONGEST_PAUSE)
-        self._last = (time_ns, monotonic)
-        part = self._path.with_suffix(".part")
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        part.write_text(json.dumps({"time_ns": time_ns}))
-        part.replace(self._path)
-        return time_ns
+            mark = self._after_a_pause(wall)
+        self._last = (monotonic, mark)
+        if keep:
+            part = self._path.with_suffix(".part")
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            part.write_text(json.dumps(asdict(mark)))
+            part.replace(self._path)
+        return mark.time_ns
 
-    def _kept(self) -> int | None:
+    def _after_a_pause(self, wall: int) -> _Mark:
+        kept = self._kept()
+        if kept is None:
+            before = self._before()
+            kept = _Mark(wall, wall) if before is None else _Mark(before, before)
+        gone = min(max(wall - kept.wall_ns, -LONGEST_PAUSE), LONGEST_PAUSE) - kept.owed_ns
+        return _Mark(kept.time_ns + max(gone, 0), wall, min(max(-gone, 0), LONGEST_PAUSE))
+
+    def _kept(self) -> _Mark | None:
         try:
-            return int(json.loads(self._path.read_text())["time_ns"])
+            found = json.loads(self._path.read_text())
+            time_ns = int(found["time_ns"])
+            return _Mark(time_ns, int(found.get("wall_ns", time_ns)), int(found.get("owed_ns", 0)))
         except (OSError, ValueError, KeyError, TypeError):
             return None
 

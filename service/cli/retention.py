@@ -14,7 +14,7 @@ def run(dry_run: bool, store: str | None) -> int:
     opened = open_store(settings.store_url)
     try:
         housekeeping = Housekeeping(settings, opened)
-        now = housekeeping.clock.now()
+        now = housekeeping.clock.now(keep=not dry_run)
         found = housekeeping.once(now, keep=not dry_run)
     finally:
         opened.close()

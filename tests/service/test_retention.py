@@ -8,6 +8,7 @@ import pytest
 from sqlalchemy import func, select
 
 from sprung.model.system import System
+from sprung.service.cli import retention as retention_command
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine
 from sprung.service.housekeeping import DAY, Housekeeping, RetentionClock
@@ -61,6 +62,49 @@ def test_a_restart_advances_it_by_a_day_at_the_most(tmp_path: Path, leap: int, a
     path = tmp_path / "retention.json"
     Clocks(START).retention(path).now()
     assert Clocks(START + leap).retention(path).now() == START + advance
+
+
+@pytest.mark.parametrize("walls", [[5500] * 40, [5500, 0] * 20, [0, -20000] * 20, [0.9, 0] * 20])
+def test_many_starts_by_a_wrong_clock_advance_it_by_a_day_at_the_most(tmp_path: Path, walls: list[float]) -> None:
+    path = tmp_path / "retention.json"
+    Clocks(START).retention(path).now()
+    for second, leap in enumerate(walls):
+        advanced = Clocks(START + round(leap * DAY) + second * 10**9).retention(path).now() - START
+        assert 0 <= advanced <= DAY + 40 * 10**9
+
+
+@pytest.mark.parametrize("leap", [0, 5500 * DAY, -9000 * DAY])
+def test_days_go_on_by_a_wrong_clock_and_after_it_was_set_right(tmp_path: Path, leap: int) -> None:
+    path, clocks = tmp_path / "retention.json", Clocks(START)
+    clocks.retention(path).now()
+    clocks.passed(0, leap)
+    before = clocks.retention(path).now()
+    for back in (0, -leap):
+        clocks.passed(0, back)
+        for _ in range(20):  # a day each, half of it a pause
+            clock = clocks.retention(path)
+            clock.now()
+            clocks.passed(43200)
+            clock.now()
+            clocks.passed(43200)
+    assert clocks.retention(path).now() >= before + 37 * DAY
+
+
+def test_a_clock_written_by_an_earlier_version_goes_on(tmp_path: Path) -> None:
+    path = tmp_path / "retention.json"
+    path.write_text(f'{{"time_ns": {START}}}')
+    assert Clocks(START + HOUR).retention(path).now() == START + HOUR
+
+
+def test_a_preview_by_the_command_does_not_move_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SPRUNG_DATA_DIR", str(tmp_path))
+    path = tmp_path / "retention.json"
+    Clocks(START).retention(path).now()
+    before = path.read_bytes()
+    assert retention_command.run(dry_run=True, store=None) == 0
+    assert path.read_bytes() == before
+    assert retention_command.run(dry_run=False, store=None) == 0
+    assert path.read_bytes() != before
 
 
 def test_without_its_file_it_begins_at_the_last_window(tmp_path: Path) -> None:
