@@ -10,7 +10,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.io import loadmat
+from scipy.io.matlab import MatReadError
 
+from sprung.replay import uff
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.extras import needed
 from sprung.replay.jsonkeys import load
@@ -33,9 +36,6 @@ def opened(path: Path) -> Iterator[list[Column]]:
 @contextmanager
 def _mat(path: Path) -> Iterator[list[Column]]:
     """MATLAB files: version 7.3 is HDF5, older ones are read by SciPy."""
-    from scipy.io import loadmat
-    from scipy.io.matlab import MatReadError
-
     with path.open("rb") as file:
         start = file.read(128)
     if start.startswith(b"MATLAB 7.3") or start.startswith(b"\x89HDF"):
@@ -202,8 +202,6 @@ def _waveform(said: Mapping[str, Any]) -> EvenTimes | None:
 
 @contextmanager
 def _uff(path: Path) -> Iterator[list[Column]]:
-    from sprung.replay import uff
-
     yield uff.columns(path)
 
 

@@ -11,7 +11,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from sprung.model.diagnosis.report.report import IdentifiedLaw, Report
-from sprung.model.laws import ElementLaw
+from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE
 from sprung.model.system import System, parse_system
 
@@ -36,7 +36,7 @@ def improved_text(text: str, system: System, report: Report) -> str:
         _set_value(group[part], quantity, parameter.value)
     for group in ("elements", "bodies", "inputs", "sensors"):
         for entry in (file.get(group) or {}).values():
-            _drop_laws(entry)
+            _drop_laws(entry, {law.name for law in system.catalogue if isinstance(law, SensorLaw)})
     for law in report.laws:
         _place(file, system, law)
     for finding in report.findings:
@@ -68,12 +68,12 @@ def _set_value(entry: Any, quantity: str, value: float) -> None:
         entry[quantity] = _rounded(value)
 
 
-def _drop_laws(entry: Any) -> None:
+def _drop_laws(entry: Any, kept_names: set[str]) -> None:
     """Take out laws, whose values come anew; faults of measurements stay: they were undone before."""
     if not isinstance(entry, Mapping):
         return
     if "laws" in entry:
-        kept = [law for law in entry["laws"] if all(effect.startswith("sensor_") for effect in law)]
+        kept = [law for law in entry["laws"] if kept_names.issuperset(law)]
         del entry["laws"]  # type: ignore[attr-defined]
         if kept:
             entry["laws"] = kept  # type: ignore[index]

@@ -11,11 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import RIG
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.own import load_laws
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import load_system, parse_system
 from sprung.replay import recording
+from sprung.replay.writing import write_recording
 from sprung.service.cli import main
 from sprung.service.core import build_core
 from sprung.service.engine import Engine
@@ -151,6 +153,20 @@ def test_a_law_from_a_file_is_known_to_the_diagnosis(tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text(SYSTEM.replace("1500}", "1500, laws: [{squeak: {size: 10}}]}"))
     laws = CATALOGUE + load_laws(tmp_path / "laws.py", ())
     assert "strut.squeak.size" in load_system(tmp_path / "one.yaml", laws).laws[0].names
+
+
+def test_a_law_from_a_file_is_searched_by_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "laws.py").write_text(LAW)
+    (tmp_path / "rig.yaml").write_text(RIG)
+    rng, t = np.random.default_rng(4), np.arange(600) / 100
+    travel, rate = 5e-3 * np.sin(2 * np.pi * 0.7 * t), 5e-3 * 1.4 * np.pi * np.cos(2 * np.pi * 0.7 * t)
+    force = 4.0e4 * travel + 1.5e3 * rate + 60 * np.sin(travel / 1e-3) + rng.normal(0, 1.0, len(t))
+    columns = np.column_stack([travel + rng.normal(0, 1e-6, len(t)), force])
+    write_recording(tmp_path / "rig.csv", parse_system(RIG).channels, columns, 100.0, 10**18)
+    given = ["--system", str(tmp_path / "rig.yaml"), "--laws", str(tmp_path / "laws.py"), "--json"]
+    main(["diagnose", str(tmp_path / "rig.csv"), *given])
+    told = capsys.readouterr()
+    assert [f["effect"] for f in json.loads(told.out.splitlines()[-1])["findings"]] == ["squeak"], told.err
 
 
 def test_a_sensor_kind_is_a_line_of_one_file(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def diagnose(
     >>> report.verdict, report.findings[0].location, report.findings[0].effect
     ('missing_physics', 'damper', 'coulomb_friction')
     """
-    tell, options = progress or (lambda share, text: None), options or Options()
+    tell, options = progress or (lambda share, text: None), options or Options(catalogue=system.catalogue)
     channels = record.values[:, : len(system.channels)]
     if is_component_test(system, channels, options.rules):
         return diagnose_components(system, record, options, tell)

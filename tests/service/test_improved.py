@@ -78,6 +78,15 @@ def test_values_laws_and_noise_are_written_and_comments_stay() -> None:
     assert len(parse_system(improved_text(text, again, report((friction,)))).laws) == 2  # the bias stays: it was undone
 
 
+def test_every_fault_of_a_measurement_stays_as_it_was_undone_before() -> None:
+    rail = "  rail: {kind: displacement, displacement: {csv: rail, noise: 1.0e-5}}\n"
+    pad = "  pad: {upper: wheel, lower: rail, stiffness: 1000, damping: 10}\n"
+    late = TEXT.replace("elements:\n", f"{rail}elements:\n{pad}")
+    late = late.replace("noise: 5.0e-4}", "noise: 5.0e-4}\n    laws: [{axle_delay: {time: 0.002, with: rail}}]")
+    again = parse_system(improved_text(late, parse_system(late), report(())))
+    assert [law.law.name for law in again.laws] == ["axle_delay"]
+
+
 def test_noise_that_was_found_higher_is_no_law() -> None:
     noisy = Finding("wheel_a", "sensor_noise", (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
     again = parse_system(improved_text(TEXT, parse_system(TEXT), report((), (noisy,))))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -47,7 +48,7 @@ from sprung.model.diagnosis.report.report import (
 )
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
-from sprung.model.laws import CATALOGUE
+from sprung.model.laws import CATALOGUE, Law
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -98,7 +99,7 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell(0.05, "channels, motion and noise")
-    own = tuple(law for law in options.catalogue if law not in CATALOGUE)
+    pieces, own = pieces_of(options.catalogue)
     records = component_records(system, record.values, record.sample_rate, options.train_share, options.rules, own)
     judged = []
     for number, one in enumerate(records):
@@ -106,32 +107,40 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
         def progress(text: str, name: str = one.element, share: float = 0.1 + 0.8 * number / len(records)) -> None:
             tell(share, f"{name}: {text}")
 
-        judged.append(_judge(one, options.rules.verdict, progress))
+        judged.append(_judge(one, pieces, options.rules.verdict, progress))
     tell(0.95, "report")
     report = _report(system, record, options, judged)
     tell(1.0, "done")
     return report
 
 
-def _judge(one: ComponentRecord, rules: VerdictRules, tell: Told) -> Judged:
+def pieces_of(catalogue: Sequence[Law]) -> tuple[tuple[Piece, ...], tuple[Law, ...]]:
+    """The pieces of a catalogue's laws, and its laws that are not ours, of which `own` makes pieces where it can."""
+    names = {law.name for law in catalogue}
+    return tuple(piece for piece in PIECES if piece.law.name in names), tuple(
+        law for law in catalogue if law not in CATALOGUE
+    )
+
+
+def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, tell: Told) -> Judged:
     turned = turned_round(one.task)
     if turned:
         one = replace(one, task=replace(one.task, force=-one.task.force))
-    found = search(one.task, (*PIECES, *one.own), tell, one.given)
+    found = search(one.task, (*pieces, *one.own), tell, one.given)
     base, final = found.base, found.final
     judged = Judged(one, found, base, final, final.floor, turned)
     alone = _only_one_loop(judged)
     if alone:
         judged = replace(judged, record=replace(one, notes=(*one.notes, f"{one.element}: {_ONE_LOOP}")))
     else:
-        judged = _established(judged)
+        judged = _established(judged, rules)
     share = judged.errors.explained(rules)
     left = bool(np.any(judged.errors.unexplained(rules) > 0))
     least = _least(judged.found.steps, one.task.rules)
     carried = bool(judged.found.steps) and share is not None and share >= least
     if alone or (left and not carried) or smooth_serves(judged.final, len(one.given.pieces)):
         tell("what is left, as a formula")
-        told = _with_formula(judged)
+        told = _with_formula(judged, rules)
         if told is not None:
             return told
         tell("what is left, as an unnamed force")
@@ -156,30 +165,30 @@ def _least(steps: tuple[Step, ...], rules: ComponentRules) -> float:
     return rules.named if one else 1 - rules.together
 
 
-def _established(judged: Judged) -> Judged:
+def _established(judged: Judged, rules: VerdictRules) -> Judged:
     """With the first law alone, where that is enough and several leave too much to be named.
 
     Where the first is not enough by itself, all stay, for what comes closest, and nothing is named.
     """
     task, steps = judged.final.task, judged.found.steps
-    share = judged.errors.explained()
+    share = judged.errors.explained(rules)
     if len(steps) < 2 or share is None or share >= _least(steps, task.rules):
         return judged
     first = steps[0].chosen
     final = refined(task, first.fit.model)
     one = replace(judged, found=replace(judged.found, steps=steps[:1]), final=final, floor=final.floor)
-    alone = one.errors.explained()
+    alone = one.errors.explained(rules)
     return one if alone is not None and alone >= _least(steps[:1], task.rules) else judged
 
 
-def _with_formula(judged: Judged) -> Judged | None:
+def _with_formula(judged: Judged, rules: VerdictRules) -> Judged | None:
     """The force that no law explains as a formula, where one explains as much as a law has to."""
     with np.errstate(all="ignore"):  # trial formulas overflow
         found = formula_search(judged.record.task, judged.record.given)
     if found is None:
         return None
     told = replace(judged, found=found, final=found.final, floor=found.final.floor)
-    share = told.errors.explained()
+    share = told.errors.explained(rules)
     return told if share is not None and share >= judged.record.task.rules.named else None
 
 

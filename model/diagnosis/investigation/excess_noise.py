@@ -17,7 +17,7 @@ def noise_faults(state: Investigation, before: FreeRun, after: FreeRun) -> tuple
     before, after: free runs without and with the findings.  What these have changed at a sensor they may have got
     wrong by a little; that much is no noise of the sensor.
     """
-    declared = declared_noise(state.system, state.prepared.signals)
+    declared = declared_noise(state.system, state.prepared.signals, state.options.rules.record)
     noise, rules = state.problem.noise, state.options.rules.noise
     grid = state.problem.part.grid
     count = grid.band.stop

@@ -46,10 +46,9 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     kinds = [kind_of(fault.effect) for fault in state.setup_faults]
     kinds += [kind_of(fault.term.law) for fault in state.input_faults]
     kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
-    verdict = verdict_of(kinds + physics, deciding, rules)
     other = another_structure(state, deciding)
-    ended = state.problem.worked_out  # what was not tried may well have been there
-    verdict = "unknown_physics" if other or (ended and verdict == "consistent") else verdict
+    ended = state.problem.worked_out
+    verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=ended)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
@@ -98,7 +97,7 @@ def another_structure(state: Investigation, errors: HeldOutErrors | None = None)
 def bounded(state: Investigation) -> Noise:
     """Noise levels that the floor may use: learnt ones, no higher than declared or seen above the compared band."""
     prepared = state.prepared.signals
-    declared = declared_noise(state.system, prepared)
+    declared = declared_noise(state.system, prepared, state.options.rules.record)
     present = np.isin(prepared.sensor_index, state.signals.sensor_index)
     known = declared.sensors[present]
     seen = upper_ratio(state, known) * known

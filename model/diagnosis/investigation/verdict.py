@@ -83,15 +83,28 @@ class HeldOutErrors:
         return float(np.clip(1 - left / excess, -1.0, 1.0)) if excess > 0 else None
 
 
-def verdict_of(kinds: Sequence[EffectKind], errors: HeldOutErrors, rules: VerdictRules = RULES.verdict) -> Verdict:
-    """The verdict for findings of the given kinds, best first, and the errors that they leave."""
+def verdict_of(
+    kinds: Sequence[EffectKind],
+    errors: HeldOutErrors,
+    rules: VerdictRules = RULES.verdict,
+    *,
+    other_structure: bool = False,
+    ended: bool = False,
+) -> Verdict:
+    """The verdict for findings of the given kinds, best first, and the errors that they leave.
+
+    other_structure: they change the structure so often that together they imitate one which the system file is not.
+    ended: the budget of work was spent, so that what was not tried may well have been there.
+    """
+    if other_structure:
+        return "unknown_physics"
     left = bool(np.any(errors.unexplained(rules) > 0))
     named = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
     faults_only = bool(named) and all(kind is EffectKind.FAULT for kind in named)
     if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and (left or not faults_only):
         return "unknown_physics"  # no model of the vehicle, whatever the noise
     if not named:
-        return "unknown_physics" if left else "consistent"
+        return "unknown_physics" if left or ended else "consistent"
     share = errors.explained(rules)
     if left and share is not None and share < rules.carried:
         return "unknown_physics"

@@ -32,8 +32,9 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     if said.ended:
         advice.insert(0, ENDED)
-    explained = said.errors.explained() if course.found else None
-    left = said.errors.unexplained()
+    rules = course.options.rules.verdict
+    explained = said.errors.explained(rules) if course.found else None
+    left = said.errors.unexplained(rules)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), said.where)
     return Report(
         system=course.system.name,

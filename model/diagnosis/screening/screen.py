@@ -21,7 +21,8 @@ def screen(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool = Tr
     if problem.memory is None:
         return _screened(problem, fit, laws, project)
     key = "screen", id(fit), problem.rules.screening, tuple(law.name for law in laws), project
-    return problem.memory.recall(key, lambda: _screened(problem, fit, laws, project))
+    # the fit is kept with it: an identity is given anew once its owner is gone
+    return problem.memory.recall(key, lambda: (fit, _screened(problem, fit, laws, project)))[1]
 
 
 def _screened(problem: Problem, fit: Fit, laws: tuple[Law, ...], project: bool) -> Screening:

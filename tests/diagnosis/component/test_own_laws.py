@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.component.diagnose import pieces_of
+from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.laws import CATALOGUE, ElementLaw, ParameterSpec, grid
 from sprung.model.system import parse_system
 from tests.diagnosis.component.test_component import TEXT, C, K, RigRecording, report, sweep
@@ -77,3 +79,11 @@ def test_a_law_of_a_user_in_the_system_file_is_fitted_and_nothing_is_missing() -
     assert found.verdict == "consistent"
     values = {p.name: p.value for p in found.laws[0].parameters}
     assert values == pytest.approx({"size": 40.0, "pitch": 3.1e-3}, rel=0.02)
+
+
+def test_what_is_searched_follows_the_catalogue() -> None:
+    assert pieces_of(CATALOGUE) == (PIECES, ())
+    assert pieces_of((*CATALOGUE, WAVES)) == (PIECES, (WAVES,))
+    friction = [law for law in CATALOGUE if law.name == "coulomb_friction"]
+    pieces, own = pieces_of(friction)
+    assert {piece.law.name for piece in pieces} == {"coulomb_friction"} and own == ()

@@ -42,6 +42,14 @@ def test_verdicts(effects: list[str], before: float, after: float, floor: float,
     assert verdict_of([kind_named(effect) for effect in effects], errors(before, after, floor)) == verdict
 
 
+def test_nothing_is_cleared_by_another_structure_or_while_candidates_were_left_out() -> None:
+    floor = errors(0.03, 0.03, 0.03)
+    assert verdict_of([], floor, ended=True) == "unknown_physics"
+    found = [kind_named("bouc_wen")]
+    assert verdict_of(found, errors(0.3, 0.03, 0.03), ended=True) == "missing_physics"
+    assert verdict_of(found, errors(0.3, 0.03, 0.03), other_structure=True) == "unknown_physics"
+
+
 def test_no_all_clear_above_twice_the_floor() -> None:
     for floor in np.geomspace(1e-3, 0.3, 20):
         for after in np.geomspace(1e-3, 1.0, 40):
