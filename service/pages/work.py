@@ -1,4 +1,4 @@
-"""`GET /pages/alarms` and `GET /pages/work`: alarms of all vehicles; uploads, jobs, reports, failed notifications."""
+"""`GET /pages/alarms` and `GET /pages/work`: alarms of all vehicles; uploads, jobs, reports, live buses, failed notifications."""
 
 from __future__ import annotations
 
@@ -60,4 +60,6 @@ async def work_page(core: CoreOf, vehicle: Annotated[str, Query(max_length=128)]
         }
 
     values = await read(core, query)
-    return HTMLResponse(render("work.html", **values, vehicle=vehicle, extensions=", ".join(EXTENSIONS)))
+    feeds = [feed.status() for feed in core.feeds]
+    extensions = ", ".join(EXTENSIONS)
+    return HTMLResponse(render("work.html", **values, feeds=feeds, vehicle=vehicle, extensions=extensions))

@@ -64,6 +64,8 @@ def test_compose_tells_somebody_and_has_no_usual_password() -> None:
     assert "alertmanager" in services and all(":" in service["image"] for service in services.values())
     assert "?" in services["grafana"]["environment"]["GF_SECURITY_ADMIN_PASSWORD"]
     assert all("mem_limit" in service for service in services.values())
+    fleet = yaml.safe_load((DEPLOY / "fleet" / "compose.yaml").read_text())["services"]
+    assert all("mem_limit" in service for service in fleet.values())
 
 
 def test_images_of_others_are_pinned_by_digest() -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.tracking.state import Alarm
 from sprung.service.core import Core
+from sprung.service.live import FeedStatus
 from sprung.service.store import fleet
 
 BROWSER = {"accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
@@ -67,3 +69,12 @@ def test_a_page_of_alarms_behind_the_last_leads_back(client: TestClient, alarmed
     assert "None on this page" in text and 'href="/pages/alarms?page=2" rel="prev"' in text
     for wrong in ("page=0", "page=x", "active=perhaps", "pge=2"):
         assert client.get(f"/pages/alarms?{wrong}").status_code == 422
+
+
+def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: TestClient, core: Core) -> None:
+    assert "Live buses" not in client.get("/pages/work").text
+    down = FeedStatus("socketcan:can0", "car-17", "down", "no such device", 0.0, 3, 2, 1, 5, 4)
+    core.feeds = [SimpleNamespace(status=lambda: down)]  # type: ignore[list-item]
+    shown = client.get("/pages/work").text
+    for text in ("Live buses", "socketcan:can0", "no such device", "3 waiting, 3 lost", "5 frames lost"):
+        assert text in shown
