@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import logging
 import math
@@ -25,7 +26,7 @@ from sprung.service.logs import request_id
 from sprung.service.oidc import Provider, Unreachable, looks_like_jwt
 from sprung.service.pages.render import signed_in
 from sprung.service.settings import Settings
-from sprung.service.tokens import Actor, Refused, Tokens
+from sprung.service.tokens import Actor, Refused, Tokens, digest_of
 
 log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"
@@ -34,7 +35,10 @@ METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
 MOST_CLIENTS = 10_000
+MOST_ASKING = 4  # requests that may wait for the OpenID Connect provider: there are 40 threads for everything
 MOST_HEADERS, MOST_HEADER_BYTES = 100, 32_000  # of one request: browsers send twenty, and cookies of 4 kB at most
+
+LOCAL, NOBODY = Actor(), Actor("nobody", frozenset())
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -74,6 +78,8 @@ class Guard:
         self._settings = settings
         self._tokens = tokens
         self._limiter = Limiter(settings.client_requests_per_second)
+        self._good: OrderedDict[str, bool] = OrderedDict()  # digests of tokens and sessions that were good lately
+        self._asking = asyncio.Semaphore(MOST_ASKING)
         self._local = is_loopback(settings.host)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -116,9 +122,8 @@ class Guard:
             need = need_of(scope["method"], path)
             if len(scope["headers"]) > MOST_HEADERS or sum(map(_length, scope["headers"])) > MOST_HEADER_BYTES:
                 raise ApiProblem(431, f"more than {MOST_HEADERS} headers, or {MOST_HEADER_BYTES // 1000} kB of them")
-            self._check_host(headers)
-            actor, by_cookie = await self._foreign(headers) or self._actor(scope, headers, need)
-            self._limiter.take(actor.name if actor.name != "local" else _address(scope))
+            await self._check_host(headers)
+            actor, by_cookie = await self._who(scope, headers, need)
             self._check_browser(scope, headers, need, by_cookie)
             self._check_scope(actor, need, path)
         except ApiProblem as problem:
@@ -130,7 +135,7 @@ class Guard:
             await response(scope, receive, with_headers)
             return
         scope["sprung.actor"] = actor
-        signed_in.set(actor.name if by_cookie and actor.name not in ("local", "nobody") else "")
+        signed_in.set(actor.name if by_cookie and actor not in (LOCAL, NOBODY) else "")
         await self.app(scope, receive, with_headers)
 
     @property
@@ -138,14 +143,45 @@ class Guard:
         """Whether requests need a token."""
         return not self._settings.open and (not self._local or self._oidc is not None or self._tokens.any)
 
+    async def _who(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
+        """Who asks, and whether a browser said so by itself (with a cookie, or because nobody needs to); counted.
+
+        Requests of somebody count as his, all others as their address's, and before anything is looked up: whoever
+        tries tokens runs dry.  A token that was good before does not wait for what others send from its address.
+        """
+        address = f"address {_address(scope)}"
+        if not need.scope:  # before the store is asked: it may be what is wrong
+            if need.limited:
+                self._limiter.take(address)
+            return NOBODY, True
+        credential = digest_of(headers.get("authorization") or session_of(headers) or "")
+        if credential not in self._good:
+            self._limiter.take(address)
+        try:
+            actor, by_cookie = await self._foreign(headers) or await run_in_threadpool(self._actor, headers)
+        except ApiProblem:
+            if self._good.pop(credential, False):
+                self._limiter.take(address)
+            raise
+        if actor is LOCAL:
+            return actor, by_cookie
+        if not self._good.pop(credential, False):
+            self._limiter.give(address)
+        self._good[credential] = True
+        while len(self._good) > MOST_CLIENTS:
+            self._good.popitem(last=False)
+        self._limiter.take(f"token {actor.name}")
+        return actor, by_cookie
+
     async def _foreign(self, headers: Headers) -> tuple[Actor, bool] | None:
         """Whose token of the provider it is; None where it is none.  Off the event loop: keys may have to be asked
-        for."""
+        for; a few at a time, since those that wait for the provider hold threads that others need."""
         kind, _, text = headers.get("authorization", "").partition(" ")
         if self._oidc is None or kind.lower() != "bearer" or not looks_like_jwt(text.strip()):
             return None
         try:
-            return await run_in_threadpool(self._oidc.actor, text.strip()), False
+            async with self._asking:
+                return await run_in_threadpool(self._oidc.actor, text.strip()), False
         except Refused as refused:
             raise _unauthorized(str(refused)) from None
         except Unreachable as error:
@@ -153,29 +189,23 @@ class Guard:
             detail = "the provider that the token is of cannot be asked now"
             raise ApiProblem(503, detail, headers={"Retry-After": "10"}) from None
 
-    def _actor(self, scope: Scope, headers: Headers, need: Need) -> tuple[Actor, bool]:
-        """Who asks, and whether a browser said so by itself (with a cookie, or because nobody needs to)."""
+    def _actor(self, headers: Headers) -> tuple[Actor, bool]:
+        """Whose token of this service or session it is; may read the store."""
         given = headers.get("authorization", "")
         kind, _, text = given.partition(" ")
         try:
-            if not need.scope and not given:  # before the store is asked: it may be what is wrong
-                return Actor("nobody", frozenset()), True
             if given and kind.lower() == "bearer":
                 return self._tokens.actor(text.strip()), False
             if not self.required:
-                return Actor(), True
+                return LOCAL, True
             session = session_of(headers)
             if session is not None:
                 return self._tokens.session(session), True
         except Refused as refused:
-            if not need.scope:
-                return Actor("nobody", frozenset()), True
             raise _unauthorized(str(refused)) from None
-        if not need.scope:
-            return Actor("nobody", frozenset()), True
         raise _unauthorized("a token is needed: send `Authorization: Bearer ...`, or sign in")
 
-    def _check_host(self, headers: Headers) -> None:
+    async def _check_host(self, headers: Headers) -> None:
         """Against pages whose host name was pointed at this machine: they would read everything as their own."""
         host = host_of(headers.get("host", ""))
         allowed = self._settings.allowed_hosts
@@ -183,7 +213,7 @@ class Guard:
             raise ApiProblem(421, "this host name is not served here; allow it with SPRUNG_ALLOWED_HOSTS")
         if allowed or "." not in host.rstrip(".") or host.endswith(".localhost") or _is_address(host):
             return
-        if host != self._settings.host and not self.required:
+        if host != self._settings.host and not await run_in_threadpool(lambda: self.required):
             raise ApiProblem(421, "this host name is not served without tokens; allow it with SPRUNG_ALLOWED_HOSTS")
 
     def _check_browser(self, scope: Scope, headers: Headers, need: Need, by_cookie: bool) -> None:
@@ -229,7 +259,7 @@ class Guard:
 
 
 class Limiter:
-    """A token bucket a client: `rate` requests a second, twice as many at once."""
+    """A token bucket a client: `rate` requests a second, twice as many at once.  For one thread."""
 
     def __init__(self, rate: float) -> None:
         self._rate = rate
@@ -248,6 +278,12 @@ class Limiter:
         if refused:
             wait = str(math.ceil((1.0 - left) / self._rate))
             raise ApiProblem(429, f"more than {self._rate:g} requests a second", headers={"Retry-After": wait})
+
+    def give(self, client: str) -> None:
+        """Take back the last `take`: the request was another client's."""
+        if client in self._left:
+            left, at = self._left[client]
+            self._left[client] = (min(self._most, left + 1.0), at)
 
 
 def request_id_of(headers: Mapping[str, str]) -> str:

@@ -17,11 +17,13 @@ class Need:
     scope: str  # PUBLIC: nothing
     by_fleet: bool = False  # a token of one fleet may ask: the route keeps to it
     body: tuple[str, ...] = ("application/json",)  # types of body that it takes
+    limited: bool = True  # how often it is asked counts
 
 
 FORM = ("multipart/form-data",)
+# /health/live costs nothing, and who watches the service must hear that it lives, whatever else comes from its address
 NEEDS: dict[tuple[str, str], Need] = {
-    ("GET", "/health/live"): Need(PUBLIC),
+    ("GET", "/health/live"): Need(PUBLIC, limited=False),
     ("GET", "/health/ready"): Need(PUBLIC),
     ("GET", "/signin"): Need(PUBLIC),
     ("POST", "/signin"): Need(PUBLIC, body=("application/x-www-form-urlencoded",)),

@@ -308,6 +308,52 @@ def test_clients_that_ask_too_often_are_told_when_to_come_back() -> None:
     limiter.take("b")
 
 
+@pytest.fixture
+def strict(engine: Engine, tmp_path: Path) -> Core:
+    """Ten requests at once, then one in ten seconds (nearly none in the time of a test)."""
+    core = build_core(Settings(data_dir=tmp_path, client_requests_per_second=0.1), engine)
+    core.tokens.create("boss", ["admin"])
+    return core
+
+
+def statuses(core: Core, *asked: tuple[str, str, str]) -> list[int]:
+    """Answers to requests of (address, path, token), one after the other."""
+    app = create_app(core)
+    found: list[int] = []
+    second = TestClient(app, client=("192.0.2.2", 1))
+    with TestClient(app, client=("192.0.2.1", 1)) as first:
+        for address, path, token in asked:
+            client = first if address == "a" else second
+            found.append(client.get(path, headers=bearer(token) if token else {}).status_code)
+    return found
+
+
+@pytest.mark.parametrize("path", ["/signin", "/health/ready", "/static/acts.js"])
+def test_who_has_no_token_is_counted_by_address(strict: Core, path: str) -> None:
+    found = statuses(strict, *[("a", path, "")] * 4, ("b", path, ""), ("a", "/health/live", ""))
+    assert 429 not in found[:1] and found[1:4] == [429] * 3
+    assert found[4] != 429 and found[5] == 200
+
+
+@pytest.mark.parametrize("token", ["", "rubbish", "sprung_0123456789ab_x", "ey.ey.ey"])
+def test_who_tries_tokens_runs_dry_and_others_do_not(strict: Core, token: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    good = strict.tokens.create("feeder", ["read"])[0]
+    looked: list[str] = []
+    actor = strict.tokens.actor
+    monkeypatch.setattr(strict.tokens, "actor", lambda text: (looked.append(text), actor(text))[1])
+    found = statuses(strict, *[("a", "/vehicles", token)] * 4, ("b", "/vehicles", good))
+    assert found == [401, 429, 429, 429, 200]
+    assert len(looked) == 1 + bool(token)  # what is refused for coming too often is not looked up
+
+
+def test_a_token_that_was_good_is_taken_beside_others_that_are_not(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(Settings(data_dir=tmp_path, client_requests_per_second=2), engine)
+    good, _ = core.tokens.create("feeder", ["read"])
+    wrong = [("a", "/vehicles", f"rubbish{i}") for i in range(20)]
+    found = statuses(core, ("a", "/vehicles", good), *wrong, ("a", "/vehicles", good))
+    assert found[0] == found[-1] == 200 and found[-2] == 429
+
+
 def test_deeds_are_written_down(client: TestClient, core: Core) -> None:
     text, _ = core.tokens.create("anna", ["admin"])
     job = client.post("/recordings", files={"file": ("a.mcap", b"x")}, headers=bearer(text)).json()["id"]
