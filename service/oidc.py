@@ -33,7 +33,7 @@ ALGORITHMS = ("RS256", "RS384", "RS512", "PS256", "PS384", "PS512", "ES256", "ES
 SECONDS = 5.0  # that the provider may take
 MOST_BYTES = 1_000_000  # of its answers
 KEPT_SECONDS = 3600.0  # for which its configuration and keys are taken as they were
-AGAIN_SECONDS = 30.0  # before keys are asked for again because of a token with an unknown one
+AGAIN_SECONDS = 30.0  # before keys are asked for again because of a token with an unknown one, or after a failure
 BEGUN_SECONDS = 600.0  # that signing in may take
 MOST_BEGUN = 1000
 LEEWAY = 60.0  # s, between the clocks
@@ -83,6 +83,7 @@ class Provider:
         self._begun: OrderedDict[str, Begun] = OrderedDict()
         self._configuration: tuple[float, dict[str, Any]] = (-1e9, {})
         self._keys: tuple[float, Any] = (-1e9, None)
+        self._away: tuple[float, str] = (-1e9, "")  # when and how the provider failed last
         self._lock = threading.Lock()
 
     def begin(self, callback: str, to: str) -> tuple[str, str]:
@@ -172,7 +173,7 @@ class Provider:
             from jwt import PyJWKSet, PyJWTError
 
             try:
-                keys = PyJWKSet.from_dict(_fetch(self._endpoint("jwks_uri")))
+                keys = PyJWKSet.from_dict(self._published(self._endpoint("jwks_uri")))
             except PyJWTError as error:
                 raise Unreachable(f"{self.issuer}: its keys cannot be used: {error}") from None
             self._keys = (now, keys)
@@ -181,10 +182,22 @@ class Provider:
             raise Refused("the token is signed with a key that the provider does not publish")
         return known
 
+    def _published(self, url: str) -> dict[str, Any]:
+        """What the provider says of itself.  Raises Unreachable; for a while after a failure without asking again:
+        each token that anybody makes up would wait for it."""
+        at, why = self._away
+        if time.monotonic() - at < AGAIN_SECONDS:
+            raise Unreachable(why)
+        try:
+            return _fetch(url)
+        except Unreachable as error:
+            self._away = (time.monotonic(), str(error))
+            raise
+
     def _endpoint(self, name: str) -> str:
         at, found = self._configuration
         if time.monotonic() - at > KEPT_SECONDS:
-            found = _fetch(f"{self.issuer.rstrip('/')}/.well-known/openid-configuration")
+            found = self._published(f"{self.issuer.rstrip('/')}/.well-known/openid-configuration")
             if found.get("issuer") != self.issuer:
                 raise Unreachable(f"{self.issuer}: it calls itself {str(found.get('issuer'))[:200]!r}")
             self._configuration = (time.monotonic(), found)

@@ -23,7 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, need_of, place_of
 from sprung.service.logs import request_id
-from sprung.service.oidc import Provider, Unreachable, looks_like_jwt
+from sprung.service.oidc import AGAIN_SECONDS, Provider, Unreachable, looks_like_jwt
 from sprung.service.pages.render import signed_in
 from sprung.service.settings import Settings
 from sprung.service.tokens import Actor, Refused, Tokens, digest_of
@@ -187,7 +187,7 @@ class Guard:
         except Unreachable as error:
             log.error("the OpenID Connect provider: %s", error)
             detail = "the provider that the token is of cannot be asked now"
-            raise ApiProblem(503, detail, headers={"Retry-After": "10"}) from None
+            raise ApiProblem(503, detail, headers={"Retry-After": f"{AGAIN_SECONDS:.0f}"}) from None
 
     def _actor(self, headers: Headers) -> tuple[Actor, bool]:
         """Whose token of this service or session it is; may read the store."""

@@ -169,6 +169,19 @@ def test_a_provider_that_is_away_is_told_and_nobody_gets_in(client: TestClient, 
     assert answer.status_code == 503 and "cannot be reached" in answer.text
     answer = client.get("/vehicles", headers={"authorization": f"Bearer {provider.token()}"})
     assert answer.status_code == 503 and answer.headers["retry-after"]
+    assert len(provider.asked) == 1  # who makes up tokens does not wait for it each time, and holds nobody up
+
+
+def test_a_provider_that_is_back_is_asked_again(
+    client: TestClient, provider: FakeProvider, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    headers = {"authorization": f"Bearer {provider.token()}"}
+    provider.broken = True
+    assert client.get("/vehicles", headers=headers).status_code == 503
+    provider.broken = False
+    assert client.get("/vehicles", headers=headers).status_code == 503
+    monkeypatch.setattr("sprung.service.oidc.AGAIN_SECONDS", 0.0)
+    assert client.get("/vehicles", headers=headers).status_code == 200
 
 
 @pytest.mark.parametrize(
