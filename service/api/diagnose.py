@@ -13,11 +13,11 @@ from sqlalchemy import Connection
 from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
-from sprung.service.api.idempotency import OnceOf
+from sprung.service.api.idempotency import Once, OnceOf, content_kind
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.recordings import job_dict
 from sprung.service.api.uploads import BODY as UPLOAD
-from sprung.service.api.uploads import discard, receive
+from sprung.service.api.uploads import FORM, discard, receive
 from sprung.service.core import Core
 from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.errors import NotFound
@@ -51,9 +51,9 @@ async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf)
 
     async def act() -> Response:
         core.jobs.reserve()
-        kind = request.headers.get("content-type", "").split(";")[0].strip().lower()
-        if kind == "multipart/form-data":
-            job = await _of_upload(request, core, actor)
+        kind = content_kind(request)
+        if kind == FORM:
+            job = await _of_upload(request, core, actor, once)
         elif kind == "application/json":
             job = await _of_reference(request, core, actor)
         else:
@@ -104,8 +104,9 @@ async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
     return Response(text, media_type="application/yaml", headers=named)
 
 
-async def _of_upload(request: Request, core: Core, actor: Actor) -> JobRow:
+async def _of_upload(request: Request, core: Core, actor: Actor, once: Once) -> JobRow:
     found = await receive(request, core.settings, core.store)
+    once.received(found.identity)
     try:
         own_vehicle(actor, found.vehicle)
         return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)

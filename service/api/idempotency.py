@@ -1,7 +1,9 @@
 """`Idempotency-Key`: a request that is sent twice is carried out once.
 
 As in the draft of the IETF (draft-ietf-httpapi-idempotency-key-header): the first answer is kept for a day and given
-again; the same key for another request is refused, and so is one whose first request is still being worked on.
+again; the same key for another request is refused, and so is one whose first request is still being worked on.  A
+request is its method, path and body; of an upload, the file, its name and the other fields count.  Keys of callers that
+differ in name, fleet or scopes have nothing to do with each other.
 """
 
 from __future__ import annotations
@@ -10,15 +12,16 @@ import hashlib
 import json
 import threading
 from collections.abc import Awaitable, Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import Depends, Header, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
-from sqlalchemy import delete, select
+from sqlalchemy import Row, delete, select
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response
 from sprung.service.api.problems import ApiProblem
+from sprung.service.api.uploads import FORM, identity_of
 from sprung.service.core import Core
 from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
@@ -33,10 +36,17 @@ _lock = threading.Lock()
 class Once:
     """Carries a request out unless an answer to its key is there."""
 
-    def __init__(self, core: Core, key: str | None, request: str) -> None:
+    def __init__(self, core: Core, key: str | None, request: Request, parts: list[bytes]) -> None:
+        """key: one of this caller alone; parts: what tells the request from others, without an upload."""
         self._core = core
         self._key = key
-        self._request = request
+        self._http = request
+        self._parts = parts
+        self._upload = b""
+
+    def received(self, identity: str) -> None:
+        """Tell what was uploaded, before the answer is kept."""
+        self._upload = identity.encode()
 
     async def answer(self, act: Callable[[], Awaitable[Response]]) -> Response:
         """The answer of `act`, or the one that was given before.  Errors are not kept."""
@@ -51,7 +61,7 @@ class Once:
         try:
             kept = await run_in_threadpool(self._find)
             if kept is not None:
-                return kept
+                return await self._again(kept)
             response = await act()
             await run_in_threadpool(self._keep, response)
             return response
@@ -59,23 +69,25 @@ class Once:
             with _lock:
                 _running.discard(self._key)
 
-    def _find(self) -> Response | None:
+    def _find(self) -> Row[Any] | None:
         table = idempotency
         with self._core.store.write() as connection:
             connection.execute(delete(table).where(table.c.created_ns < now_ns() - KEPT))
-            row = connection.execute(select(table).where(table.c.key == self._key)).first()
-        if row is None:
-            return None
-        if row.request != self._request:
+            return connection.execute(select(table).where(table.c.key == self._key)).first()
+
+    async def _again(self, kept: Row[Any]) -> Response:
+        if content_kind(self._http) == FORM:
+            self.received(await identity_of(self._http, self._core.settings))
+        if kept.request != _digest(*self._parts, self._upload):
             detail = "was used for another request"
             raise ApiProblem(422, f"Idempotency-Key {detail}", [{"field": "Idempotency-Key", "detail": detail}])
-        headers = {"Idempotency-Replayed": "true"} | ({"Location": row.location} if row.location else {})
-        return json_response(row.body, row.status, headers)
+        headers = {"Idempotency-Replayed": "true"} | ({"Location": kept.location} if kept.location else {})
+        return json_response(kept.body, kept.status, headers)
 
     def _keep(self, response: Response) -> None:
         row = {
             "key": self._key,
-            "request": self._request,
+            "request": _digest(*self._parts, self._upload),
             "status": response.status_code,
             "body": json.loads(bytes(response.body)),
             "location": response.headers.get("location"),
@@ -87,10 +99,19 @@ class Once:
 
 async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> Once:
     """What a route needs to be carried out once; JSON bodies count as part of the request."""
-    kind = request.headers.get("content-type", "").split(";")[0]
-    body = await request.body() if key is not None and kind == "application/json" else b""
-    parts = [request.method.encode(), request.url.path.encode(), actor.name.encode(), body]
-    return Once(core, key, hashlib.sha256(b"\n".join(parts)).hexdigest())
+    body = await request.body() if key is not None and content_kind(request) == "application/json" else b""
+    if key is not None:
+        key = _digest(*(part.encode() for part in (actor.name, actor.fleet, *sorted(actor.scopes), key)))
+    return Once(core, key, request, [request.method.encode(), request.url.path.encode(), body])
+
+
+def content_kind(request: Request) -> str:
+    """What type of body a request says it has, without parameters."""
+    return request.headers.get("content-type", "").split(";")[0].strip().lower()
+
+
+def _digest(*parts: bytes) -> str:
+    return hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).hexdigest()
 
 
 OnceOf = Annotated[Once, Depends(once)]

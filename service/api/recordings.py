@@ -39,6 +39,7 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
     async def act() -> Response:
         core.jobs.reserve()
         found = await receive(request, core.settings, core.store)
+        once.received(found.identity)
         try:
             own_vehicle(actor, found.vehicle)
             job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle)

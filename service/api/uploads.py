@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -28,6 +29,7 @@ from sprung.service.times import now_ns
 CHUNK = 1 << 20
 MOST_PARTS = 8
 MOST_FIELD_BYTES = 4096
+FORM = "multipart/form-data"
 LONGEST_BOUNDARY = 70  # RFC 2046
 _VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
 
@@ -54,6 +56,7 @@ class Upload:
 
     row: RecordingRow
     vehicle: str | None
+    identity: str  # tells a form from others: the file's content and name, and the vehicle
     fresh: bool = True  # False: it was sent before and is still kept; the row is that one's
 
 
@@ -63,17 +66,32 @@ async def receive(request: Request, settings: Settings, store: Store) -> Upload:
     Raises ApiProblem: 415 for another type of body or of file, 413 and 507 when it is too large, 422 for a wrong form.
     Nothing stays on the disk then.
     """
-    kind, options = parse_options_header(request.headers.get("content-type", ""))
-    boundary = options.get(b"boundary")
-    if kind != b"multipart/form-data" or not boundary:
-        raise ApiProblem(415, "send multipart/form-data with a file")
-    if len(boundary) > LONGEST_BOUNDARY:
-        raise ApiProblem(422, f"the boundary of the form is longer than {LONGEST_BOUNDARY} characters")
+    boundary = _boundary(request)
     stated = request.headers.get("content-length", "")
     room = await run_in_threadpool(room_for_uploads, settings, store)
     if room <= (int(stated) if stated.isdigit() else 0):
         raise NoSpace(f"no room for this upload: {max(room, 0) / 1e6:.0f} MB are left for uploads; try again later")
-    form = Form(settings, boundary, room)
+    upload = await _read(request, Form(settings, boundary, room))
+    return await run_in_threadpool(_once, settings, store, upload)
+
+
+async def identity_of(request: Request, settings: Settings) -> str:
+    """What `receive` would give as the upload's identity; nothing is kept.  Raises ApiProblem as it does."""
+    form = Form(settings, _boundary(request), settings.max_upload_bytes, keep=False)
+    return (await _read(request, form)).identity
+
+
+def _boundary(request: Request) -> bytes:
+    kind, options = parse_options_header(request.headers.get("content-type", ""))
+    boundary = options.get(b"boundary")
+    if kind != FORM.encode() or not boundary:
+        raise ApiProblem(415, "send multipart/form-data with a file")
+    if len(boundary) > LONGEST_BOUNDARY:
+        raise ApiProblem(422, f"the boundary of the form is longer than {LONGEST_BOUNDARY} characters")
+    return boundary
+
+
+async def _read(request: Request, form: Form) -> Upload:
     try:
         held = bytearray()
         async for chunk in request.stream():
@@ -82,7 +100,7 @@ async def receive(request: Request, settings: Settings, store: Store) -> Upload:
                 await run_in_threadpool(form.feed, bytes(held))
                 held.clear()
         await run_in_threadpool(form.feed, bytes(held))
-        return await run_in_threadpool(_once, settings, store, await run_in_threadpool(form.finish))
+        return await run_in_threadpool(form.finish)
     except FormParserError as error:
         raise ApiProblem(422, f"the body is no multipart/form-data: {error}") from error
     finally:
@@ -108,12 +126,13 @@ class _Part:
 
 
 class Form:
-    """Takes the bytes of a form; the file goes to the disk as it comes."""
+    """Takes the bytes of a form; the file goes to the disk as it comes, unless it is only looked at (keep: False)."""
 
-    def __init__(self, settings: Settings, boundary: bytes, room: int) -> None:
+    def __init__(self, settings: Settings, boundary: bytes, room: int, keep: bool = True) -> None:
         self.size = 0  # of the file so far
         self._uploads = settings.uploads
         self._room = room
+        self._keep = keep
         self._parts = 0
         self._part = _Part()
         self._header = (bytearray(), bytearray())
@@ -157,14 +176,16 @@ class Form:
                 vehicle = _VEHICLE.validate_python(self._values["vehicle"].decode("utf-8", "replace"))
             except ValidationError as error:
                 raise from_validation(error, "vehicle.") from None
-        self._target.flush()
-        os.fsync(self._target.fileno())
-        self._target.close()
-        stored = work.upload_name(self._digest.hexdigest(), self._id, self._extension)
-        (self._uploads / self._part_file).replace(self._uploads / stored)
-        sync_folder(self._uploads)
+        digest = self._digest.hexdigest()
+        stored = work.upload_name(digest, self._id, self._extension)
+        if self._keep:
+            self._target.flush()
+            os.fsync(self._target.fileno())
+            self._target.close()
+            (self._uploads / self._part_file).replace(self._uploads / stored)
+            sync_folder(self._uploads)
         row = RecordingRow(self._id, None, self._label, "upload", stored, self.size, None, now_ns(), None)
-        return Upload(row, vehicle)
+        return Upload(row, vehicle, json.dumps([digest, self._label, vehicle]))
 
     def close(self) -> None:
         """Delete what was not finished."""
@@ -197,8 +218,11 @@ class Form:
         name = options[b"filename"].decode("utf-8", "replace")
         self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
         self._extension = known_extension(self._label)
-        self._part_file = f"{self._id}.part"
-        self._target = open(self._uploads / self._part_file, "xb")  # noqa: SIM115 (closed by `close`)
+        if self._keep:
+            self._part_file = f"{self._id}.part"
+            self._target = open(self._uploads / self._part_file, "xb")  # noqa: SIM115 (closed by `close`)
+        else:
+            self._target = open(os.devnull, "wb")  # noqa: SIM115 (closed by `close`)
 
     def _content(self, data: bytes, start: int, end: int) -> None:
         if self._part.is_file:
@@ -240,4 +264,4 @@ def _once(settings: Settings, store: Store, upload: Upload) -> Upload:
     if before is None or before.file is None or not (settings.uploads / before.file).is_file():
         return upload
     discard(settings, upload)
-    return Upload(before, upload.vehicle, fresh=False)
+    return replace(upload, row=before, fresh=False)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import jsonschema
 import numpy as np
 import pytest
@@ -96,6 +97,41 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
     jobs = [client.post("/recordings", files=files, headers={"Idempotency-Key": "k2"}).json()["id"] for _ in "ab"]
     assert jobs[0] == jobs[1]
     assert len(client.get("/jobs").json()["jobs"]) == 1
+
+
+@pytest.mark.parametrize("path", ["/recordings", "/diagnose"])
+def test_a_key_that_was_used_for_another_upload_is_refused(client: TestClient, path: str) -> None:
+    headers = {"Idempotency-Key": "k"}
+
+    def send(name: str = "ride.csv", content: bytes = b"time,a\n0,1\n", vehicle: str = "a") -> httpx.Response:
+        return client.post(path, files={"file": (name, content)}, data={"vehicle": vehicle}, headers=headers)
+
+    first = send()
+    assert first.status_code == 202
+    for other in (send(content=b"time,a\n0,2\n"), send(name="other.csv"), send(vehicle="b")):
+        assert other.status_code == 422 and other.json()["errors"][0]["field"] == "Idempotency-Key"
+    again = send()
+    assert again.json() == first.json() and again.headers["idempotency-replayed"] == "true"
+    headers["Idempotency-Key"] = "another"
+    assert send(content=b"time,a\n0,2\n").json()["id"] != first.json()["id"]
+
+
+def test_a_body_counts_however_its_type_is_written(client: TestClient, broken: str) -> None:
+    headers = {"Idempotency-Key": "k", "Content-Type": "Application/JSON ; charset=utf-8"}
+    first, other = (
+        client.post("/vehicles/a/notes", content=f'{{"text": "{text}"}}', headers=headers) for text in ("one", "two")
+    )
+    assert (first.status_code, other.status_code) == (201, 422)
+
+
+def test_tokens_of_one_name_share_no_answers(client: TestClient, core: Core, broken: str) -> None:
+    answers = []
+    for fleet in ("", "a"):
+        text, _ = core.tokens.create("depot", ["operate"], fleet)
+        headers = {"Idempotency-Key": "k", "Authorization": f"Bearer {text}"}
+        answers.append(client.post("/vehicles/a/notes", json={"text": "seen"}, headers=headers))
+    assert [answer.status_code for answer in answers] == [201, 201]
+    assert "idempotency-replayed" not in answers[1].headers
 
 
 def test_wrong_notes_are_refused(client: TestClient, broken: str) -> None:
