@@ -1,4 +1,4 @@
-"""`GET /pages/alarms` and `GET /pages/work`: alarms of all vehicles; uploads, jobs, reports, live buses, failed notifications."""
+"""`GET /pages/alarms` and `GET /pages/work`: alarms of all vehicles; uploads, jobs, reports, buses, notifications."""
 
 from __future__ import annotations
 
