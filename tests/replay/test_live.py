@@ -223,3 +223,32 @@ def test_a_frame_without_a_possible_time_costs_itself():
     block = frame_block([good, bad, worse], account)
     assert block.time.tolist() == [1_790_000_000_000_000_000]
     assert account.tally.corrupt == 2
+
+
+def test_a_reader_that_is_behind_gives_up_what_waits_until_it_has_caught_up(dbc, bus_name, monkeypatch):
+    bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
+    clock = [1_790_000_000.0]
+    monkeypatch.setattr("sprung.replay.live.time.time", lambda: clock[0])
+
+    def read(waited):
+        message = frame(1)
+        message.timestamp = clock[0] - waited
+        return bool(bus._current([message, message]))
+
+    assert read(0.01)
+    assert read(4.0)  # late, and still worth reading
+    assert not read(6.0)
+    assert not read(1.0)  # nearer, and not yet caught up
+    assert read(0.2)
+    assert (bus.tally.dropped, bus.account.incomplete) == (4, True)
+
+
+def test_frames_that_the_kernel_dropped_are_counted_once(dbc, bus_name, monkeypatch):
+    bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
+    counter = iter([7, 7, 12, 12])  # of the socket, which may have lost some before it was opened here
+    monkeypatch.setattr("sprung.replay.live.lost_by_kernel", lambda *_: next(counter))
+    bus._opened(None)
+    for _ in range(3):
+        bus._asked = -1e9
+        bus._ask(None)
+    assert (bus.lost, bus.tally.dropped, bus.account.incomplete) == (5, 5, True)
