@@ -5,6 +5,7 @@ Environment variables `SPRUNG_<NAME>` set the defaults of the command line's opt
 
 from __future__ import annotations
 
+import ipaddress
 import os
 import sys
 from collections.abc import Mapping
@@ -55,6 +56,7 @@ class Settings(BaseSettings):
     allowed_hosts: tuple[
         str, ...
     ] = ()  # host names that are served, as a JSON list; none: any, where tokens are needed
+    trusted_proxies: tuple[str, ...] = ()  # addresses or networks, as a JSON list, whose X-Forwarded-* are believed
     log_format: Literal["text", "json"] = "text"
     log_level: Literal["debug", "info", "warning", "error"] = "warning"
     connections: int = Field(default=1000, gt=0)  # in all; fewer where the system allows fewer open files
@@ -114,6 +116,13 @@ class Settings(BaseSettings):
     retention_minutes_days: float = Field(default=730.0, gt=0)  # one-minute roll-ups
     archive: str | None = None  # folder or address (s3://...) for windows that are old, as Parquet; None: they are gone
     retention_uploads_days: float = Field(default=7.0, gt=0)
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        for one in given:
+            ipaddress.ip_network(one)  # a ValueError that names it: what is misspelt would be trusted by nobody
+        return given
 
     @field_validator("admin_token")
     @classmethod

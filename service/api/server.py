@@ -188,6 +188,9 @@ def make_server(app: FastAPI, settings: Settings, on_exit: Callable[[], None]) -
         log_config=None,
         access_log=False,
         server_header=False,
+        # uvicorn would believe whoever connects from this machine, also where there is no proxy
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
         timeout_graceful_shutdown=settings.shutdown_seconds,
         timeout_keep_alive=30,
         h11_max_incomplete_event_size=64_000,

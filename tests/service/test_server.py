@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import socket
 import ssl
 import subprocess
@@ -25,9 +26,9 @@ from sprung.service.settings import Settings
 from tests.served import served
 
 
-def ask(port: int, path: str = "/health/live", seconds: float = 10.0) -> bytes:
+def ask(port: int, path: str = "/health/live", seconds: float = 10.0, headers: str = "") -> bytes:
     with socket.create_connection(("127.0.0.1", port), timeout=seconds) as connection:
-        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n".encode())
+        connection.sendall(f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n".encode())
         found = b""
         while chunk := connection.recv(65536):
             found += chunk
@@ -78,6 +79,23 @@ def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) ->
         slow.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n{")
         assert closed_within(slow, 10)
         assert b"200 OK" in ask(port)
+
+
+@pytest.mark.parametrize("trusted", [False, True])
+def test_what_a_proxy_says_is_believed_of_trusted_ones_only(engine: Engine, tmp_path: Path, trusted: bool) -> None:
+    proxies = ("127.0.0.0/8",) if trusted else ()
+    core = build_core(settings(tmp_path, client_requests_per_second=0.1, trusted_proxies=proxies), engine)
+    with served(core) as port:
+        said = [f"X-Forwarded-For: 192.0.2.{i}\r\nX-Forwarded-Proto: https\r\n" for i in range(3)]
+        found = [ask(port, "/signin", headers=text) for text in said]
+    assert [b" 429 " in answer for answer in found] == [False, not trusted, not trusted]
+    assert all((b"strict-transport-security" in answer.lower()) == trusted for answer in found)
+
+
+@pytest.mark.parametrize("wrong", ["*", "proxy.example", "10.0.0"])
+def test_proxies_are_named_by_address(tmp_path: Path, wrong: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(wrong)):
+        settings(tmp_path, trusted_proxies=(wrong,))
 
 
 def test_a_connection_that_is_kept_alive_stays_between_requests(engine: Engine, tmp_path: Path) -> None:
