@@ -20,6 +20,7 @@ from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from sprung.service.can_database import database_of
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
+from sprung.service.signed import check_signature
 
 WEIGHED_OF = (
     2  # windows, one is weighed for gains and delays, so that a gain of 2 % is told in a minute: it costs as much
@@ -115,6 +116,8 @@ def load_engine(settings: Settings) -> Engine:
         raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
     if settings.weights is not None and (reason := without_weights(system)):
         log.warning("%s: these weights are not used: %s", settings.weights, reason)
+    if settings.weights is not None and settings.weights_key is not None:
+        check_signature(settings.weights, settings.weights_key)
     return Engine(
         system,
         load_identifier(system, settings.weights, workers=os.cpu_count() or 1),

@@ -39,6 +39,7 @@ class Settings(BaseSettings):
     system: Path | None = None  # None: the bundled Manchester vehicle
     dbc: Path | None = None  # None: the bundled one, where it has the system's CAN signals
     weights: Path | None = None  # directory of a trained estimator; None: the bundled one
+    weights_key: Path | None = None  # public key (Ed25519, PEM) by which `weights` must be signed; None: by nobody
 
     host: str = "127.0.0.1"
     port: int = Field(default=8000, ge=0, le=65535)
