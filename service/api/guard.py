@@ -231,8 +231,6 @@ class Guard:
         kind = headers.get("content-type", "").split(";")[0].strip().lower()
         length = headers.get("content-length")
         sent = "transfer-encoding" in headers or (length is not None and length != "0")
-        if not kind and "application/json" in need.body:
-            return  # a browser that sends without a type tells its origin, which was looked at
         if sent and kind not in need.body:
             raise ApiProblem(415, f"send {' or '.join(need.body)}", headers={"Accept-Post": ", ".join(need.body)})
 

@@ -20,6 +20,7 @@ from sprung.service.settings import Settings
 from tests.service_fakes import FakeIdentifier, make_window
 
 PROBLEM = "application/problem+json"
+JSON = {"content-type": "application/json"}
 
 
 @pytest.fixture
@@ -133,7 +134,7 @@ def _change(body: dict[str, Any], path: str, value: Any) -> bytes:
 def test_a_wrong_body_is_refused_and_the_field_named(
     client: TestClient, body: dict[str, Any], path: str, value: str, field: str
 ) -> None:
-    response = client.post("/identify", content=_change(body, path, value))
+    response = client.post("/identify", content=_change(body, path, value), headers=JSON)
     problem = refused(response, 422)
     if value in ("NaN", "Infinity", "-Infinity"):  # no JSON at all, or not finite: either way the place is named
         assert "car_1l" in response.text or "line 1" in response.text
@@ -164,7 +165,7 @@ def test_inputs_without_any_sensor_are_refused(client: TestClient, body: dict[st
 )
 def test_a_key_that_is_there_twice_is_refused(client: TestClient, body: dict[str, Any], key: str, again: str) -> None:
     content = json.dumps(body).replace(f'"{key}"', again, 1)
-    problem = refused(client.post("/identify", content=content), 422)
+    problem = refused(client.post("/identify", content=content, headers=JSON), 422)
     assert {"field": key, "detail": "is there twice"} in problem["errors"]
 
 
@@ -179,22 +180,22 @@ def test_every_route_refuses_a_key_that_is_there_twice(client: TestClient, body:
 
 def test_names_with_escapes_are_no_repetition(client: TestClient, body: dict[str, Any]) -> None:
     content = json.dumps(body).replace("car_1l", "c\\u0061r_1l")
-    assert client.post("/identify", content=content).status_code == 200
+    assert client.post("/identify", content=content, headers=JSON).status_code == 200
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 5000])
 def test_what_is_no_json_object_is_refused(client: TestClient, content: bytes) -> None:
-    refused(client.post("/identify", content=content), 422)
+    refused(client.post("/identify", content=content, headers=JSON), 422)
 
 
 def test_a_body_past_the_limit_is_refused_stated_or_not(client: TestClient) -> None:
-    refused(client.post("/identify", content=b" " * 300_001), 413)
+    refused(client.post("/identify", content=b" " * 300_001, headers=JSON), 413)
 
     def endless() -> Iterator[bytes]:
         for _ in range(40):
             yield b" " * 10_000
 
-    refused(client.post("/identify", content=endless()), 413)
+    refused(client.post("/identify", content=endless(), headers=JSON), 413)
 
 
 def test_unknown_paths_methods_and_vehicles_are_problems(client: TestClient) -> None:
