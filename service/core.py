@@ -43,6 +43,7 @@ from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.archive import Archive, open_archive
 from sprung.service.store.windows import latest_window
 from sprung.service.tokens import Tokens
+from sprung.service.upload_room import UploadRoom
 from sprung.service.views import VehicleView, vehicle_view
 from sprung.service.vitals import Vitals, request_histogram
 
@@ -75,6 +76,7 @@ class Core:
     stopping: threading.Event
     ingest: Ingest
     telling: FleetTelling
+    upload_room: UploadRoom
     archive: Archive | None = None
     oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
@@ -166,6 +168,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         threading.Event(),
         Ingest(pipeline, settings.late_seconds),
         FleetTelling(engine, store, pipeline.model_id),
+        UploadRoom(settings, store),
         archive,
         provider_of(settings),
         feeds,

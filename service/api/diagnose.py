@@ -17,7 +17,7 @@ from sprung.service.api.idempotency import Once, OnceOf, content_kind
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.recordings import job_dict
 from sprung.service.api.uploads import BODY as UPLOAD
-from sprung.service.api.uploads import FORM, discard, receive
+from sprung.service.api.uploads import FORM, receive
 from sprung.service.core import Core
 from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.errors import NotFound
@@ -105,14 +105,10 @@ async def report_system(core: CoreOf, actor: ActorOf, id: str) -> Response:
 
 
 async def _of_upload(request: Request, core: Core, actor: Actor, once: Once) -> JobRow:
-    found = await receive(request, core.settings, core.store)
-    once.received(found.identity)
-    try:
+    async with receive(request, core) as found:
+        once.received(found.identity)
         own_vehicle(actor, found.vehicle)
         return await run_in_threadpool(core.diagnoses.from_recording, found.row, found.vehicle)
-    except BaseException:
-        discard(core.settings, found)
-        raise
 
 
 async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:

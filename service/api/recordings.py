@@ -12,7 +12,7 @@ from sqlalchemy import Connection
 from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, note, own_vehicle, read
 from sprung.service.api.idempotency import OnceOf
-from sprung.service.api.uploads import BODY, discard, receive
+from sprung.service.api.uploads import BODY, receive
 from sprung.service.errors import NotFound
 from sprung.service.store import work
 from sprung.service.store.work import JobRow
@@ -38,14 +38,10 @@ async def upload(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf) -
 
     async def act() -> Response:
         core.jobs.reserve()
-        found = await receive(request, core.settings, core.store)
-        once.received(found.identity)
-        try:
+        async with receive(request, core) as found:
+            once.received(found.identity)
             own_vehicle(actor, found.vehicle)
             job = await run_in_threadpool(core.jobs.submit, "recording", found.row, found.vehicle)
-        except BaseException:
-            discard(core.settings, found)
-            raise
         await note(core, actor, "upload", job.id, {"name": found.row.name, "vehicle": found.vehicle})
         return json_response(job_dict(job), 202, {"Location": f"/jobs/{job.id}"})
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,13 +20,13 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from sprung.replay.recording import EXTENSIONS
 from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem, from_validation
-from sprung.service.condition import free_bytes
+from sprung.service.core import Core
 from sprung.service.durable import sync_folder
-from sprung.service.errors import NoSpace
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
+from sprung.service.upload_room import Share
 
 CHUNK = 1 << 20
 MOST_PARTS = 8
@@ -60,24 +62,32 @@ class Upload:
     fresh: bool = True  # False: it was sent before and is still kept; the row is that one's
 
 
-async def receive(request: Request, settings: Settings, store: Store) -> Upload:
-    """Take the form of a request.
+@asynccontextmanager
+async def receive(request: Request, core: Core) -> AsyncIterator[Upload]:
+    """Take the form of a request; the file stays unless what is done with it fails.
 
-    Raises ApiProblem: 415 for another type of body or of file, 413 and 507 when it is too large, 422 for a wrong form.
+    Raises ApiProblem: 415 for another type of body or of file, 413 when it is too large, 422 for a wrong form; NoSpace.
     Nothing stays on the disk then.
     """
     boundary = _boundary(request)
     stated = request.headers.get("content-length", "")
-    room = await run_in_threadpool(room_for_uploads, settings, store)
-    if room <= (int(stated) if stated.isdigit() else 0):
-        raise NoSpace(f"no room for this upload: {max(room, 0) / 1e6:.0f} MB are left for uploads; try again later")
-    upload = await _read(request, Form(settings, boundary, room))
-    return await run_in_threadpool(_once, settings, store, upload)
+    share = core.upload_room.share()
+    try:
+        await run_in_threadpool(share.take, int(stated) if stated.isdigit() else 0)
+        upload = await _read(request, Form(core.settings, boundary, share))
+        upload = await run_in_threadpool(_once, core.settings, core.store, upload)
+        try:
+            yield upload
+        except BaseException:
+            _discard(core.settings, upload)
+            raise
+    finally:
+        share.give_back()  # not before the store counts what was accepted
 
 
 async def identity_of(request: Request, settings: Settings) -> str:
     """What `receive` would give as the upload's identity; nothing is kept.  Raises ApiProblem as it does."""
-    form = Form(settings, _boundary(request), settings.max_upload_bytes, keep=False)
+    form = Form(settings, _boundary(request), None)
     return (await _read(request, form)).identity
 
 
@@ -107,14 +117,6 @@ async def _read(request: Request, form: Form) -> Upload:
         form.close()
 
 
-def room_for_uploads(settings: Settings, store: Store) -> int:
-    """Bytes that uploads may still take: of the quota, and of the disk."""
-    settings.uploads.mkdir(parents=True, exist_ok=True)
-    with store.read() as connection:
-        kept = work.stored_bytes(connection)
-    return min(settings.max_uploads_bytes - kept, free_bytes(settings.uploads) - settings.min_free_bytes)
-
-
 @dataclass
 class _Part:
     """One part of the form while it comes."""
@@ -126,13 +128,13 @@ class _Part:
 
 
 class Form:
-    """Takes the bytes of a form; the file goes to the disk as it comes, unless it is only looked at (keep: False)."""
+    """Takes the bytes of a form; the file goes to the disk as it comes, unless it is only looked at (share: None)."""
 
-    def __init__(self, settings: Settings, boundary: bytes, room: int, keep: bool = True) -> None:
+    def __init__(self, settings: Settings, boundary: bytes, share: Share | None) -> None:
         self.size = 0  # of the file so far
         self._uploads = settings.uploads
-        self._room = room
-        self._keep = keep
+        self._share = share
+        self._came = 0  # bytes of the form so far, with those that are being looked at
         self._parts = 0
         self._part = _Part()
         self._header = (bytearray(), bytearray())
@@ -161,6 +163,7 @@ class Form:
     def feed(self, data: bytes) -> None:
         """The next bytes.  Raises ApiProblem or NoSpace as soon as they are wrong."""
         if data:
+            self._came += len(data)
             self._parser.write(data)
 
     def finish(self) -> Upload:
@@ -178,7 +181,7 @@ class Form:
                 raise from_validation(error, "vehicle.") from None
         digest = self._digest.hexdigest()
         stored = work.upload_name(digest, self._id, self._extension)
-        if self._keep:
+        if self._share is not None:
             self._target.flush()
             os.fsync(self._target.fileno())
             self._target.close()
@@ -218,7 +221,7 @@ class Form:
         name = options[b"filename"].decode("utf-8", "replace")
         self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
         self._extension = known_extension(self._label)
-        if self._keep:
+        if self._share is not None:
             self._part_file = f"{self._id}.part"
             self._target = open(self._uploads / self._part_file, "xb")  # noqa: SIM115 (closed by `close`)
         else:
@@ -228,9 +231,11 @@ class Form:
         if self._part.is_file:
             assert self._target is not None
             self.size += end - start
-            if self.size > self._room:
-                raise NoSpace("no room for this upload is left; try again later")
+            if self._share is not None:
+                self._share.reach(self._came)
             self._target.write(memoryview(data)[start:end])
+            if self._share is not None:
+                self._share.written = self.size
             self._digest.update(memoryview(data)[start:end])
             return
         value = self._values.setdefault(self._part.name, bytearray())
@@ -251,7 +256,7 @@ def known_extension(label: str) -> str:
     return extension
 
 
-def discard(settings: Settings, upload: Upload) -> None:
+def _discard(settings: Settings, upload: Upload) -> None:
     """Delete an upload that was received and could not be accepted after all."""
     if upload.fresh and upload.row.file is not None:
         (settings.uploads / upload.row.file).unlink(missing_ok=True)
@@ -263,5 +268,5 @@ def _once(settings: Settings, store: Store, upload: Upload) -> Upload:
         before = work.same_upload(connection, upload.row, upload.vehicle)
     if before is None or before.file is None or not (settings.uploads / before.file).is_file():
         return upload
-    discard(settings, upload)
+    _discard(settings, upload)
     return replace(upload, row=before, fresh=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import socket
@@ -9,11 +10,12 @@ import ssl
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import httpx
 import pytest
 from fastapi.testclient import TestClient
 
@@ -22,7 +24,9 @@ from sprung.service.api.bodies import read_window
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
+from sprung.service.errors import NoSpace
 from sprung.service.settings import Settings
+from sprung.service.upload_room import UploadRoom
 from tests.served import served
 
 
@@ -235,6 +239,55 @@ def test_an_upload_past_the_quota_is_507_and_leaves_nothing(client: TestClient, 
 def test_the_quota_counts_what_is_kept(client: TestClient) -> None:
     assert client.post("/recordings", files={"file": ("a.mcap", b"x" * 30_000)}).status_code == 202
     assert client.post("/recordings", files={"file": ("b.mcap", b"x" * 30_000)}).status_code == 507
+
+
+@pytest.mark.parametrize("path", ["/recordings", "/diagnose"])
+@pytest.mark.parametrize("stated", [True, False])
+def test_uploads_at_the_same_time_share_the_quota(client: TestClient, core: Core, path: str, stated: bool) -> None:
+    head = b'--b\r\nContent-Disposition: form-data; name="file"; filename="%d.mcap"\r\n\r\n'
+    headers = {"content-type": "multipart/form-data; boundary=b"}
+
+    async def send(to: httpx.AsyncClient, number: int) -> int:
+        parts = [head % number, b"x" * 6000, b"y" * 6000, b"\r\n--b--\r\n"]
+        length = {"content-length": str(sum(map(len, parts)))} if stated else {}
+
+        async def body() -> AsyncIterator[bytes]:
+            for part in parts:
+                yield part
+                await asyncio.sleep(0.05)
+
+        return (await to.post(path, content=body(), headers=headers | length)).status_code
+
+    async def send_all() -> list[int]:
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(client.app), base_url="http://localhost") as to:
+            return await asyncio.gather(*(send(to, number) for number in range(8)))
+
+    statuses = asyncio.run(send_all())
+    assert set(statuses) == {202, 507}
+    assert (
+        sum(path.stat().st_size for path in core.settings.uploads.iterdir()) == 12_000 * statuses.count(202) <= 50_000
+    )
+    left = 50_000 - 12_000 * statuses.count(202) - 300  # what the others had taken was given back
+    assert client.post(path, files={"file": ("last.mcap", b"z" * left)}).status_code == 202
+
+
+def test_uploads_at_the_same_time_leave_the_disk_its_free_bytes(
+    core: Core, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = 100_000
+    monkeypatch.setattr("sprung.service.upload_room.free_bytes", lambda folder: free)
+    room = UploadRoom(Settings(data_dir=tmp_path, min_free_bytes=50_000), core.store)
+    first, second = room.share(), room.share()
+    first.take(30_000)
+    with pytest.raises(NoSpace):
+        second.take(30_000)
+    second.take(15_000)
+    first.written, free = 30_000, 70_000
+    second.take(4_000)
+    with pytest.raises(NoSpace):
+        second.take(4_000)
+    second.give_back()
+    room.share().take(19_000)
 
 
 def test_a_file_of_no_known_kind_is_refused_before_its_content_came(client: TestClient, core: Core) -> None:
