@@ -31,6 +31,7 @@ from sprung.service.tokens import Actor, Refused, Tokens, digest_of
 log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+HOST = re.compile(r"(?:\[([^\]]*)\]|([^:\[\]]*))(?::\d*)?")  # RFC 9110, 7.2; an IPv6 address stands in brackets
 METHODS = ("GET", "HEAD", "OPTIONS", "POST", "PUT", "PATCH", "DELETE")
 UNSAFE = ("POST", "PUT", "PATCH", "DELETE")
 BURST_SECONDS = 2.0  # of the permitted rate that may come at once
@@ -300,9 +301,11 @@ def session_of(headers: Mapping[str, str]) -> str | None:
 
 
 def host_of(header: str) -> str:
-    """The name or address in a Host header, without its port."""
-    name = header.rsplit("]", 1)[0].lstrip("[") if header.startswith("[") else header.rsplit(":", 1)[0]
-    return name.lower()
+    """The name or address in a Host header, without its port.  Raises a 400 ApiProblem where it is something else."""
+    found = HOST.fullmatch(header)
+    if found is None:
+        raise ApiProblem(400, "the Host header is no name or address with or without a port")
+    return (found[1] or found[2] or "").lower()
 
 
 def is_loopback(host: str) -> bool:

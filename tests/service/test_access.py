@@ -272,6 +272,12 @@ def test_names_that_were_pointed_here_are_not_served(client: TestClient, engine:
     for host, expected in (
         ("attacker.example", 421),
         ("attacker.example:8000", 421),
+        ("[::1]attacker.example", 400),
+        ("[::1]attacker.example:8000", 400),
+        ("localhost:8000attacker.example", 400),
+        ("attacker.example:80:localhost", 400),
+        ("[[::1]]", 400),
+        ("::1", 400),
         ("localhost:8000", 200),
         ("127.0.0.1:8000", 200),
         ("[::1]:8000", 200),
