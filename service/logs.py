@@ -32,9 +32,17 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, default=str)
 
 
+class PlainLines(logging.Formatter):
+    """Text for people; an event stays on its line, however many its message has (SQL errors have three)."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Level and message."""
+        return " ".join(f"sprung: {record.levelname}: {record.message}".splitlines())
+
+
 def set_up(form: str, level: str) -> None:
     """Log to stderr; form: text or json."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLines() if form == "json" else logging.Formatter("sprung: %(levelname)s: %(message)s"))
+    handler.setFormatter(JsonLines() if form == "json" else PlainLines())
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
     logging.getLogger("sprung").setLevel(level.upper())

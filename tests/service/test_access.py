@@ -21,7 +21,7 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
-from sprung.service.logs import JsonLines, request_id
+from sprung.service.logs import JsonLines, PlainLines, request_id
 from sprung.service.main import access_notice
 from sprung.service.settings import Settings
 from sprung.service.store import Store, audit, tokens
@@ -401,3 +401,14 @@ def test_logs_are_one_json_object_a_line_with_the_request() -> None:
     finally:
         request_id.reset(token)
     assert (line["event"], line["level"], line["job"], line["request"]) == ("job ended", "info", "j1", "ride-7")
+
+
+def test_a_message_of_several_lines_is_one_line_for_people() -> None:
+    told = {
+        "name": "sprung.x",
+        "levelno": 40,
+        "levelname": "ERROR",
+        "msg": "%s",
+        "args": ("disk is full\n[SQL: x]\nsee",),
+    }
+    assert PlainLines().format(logging.makeLogRecord(told)) == "sprung: ERROR: disk is full [SQL: x] see"
