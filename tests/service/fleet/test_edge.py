@@ -140,6 +140,19 @@ def test_statuses_say_whether_to_try_again() -> None:
     assert not dead.stored and dead.trouble and not dead.refused
 
 
+def test_a_recording_whose_first_attempt_is_still_worked_on_is_sent_again() -> None:
+    receiver = EdgeReceiver([409])
+    threading.Thread(target=receiver.serve_forever, daemon=True).start()
+    link = HttpLink(f"http://127.0.0.1:{receiver.server_port}", None, "north-1")
+    entry = SpoolEntry(9, "recording", "north-1-x.mcap", b"\x89MCAP")
+    busy, again = link.send(entry), link.send(entry)
+    link.close()
+    receiver.shutdown()
+    receiver.server_close()
+    assert busy.trouble and not busy.refused
+    assert again.stored
+
+
 def test_raw_samples_go_to_the_server_that_takes_them() -> None:
     """The ingest takes estimates only; what it says of a recording names the option."""
     ingest, pages = EdgeReceiver([200, 404]), EdgeReceiver([])
