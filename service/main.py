@@ -31,7 +31,9 @@ from sprung.service.lock import held
 from sprung.service.numerics import numerics
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import Settings
+from sprung.service.store import open_store
 from sprung.service.store.work import add_recording
+from sprung.service.tokens import Tokens
 from sprung.service.worker import ProcessLimits
 
 log = logging.getLogger("sprung")
@@ -59,6 +61,7 @@ def serve(settings: Settings, feeds: Feeds, watch: Watch, announce: Callable[[st
     watch: callbacks that show a recording's progress and outcome; announce: told the address once it is open.
     Raises UserError for settings, files and buses that cannot be used.
     """
+    check_access(settings)
     loaded = load_engine(settings)
     with ExitStack() as stack:
         engine, following = stack.enter_context(numerics(loaded, settings))
@@ -109,6 +112,17 @@ def access_notice(settings: Settings, tokens: bool) -> str:
             "set SPRUNG_ADMIN_TOKEN, or say SPRUNG_OPEN=true behind a proxy that asks for sign-in"
         )
     return "requests need no token, as only this machine reaches the address; `sprung token create` changes that"
+
+
+def check_access(settings: Settings) -> None:
+    """Before anything is loaded: raises UserError for a service that others reach and that asks for no token."""
+    if settings.open or settings.admin_token is not None or settings.oidc_issuer or is_loopback(settings.host):
+        return
+    store = open_store(settings.store_url)
+    try:
+        access_notice(settings, Tokens(store).any)
+    finally:
+        store.close()
 
 
 def announce_access(notice: str) -> None:

@@ -6,6 +6,7 @@ import json
 import logging
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,9 @@ from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import MEDIA_TYPE, Message, WindowEstimate, encode
 from sprung.service.logs import JsonLines, PlainLines, request_id
-from sprung.service.main import access_notice
+from sprung.service.main import Feeds, access_notice, serve
 from sprung.service.settings import Settings
-from sprung.service.store import Store, audit, tokens
+from sprung.service.store import Store, audit, open_store, tokens
 from sprung.service.tokens import Refused, Tokens
 from tests.service_fakes import make_window
 
@@ -176,6 +177,27 @@ def test_a_service_that_others_reach_does_not_start_without_a_token() -> None:
     assert [is_loopback(h) for h in ("127.0.0.1", "::1", "localhost", "127.8.8.8", "0.0.0.0", "10.0.0.1", "x.org")] == [
         True, True, True, True, False, False, False,
     ]  # fmt: skip
+
+
+def test_a_service_without_a_token_is_refused_before_anything_is_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(settings: Settings) -> Engine:
+        raise LookupError("loaded")
+
+    def start(**changes: Any) -> None:
+        serve(Settings(data_dir=tmp_path, **changes), Feeds(), lambda path, core: pytest.fail(), lambda address: None)
+
+    monkeypatch.setattr("sprung.service.main.load_engine", load)
+    with pytest.raises(UserError, match="sprung token create"):
+        start(host="0.0.0.0")
+    for allowed in ({}, {"host": "0.0.0.0", "open": True}, {"host": "0.0.0.0", "admin_token": "x" * 20}):
+        with pytest.raises(LookupError):
+            start(**allowed)
+    with closing(open_store(Settings(data_dir=tmp_path).store_url)) as store:
+        Tokens(store).create("boss", ["admin"])
+    with pytest.raises(LookupError):
+        start(host="0.0.0.0")
 
 
 def test_the_last_token_revoked_does_not_open_the_service(client: TestClient, core: Core) -> None:
