@@ -159,7 +159,8 @@ class Guard:
         if credential not in self._good:
             self._limiter.take(address)
         try:
-            actor, by_cookie = await self._foreign(headers) or await run_in_threadpool(self._actor, headers)
+            found = await self._foreign(headers)
+            actor, by_cookie = found if found is not None else await run_in_threadpool(self._actor, headers)
         except ApiProblem:
             if self._good.pop(credential, False):
                 self._limiter.take(address)
