@@ -1,4 +1,7 @@
-"""Who did what, and when: written in the transaction of the deed itself, never changed."""
+"""Who did what, and when; never changed.
+
+What is done in the store is noted in the transaction of the deed itself; uploads, jobs and their ends right after them.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import tempfile
 from itertools import pairwise
 from pathlib import Path
@@ -116,8 +117,12 @@ class Books(RuleBasedStateMachine):
         before = {vehicle: self._state(vehicle) for vehicle, given in self.given.items() if given}
         if closed:
             self.store.close()
-        else:
-            self.store.engine.dispose()
+        else:  # what is on the disk while the store is open is all that a kill leaves: write-ahead log included
+            left = tempfile.TemporaryDirectory()
+            shutil.copytree(self.folder.name, left.name, dirs_exist_ok=True)
+            self.store.close()
+            self.folder.cleanup()
+            self.folder = left
         self._open()
         assert {vehicle: self._state(vehicle) for vehicle in before} == before
 
