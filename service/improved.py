@@ -34,9 +34,10 @@ def improved_text(text: str, system: System, report: Report) -> str:
             continue
         group = file["bodies" if quantity == "mass" else "elements"]
         _set_value(group[part], quantity, parameter.value)
+    undone = {law.name for law in system.catalogue if isinstance(law, SensorLaw)}
     for group in ("elements", "bodies", "inputs", "sensors"):
         for entry in (file.get(group) or {}).values():
-            _drop_laws(entry, {law.name for law in system.catalogue if isinstance(law, SensorLaw)})
+            _drop_laws(entry, undone)
     for law in report.laws:
         _place(file, system, law)
     for finding in report.findings:
@@ -68,12 +69,12 @@ def _set_value(entry: Any, quantity: str, value: float) -> None:
         entry[quantity] = _rounded(value)
 
 
-def _drop_laws(entry: Any, kept_names: set[str]) -> None:
+def _drop_laws(entry: Any, undone: set[str]) -> None:
     """Take out laws, whose values come anew; faults of measurements stay: they were undone before."""
     if not isinstance(entry, Mapping):
         return
     if "laws" in entry:
-        kept = [law for law in entry["laws"] if kept_names.issuperset(law)]
+        kept = [law for law in entry["laws"] if undone.issuperset(law)]
         del entry["laws"]  # type: ignore[attr-defined]
         if kept:
             entry["laws"] = kept  # type: ignore[index]

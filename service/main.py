@@ -118,11 +118,12 @@ def check_access(settings: Settings) -> None:
     """Before anything is loaded: raises UserError for a service that others reach and that asks for no token."""
     if settings.open or settings.admin_token is not None or settings.oidc_issuer or is_loopback(settings.host):
         return
-    store = open_store(settings.store_url)
-    try:
-        access_notice(settings, Tokens(store).any)
-    finally:
-        store.close()
+    with held(settings.data_dir):  # opening may change the store: not while another service works on it
+        store = open_store(settings.store_url)
+        try:
+            access_notice(settings, Tokens(store).any)
+        finally:
+            store.close()
 
 
 def announce_access(notice: str) -> None:

@@ -215,6 +215,11 @@ def told(alarm: Alarm | AlarmRow) -> str:
     return " or ".join([*rivals, spoken(alarm.parameter or "")])
 
 
+def unclear(rivals: Sequence[str]) -> str:
+    """A sentence on what the measurements do not tell an alarm from, to stand before others; empty where nothing."""
+    return f"The measurements do not tell it from {' or '.join(rivals)}: check the sensor first. " if rivals else ""
+
+
 def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
     """Severity of an alarm of all elements of a kind, `*.damping` or `primary_*.damping`, to which one belongs."""
     return next(

@@ -13,11 +13,12 @@ from sqlalchemy import Connection
 from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
-from sprung.service.api.idempotency import Once, OnceOf, content_kind
+from sprung.service.api.idempotency import Once, OnceOf
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.recordings import job_dict
+from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import BODY as UPLOAD
-from sprung.service.api.uploads import FORM, receive
+from sprung.service.api.uploads import receive
 from sprung.service.core import Core
 from sprung.service.diagnosis_task import IMPROVED
 from sprung.service.errors import NotFound
@@ -51,7 +52,7 @@ async def diagnose(request: Request, core: CoreOf, actor: ActorOf, once: OnceOf)
 
     async def act() -> Response:
         core.jobs.reserve()
-        kind = content_kind(request)
+        kind = content_kind(request.headers)
         if kind == FORM:
             job = await _of_upload(request, core, actor, once)
         elif kind == "application/json":

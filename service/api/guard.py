@@ -21,7 +21,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
-from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, need_of, place_of
+from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, content_kind, need_of, place_of
 from sprung.service.logs import request_id
 from sprung.service.oidc import AGAIN_SECONDS, Provider, Unreachable, looks_like_jwt
 from sprung.service.pages.render import signed_in
@@ -230,7 +230,7 @@ class Guard:
                 raise ApiProblem(403, "requests of other origins are not taken")
         if need is ADMIN:  # no such route: the application says so
             return
-        kind = headers.get("content-type", "").split(";")[0].strip().lower()
+        kind = content_kind(headers)
         length = headers.get("content-length")
         sent = "transfer-encoding" in headers or (length is not None and length != "0")
         if sent and kind not in need.body:

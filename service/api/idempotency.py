@@ -21,7 +21,8 @@ from sqlalchemy import Row, delete, select
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response
 from sprung.service.api.problems import ApiProblem
-from sprung.service.api.uploads import FORM, identity_of
+from sprung.service.api.scopes import FORM, content_kind
+from sprung.service.api.uploads import identity_of
 from sprung.service.core import Core
 from sprung.service.store.engine import insert_or_ignore
 from sprung.service.store.schema import idempotency
@@ -76,7 +77,7 @@ class Once:
             return connection.execute(select(table).where(table.c.key == self._key)).first()
 
     async def _again(self, kept: Row[Any]) -> Response:
-        if content_kind(self._http) == FORM:
+        if content_kind(self._http.headers) == FORM:
             self.received(await identity_of(self._http, self._core.settings))
         if kept.request != _digest(*self._parts, self._upload):
             detail = "was used for another request"
@@ -99,15 +100,10 @@ class Once:
 
 async def once(request: Request, core: CoreOf, actor: ActorOf, key: Key = None) -> Once:
     """What a route needs to be carried out once; JSON bodies count as part of the request."""
-    body = await request.body() if key is not None and content_kind(request) == "application/json" else b""
+    body = await request.body() if key is not None and content_kind(request.headers) == "application/json" else b""
     if key is not None:
         key = _digest(*(part.encode() for part in (actor.name, actor.fleet, *sorted(actor.scopes), key)))
     return Once(core, key, request, [request.method.encode(), request.url.path.encode(), body])
-
-
-def content_kind(request: Request) -> str:
-    """What type of body a request says it has, without parameters."""
-    return request.headers.get("content-type", "").split(";")[0].strip().lower()
 
 
 def _digest(*parts: bytes) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from sprung.service.fleet.message import MEDIA_TYPE
@@ -20,7 +21,14 @@ class Need:
     limited: bool = True  # how often it is asked counts
 
 
-FORM = ("multipart/form-data",)
+FORM = "multipart/form-data"
+
+
+def content_kind(headers: Mapping[str, str]) -> str:
+    """What type of body a request says it has, without parameters."""
+    return headers.get("content-type", "").split(";")[0].strip().lower()
+
+
 # /health/live costs nothing, and who watches the service must hear that it lives, whatever else comes from its address
 NEEDS: dict[tuple[str, str], Need] = {
     ("GET", "/health/live"): Need(PUBLIC, limited=False),
@@ -37,8 +45,8 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("POST", "/identify"): Need("ingest", by_fleet=True),
     ("POST", "/ingest/estimates"): Need("ingest", by_fleet=True, body=(MEDIA_TYPE, "application/octet-stream")),
     ("POST", "/ingest/windows"): Need("ingest", by_fleet=True),
-    ("POST", "/recordings"): Need("ingest", by_fleet=True, body=FORM),
-    ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", *FORM)),
+    ("POST", "/recordings"): Need("ingest", by_fleet=True, body=(FORM,)),
+    ("POST", "/diagnose"): Need("operate", by_fleet=True, body=("application/json", FORM)),
     ("GET", "/jobs/{id}"): Need("read", by_fleet=True),
     ("POST", "/jobs/{id}/cancel"): Need("operate", by_fleet=True),
     ("GET", "/reports/{id}"): Need("read", by_fleet=True),

@@ -20,6 +20,7 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from sprung.replay.recording import EXTENSIONS
 from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem, from_validation
+from sprung.service.api.scopes import FORM
 from sprung.service.core import Core
 from sprung.service.durable import sync_folder
 from sprung.service.settings import Settings
@@ -31,7 +32,6 @@ from sprung.service.upload_room import Share
 CHUNK = 1 << 20
 MOST_PARTS = 8
 MOST_FIELD_BYTES = 4096
-FORM = "multipart/form-data"
 LONGEST_BOUNDARY = 70  # RFC 2046
 _VEHICLE: TypeAdapter[str] = TypeAdapter(VehicleId)
 

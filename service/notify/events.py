@@ -8,7 +8,7 @@ from urllib.parse import quote
 
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.views import finite, spoken
+from sprung.service.views import finite, spoken, unclear
 
 ALARM_TYPES = {"opened": "sprung.alarm.opened", "changed": "sprung.alarm.changed", "closed": "sprung.alarm.closed"}
 REPORT_READY = "sprung.report.ready"
@@ -28,10 +28,7 @@ def alarm_event(base: str, vehicle: str, change: AlarmChange, now: int) -> dict[
     alarm = change.alarm
     element, _, quantity = (alarm.parameter or "").rpartition(".")
     advice = ADVICE["common" if alarm.kind == "change" and "*" in element else alarm.kind]
-    if alarm.alternatives:
-        advice = (
-            f"The measurements do not tell it from {' or '.join(alarm.alternatives)}: check the sensor first. {advice}"
-        )
+    advice = unclear(alarm.alternatives) + advice
     data = {
         "vehicle": vehicle,
         "alarm": {

@@ -9,7 +9,7 @@ from sprung.model.tracking.tracker import Alarm
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
-from sprung.service.views import VehicleView, told
+from sprung.service.views import VehicleView, told, unclear
 
 MOSTLY = 0.5  # share of the windows from which something is worth a hint
 
@@ -85,10 +85,7 @@ def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> lis
         )
         now = next((a for a in view.active if (a.kind, a.parameter) == (worst.kind, worst.parameter)), worst)
         rivals = now.alternatives if isinstance(now, Alarm) else ()
-        unclear = (
-            f"The measurements do not tell it from {' or '.join(rivals)}: check the sensor first. " if rivals else ""
-        )
-        found.append(Hint(level, f"{told(now)} has changed{size}{many}", f"{unclear}{what} {ask}"))
+        found.append(Hint(level, f"{told(now)} has changed{size}{many}", f"{unclear(rivals)}{what} {ask}"))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
         found.append(Hint("warning", "Windows no longer fit the model", text))

@@ -77,9 +77,14 @@ class Judged:
         return float(np.std(self.record.task.force[self.record.task.split :])) or 1.0
 
     @cached_property
+    def by_chance(self) -> tuple[FloatArray, list[str]]:
+        """Covariance of what the final model has, by chance alone, and names."""
+        return covariance(self.final)
+
+    @cached_property
     def covariance(self) -> tuple[FloatArray, list[str]]:
         """Covariance of what the final model has, with what the record leaves open besides chance, and names."""
-        full, names = covariance(self.final)
+        full, names = self.by_chance
         return full + left_open(self.final, [one.moved for one in self.alike]), names
 
     @cached_property
@@ -289,7 +294,7 @@ def _findings(one: Judged) -> list[Finding]:
     unnamed = one.surface or first
     if unnamed is not None:
         findings.append(unknown_finding(one.record.element, unnamed, one.found.steps, mapped=one.surface is not None))
-    deviation, by_chance = (float(np.sqrt(max(of[0, 0], 0.0))) for of in (full, covariance(one.final)[0]))
+    deviation, by_chance = (float(np.sqrt(max(of[0, 0], 0.0))) for of in (full, one.by_chance[0]))
     sign = -1.0 if one.reversed else 1.0
     least = one.final.task.rules.preload * max(by_chance, one.floor / np.sqrt(one.record.task.split))
     if abs(one.final.preload) > least:

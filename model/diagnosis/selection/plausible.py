@@ -38,9 +38,9 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str 
 
 def _unheard(grid: Grid, term: Term) -> str | None:
     """A resonance above all that is compared: below it nothing parts it from a body that is heavier or softer."""
-    highest = grid.omega[grid.band][-1] / (2 * np.pi)
     if "frequency" not in term.law.names:
         return None
+    highest = grid.omega[grid.band][-1] / (2 * np.pi)
     frequency = term.parameters[term.law.names.index("frequency")]
     return f"{frequency:.3g} Hz is above the {highest:.3g} Hz that are compared" if frequency > highest else None
 
