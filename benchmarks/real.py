@@ -111,7 +111,7 @@ def followed(report: Report, peaks: FloatArray, independent: FloatArray) -> dict
 
 def references(record: MeasuredRecord) -> dict[str, float]:
     """Held-out errors of the models by SciPy, on the samples that the diagnosis used."""
-    (one,) = component_records(record.system, record.values, record.sample_rate, Options().train_share)
+    (one,) = component_records(record.system, record.values, record.sample_rate)
     task = one.task.every(max(1, len(one.task.force) // MOST_REFERENCE))
     displacement = np.interp(task.motion.time, np.arange(len(record.values)) / record.sample_rate, record.values[:, 0])
     rate = np.gradient(displacement, task.motion.time)

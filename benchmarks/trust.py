@@ -4,6 +4,8 @@
 that replay, migrate, forget, back up and restore.  `--cuts N` replays the system calls of a traced service onto a disk
 that loses what was not synced, and looks at what is left at N moments.  `--load-minutes N` sends the windows of 100
 vehicles (`--vehicles`), one a second each; `--soak-minutes N` sends few, uploads and looks at pages meanwhile.
+`--scarce-seconds N` takes disk, files, memory and the store's lock from a running service, for N seconds each; as 20
+kills are, it is done unless told otherwise (`sprung bench trust 0 --scarce-seconds 0`).
 With `--folder` what was done is kept: the same call goes on where the last one was ended.
 """
 
@@ -21,6 +23,7 @@ from typing import Any
 from sprung.benchmarks.trust_load import VEHICLES, load
 from sprung.benchmarks.trust_power import power_cuts
 from sprung.benchmarks.trust_ride import RestlessRide
+from sprung.benchmarks.trust_scarcity import scarcity
 from sprung.benchmarks.trust_soak import soak
 from sprung.benchmarks.trust_steps import KILLS
 from sprung.benchmarks.trust_zygote import Zygote
@@ -33,6 +36,7 @@ def run(
     load_minutes: float = 0.0,
     vehicles: int = VEHICLES,
     soak_minutes: float = 0.0,
+    scarce_seconds: float = 4.0,
     folder: str = "",
     minutes: float = 0.0,
     seed: int = 1,
@@ -52,6 +56,8 @@ def run(
             yield from load(Path(temporary), load_minutes, vehicles)
         if soak_minutes:
             yield from soak(Path(temporary), soak_minutes)
+        if scarce_seconds:
+            yield from scarcity(Path(temporary), scarce_seconds)
 
 
 def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[str, Any]]:

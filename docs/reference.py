@@ -1,4 +1,7 @@
-"""The generated reference: docs/reference/cli.md, metrics.md, openapi.json, system.schema.json; `make docs` runs it."""
+"""The generated reference: docs/reference/cli.md, laws.md, metrics.md, openapi.json, system.schema.json.
+
+`make docs` runs it.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import os
 import tempfile
 from pathlib import Path
 
+from sprung.model.laws import CATALOGUE
 from sprung.model.systemfile import json_schema
 from sprung.service.api.app import create_app
 from sprung.service.cli import main as run
@@ -31,6 +35,18 @@ def commands() -> str:
         with contextlib.redirect_stdout(text):
             run([*words, "--help"])
         parts.append(f"## sprung {' '.join(words)}\n\n```\n{text.getvalue().strip()}\n```\n")
+    return "\n".join(parts)
+
+
+def laws() -> str:
+    """Every law of the catalogue, its parameters, and what it looks like."""
+    parts = ["# Laws\n\nWhat the code says of every law; [the catalogue](../catalogue.md) has their forces.\n"]
+    for law in CATALOGUE:
+        others = ", ".join(f"`{name}`" for name in law.confused_with) or "nothing"
+        parts.append(f"## {law.name}\n\n{law.title}. Looks like: {law.looks_like}. Confused with: {others}.\n")
+        rows = [f"| `{p.name}` | {p.unit} | {p.low:g} to {p.high:g} | {p.meaning} |" for p in law.parameters]
+        if rows:
+            parts.append("\n".join(["| parameter | unit | admissible | meaning |", "|---|---|---|---|", *rows, ""]))
     return "\n".join(parts)
 
 
@@ -59,10 +75,11 @@ def main() -> None:
     (TARGET / "cli.md").write_text(commands(), encoding="utf-8")
     (TARGET / "metrics.md").write_text(metrics, encoding="utf-8")
     (TARGET / "openapi.json").write_text(description + "\n", encoding="utf-8")
+    (TARGET / "laws.md").write_text(laws(), encoding="utf-8")
     schema = json.dumps(json_schema(), indent=1)
     (TARGET / "system.schema.json").write_text(schema + "\n", encoding="utf-8")
     (TARGET / "index.md").write_text(
-        "# Reference\n\n[Commands](cli.md), [metrics](metrics.md), [OpenAPI](openapi.json), "
+        "# Reference\n\n[Commands](cli.md), [laws](laws.md), [metrics](metrics.md), [OpenAPI](openapi.json), "
         "[JSON Schema of system files](system.schema.json): all made from the code by `make docs`.\n",
         encoding="utf-8",
     )

@@ -16,6 +16,7 @@ from sprung.service.store import Store
 
 FRESH_SECONDS = 1.0  # that an answer is given again: asking costs a transaction
 DESCRIPTORS = 8  # that must be left
+MEMORY_BYTES = 32 << 20  # likewise: the stacks of a few threads
 
 
 class Condition:
@@ -32,7 +33,9 @@ class Condition:
         """One line for everything that is wrong now; takes a second or two when something is."""
         with self._lock:
             if time.monotonic() - self._asked > FRESH_SECONDS:
-                self._known = [line for line in (self._store_trouble(), *self._file_troubles()) if line]
+                self._known = [
+                    line for line in (self._store_trouble(), *self._file_troubles(), _memory_trouble()) if line
+                ]
                 self._asked = time.monotonic()
             return list(self._known)
 
@@ -56,6 +59,14 @@ class Condition:
         if free < self._settings.min_free_bytes:
             return [f"{folder}: {free / 1e6:.0f} MB are free, {self._settings.min_free_bytes / 1e6:.0f} MB are needed"]
         return []
+
+
+def _memory_trouble() -> str:
+    try:
+        bytearray(MEMORY_BYTES)
+    except MemoryError:
+        return f"{MEMORY_BYTES >> 20} MB of memory are not to be had"
+    return ""
 
 
 def _open_some() -> None:

@@ -12,9 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from sqlalchemy import ColumnElement, Connection
-from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.service.errors import UserError
 from sprung.service.settings import Settings
 from sprung.service.store import Store, retention, work
 from sprung.service.store.archive import open_archive
@@ -162,7 +160,7 @@ class Housekeeping:
         while True:
             try:
                 self.once(self.clock.now())
-            except (SQLAlchemyError, OSError, UserError):
+            except Exception:  # whatever it is, it may be over in an hour, and nobody else forgets old data
                 log.exception("housekeeping failed; it tries again in an hour")
             if self._stopping.wait(PERIOD_SECONDS):
                 return

@@ -138,10 +138,10 @@ class Tokens:
             raise Refused("the token is not known")
         return self._valid(row)
 
-    def sign_in(self, text: str) -> str:
-        """A session of the token's owner, that ends with the token.  Raises Refused."""
-        self.actor(text)
-        return self.open_session(lambda: self.actor(text), SESSION_SECONDS)
+    def sign_in(self, text: str) -> tuple[str, Actor]:
+        """A session of the token's owner, that ends with the token, and who that is.  Raises Refused."""
+        actor = self.actor(text)
+        return self.open_session(lambda: self.actor(text), SESSION_SECONDS), actor
 
     def open_session(self, owner: Callable[[], Actor], seconds: float) -> str:
         """A session; `owner` is asked with each request and may raise Refused."""
@@ -152,10 +152,15 @@ class Tokens:
                 self._sessions.popitem(last=False)
         return session
 
-    def sign_out(self, session: str) -> None:
-        """End a session."""
+    def sign_out(self, session: str) -> Actor | None:
+        """End a session; whose it was, None if it was over."""
+        try:
+            actor = self.session(session)
+        except Refused:
+            actor = None
         with self._lock:
             self._sessions.pop(digest_of(session), None)
+        return actor
 
     def session(self, session: str) -> Actor:
         """Whose session it is; ends with its token.  Raises Refused."""

@@ -48,6 +48,7 @@ class RecordRules:
     """What can be used of a recording."""
 
     minimum_samples: int = rule(200, "derived: two periods of the slowest mode of a vehicle at 100 Hz", 100, 400)
+    fitted: float = rule(0.7, "of the recording, from its start; chosen: the rest judges what was fitted", 0.6, 0.8)
     gap: float = rule(0.05, "s; derived: a period of the highest frequency compared at 100 Hz loses nothing", 0.02, 0.1)
     moves: float = rule(2.0, "noise deviations by which one sensor has to move; chosen: 1 is noise alone", 1.5, 3.0)
     longest: int = rule(18_000, "samples; chosen: three minutes of a vehicle, 2 to 3 GB of memory", 12_000, 60_000)
@@ -158,6 +159,8 @@ class PlausibleRules:
 class AcceptanceRules:
     """When a further finding counts, and how faults of input channels are compensated."""
 
+    alpha: float = rule(1e-3, "chance of a false finding before the held-out check; chosen: one recording", 1e-4, 1e-2)
+    findings: int = rule(6, "that are sought at most; chosen: five, and one to see that there is none", 5, 8)
     minor_beside: float = rule(0.05, "of an earlier finding at the same place; chosen", 0.02, 0.1)
     minor_elsewhere: float = rule(0.002, "of an earlier finding elsewhere; chosen", 0.0005, 0.01)
     minor_followed: float = rule(0.01, "of logarithmic gains; chosen: laws are simulated no better", 0.003, 0.03)

@@ -50,6 +50,7 @@ COULOMB_FRICTION = ElementLaw(
             lambda seen: 0.05 * seen.rate_rms,
             log=True,
             usual=(0.0, 4.0),  # wider, it is a damper that saturates
+            minor=True,
         ),
     ),
     force=_coulomb,

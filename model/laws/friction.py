@@ -57,6 +57,7 @@ STRIBECK = ElementLaw(
             "rate over which the force changes sign",
             lambda seen: 0.05 * seen.rate_rms,
             log=True,
+            minor=True,
         ),
     ),
     force=_stribeck,

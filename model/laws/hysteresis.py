@@ -213,7 +213,7 @@ _BOUC_WEN = ElementLaw(
         ParameterSpec(
             "beta", "m^-n", 1e-6, 1e60, "inverse of the yield deflection^n, times 2/3", lambda s: 0.0, log=True
         ),
-        ParameterSpec("n", "1", 1.0, 8.0, "sharpness of the yielding", lambda seen: 1.0),
+        ParameterSpec("n", "1", 1.0, 8.0, "sharpness of the yielding", lambda seen: 1.0, minor=True),
     ),
     force=_bouc_wen_force,
     formula="alpha * z",

@@ -25,6 +25,7 @@ from sprung.service.pages.render import render
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
 
+NO_THREAD = "can't start new thread"  # what Python says when there is no memory for another stack
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 WAIT = {"Retry-After": "10"}
 
@@ -157,7 +158,7 @@ def _as_problem(error: Exception) -> ApiProblem:
             return ApiProblem(422, str(error))
         case NoSpace():
             return ApiProblem(507, str(error))
-        case SQLAlchemyError() | OSError() | MemoryError() if found := _resource_problem(error):
+        case SQLAlchemyError() | OSError() | MemoryError() | RuntimeError() if found := _resource_problem(error):
             log.error("%s: %s", found.detail, error)
             return found
         case _:
@@ -176,7 +177,7 @@ def _fault(error: Mapping[str, Any]) -> dict[str, str]:
 
 def _resource_problem(error: BaseException) -> ApiProblem | None:
     """What the machine lacks, as the client should know it; None for an error of another kind."""
-    if isinstance(error, MemoryError):
+    if isinstance(error, MemoryError) or str(error) == NO_THREAD:
         return ApiProblem(503, "the service is out of memory", headers=WAIT)
     if isinstance(error, OSError):
         if error.errno in NO_ROOM:

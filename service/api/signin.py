@@ -40,10 +40,11 @@ async def sign_in(request: Request, core: CoreOf) -> Response:
     form = await request.form(max_fields=4)
     to = _inside(str(form.get("to", "/")))
     try:
-        session = await run_in_threadpool(core.tokens.sign_in, str(form.get("token", "")).strip())
+        session, actor = await run_in_threadpool(core.tokens.sign_in, str(form.get("token", "")).strip())
     except Refused as refused:
         await asyncio.sleep(0.5)  # whoever guesses has time
         return _form(core, to, str(refused), 401)
+    await note(core, actor, "sign in", actor.name)
     response = RedirectResponse(to, 303)
     _set_session(request, response, session, SESSION_SECONDS)
     return response
@@ -97,8 +98,9 @@ async def signed_in_elsewhere(request: Request, core: CoreOf) -> Response:
 async def sign_out(request: Request, core: CoreOf) -> Response:
     """End the session."""
     session = session_of(request.headers)
-    if session is not None:
-        core.tokens.sign_out(session)
+    actor = None if session is None else await run_in_threadpool(core.tokens.sign_out, session)
+    if actor is not None:
+        await note(core, actor, "sign out", actor.name)
     response = RedirectResponse("/signin", 303)
     response.delete_cookie(COOKIE)
     return response

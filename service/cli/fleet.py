@@ -24,7 +24,7 @@ from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
-from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds
+from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds, without_password
 from sprung.service.fleet.ray_serving import ServingSizes
 from sprung.service.fleet.tasks import tasks_for
 from sprung.service.logs import set_up
@@ -167,7 +167,7 @@ async def _consume(
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stopping.set)
     broker = await _broker(address, late_seconds)
-    print(f"sprung fleet: folding what {address} holds; Ctrl-C stops", flush=True)
+    print(f"sprung fleet: folding what {without_password(address)} holds; Ctrl-C stops", flush=True)
     try:
         await consume(broker, ingest, stopping, counts, (lambda: None) if alive is None else alive.touch)
     finally:
@@ -179,7 +179,7 @@ async def _broker(address: str, late_seconds: float) -> Broker:
         return await NatsBroker.open(address, ack_seconds(late_seconds))
     if address.startswith("kafka://"):
         return await open_kafka(address)
-    raise UserError(f"{address}: give nats://HOST:PORT or kafka://HOST:PORT/TOPIC")
+    raise UserError(f"{without_password(address)}: give nats://HOST:PORT or kafka://HOST:PORT/TOPIC")
 
 
 def run_migrate(store: str | None) -> int:

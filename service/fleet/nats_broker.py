@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -145,16 +146,27 @@ async def _connected(servers: str) -> Any:
     except ModuleNotFoundError as error:
         raise UserError("NATS needs nats-py: pip install 'sprung[fleet]'") from error
 
-    async def quiet(_error: Exception) -> None:
-        """Reconnecting says it."""
+    refused: list[Exception] = []
 
-    connecting = nats.connect(servers, max_reconnect_attempts=-1, error_cb=quiet, connect_timeout=5)
+    async def heard(error: Exception) -> None:
+        """Reconnecting says it; who is not let in hears it once."""
+        if isinstance(error, Error) and not refused:
+            refused.append(error)
+
+    where = without_password(servers)
+    connecting = nats.connect(servers, max_reconnect_attempts=-1, error_cb=heard, connect_timeout=5)
     try:  # later it connects again however long it takes; now an address may be wrong
         return await asyncio.wait_for(connecting, FIRST_ANSWER_SECONDS)
     except (Error, OSError) as error:
-        raise UserError(f"{servers}: no NATS server answers ({type(error).__name__})") from error
+        reason = str(refused[0]) if refused else type(error).__name__
+        raise UserError(f"{where}: no NATS server answers, or it lets nobody in ({reason})") from error
     except ValueError as error:
-        raise UserError(f"{servers}: give an address as in nats://HOST:4222 ({error})") from error
+        raise UserError(f"{where}: give an address as in nats://USER:PASSWORD@HOST:4222 ({error})") from error
+
+
+def without_password(address: str) -> str:
+    """An address as it may be printed: whoever reads a log learns no password."""
+    return re.sub(r"(?<=://)[^/@]*@", "", address)
 
 
 async def _ensure_stream(stream: Any) -> None:

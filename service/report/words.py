@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 
 from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
+from sprung.model.laws import CATALOGUE, Law
+from sprung.model.laws.basis import UNKNOWN
 from sprung.service.report.ink import engineering
 from sprung.service.report.values import largest_bias
 
@@ -15,22 +17,22 @@ VERDICTS = {
     "unknown_physics": "The vehicle does something that no known law explains",
 }
 
-EFFECTS = {
-    "coulomb_friction": "dry friction",
-    "bouc_wen": "hysteresis (Bouc-Wen)",
-    "damper_blowoff": "damper blow-off",
-    "series_stiffness": "soft damper mounting",
-    "unknown": "an unknown law",
-}
+_LAWS: dict[str, Law] = {law.name: law for law in CATALOGUE}
 
 
 def effect_words(effect: str) -> str:
-    """An effect's name as words: `bump_stop` as "bump stop"."""
-    return EFFECTS.get(effect, effect.replace("_", " "))
+    """An effect's name as words: a law's title, else `exchanged_sensors` as "exchanged sensors"."""
+    if effect == UNKNOWN:
+        return "an unknown law"
+    law = _LAWS.get(effect)
+    return effect.replace("_", " ") if law is None else law.title
 
 
-# Parameters that shape a law's corner and say nothing about how strong it is
-MINOR = {"smoothing", "n"}
+def _minor(effect: str) -> set[str]:
+    """Parameters of a law of the catalogue, or of its wider form, that say nothing about how strong it is."""
+    law = _LAWS.get(effect)
+    forms = [form for form in (law, getattr(law, "wider", None)) if form is not None]
+    return {spec.name for form in forms for spec in form.parameters if spec.minor}
 
 
 def quantity(p: LawParameter) -> str:
@@ -54,7 +56,7 @@ def quantity(p: LawParameter) -> str:
 def finding_words(finding: Finding) -> str:
     """One finding: place, law, numbers."""
     name = effect_words(finding.family or finding.effect)
-    main = [p for p in finding.parameters if p.name not in MINOR]
+    main = [p for p in finding.parameters if p.name not in _minor(finding.effect)]
     if len(main) == 1 and main[0].determined:
         return f"{name} of {quantity(main[0])}"
     numbers = ", ".join(f"{p.name} {quantity(p)}" for p in main)

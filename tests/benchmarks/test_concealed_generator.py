@@ -18,7 +18,7 @@ from sprung.benchmarks.generator.integrate import SAMPLE_RATE, STEP_RATE, WARM_U
 from sprung.benchmarks.generator.laws import LAWS
 from sprung.benchmarks.generator.make import _integrated, make_with_each_missing
 from sprung.benchmarks.several_laws import drawn
-from sprung.model.diagnosis.api import Options
+from sprung.model.diagnosis.rules import RULES
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, load_system
 from sprung.replay.record import load_record
 
@@ -103,7 +103,7 @@ def test_several_laws_are_three_to_five_the_first_two_at_one_element() -> None:
         assert places[0] == places[1] and names[0] != names[1]
         assert len(set(places)) == len(places) - 1
     assert {len(case.effects) for case in cases} == {3, 4, 5}
-    assert Options().most_findings > 5  # one more than there are, to see that there is none
+    assert RULES.acceptance.findings > 5  # one more than there are, to see that there is none
 
 
 @pytest.mark.slow

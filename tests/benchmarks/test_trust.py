@@ -143,8 +143,8 @@ def test_a_kill_that_came_too_late_is_none_and_a_run_goes_on(tmp_path: Path, mon
 
     monkeypatch.setattr(trust, "KILLS", (("late", Late, 1),))
     monkeypatch.setattr(trust, "Zygote", Nobody)
-    first, *_ = trust.run(3, folder=str(tmp_path))
-    second, *_ = trust.run(8, folder=str(tmp_path))
+    first, *_ = trust.run(3, scarce_seconds=0.0, folder=str(tmp_path))
+    second, *_ = trust.run(8, scarce_seconds=0.0, folder=str(tmp_path))
     assert (first["value"], second["value"]) == (3, 8)
     lines = [json.loads(line) for line in (tmp_path / "kills.jsonl").read_text().splitlines()]
     assert [line["number"] for line in lines] == list(range(1, len(lines) + 1))

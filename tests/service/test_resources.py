@@ -54,6 +54,7 @@ def test_a_disk_that_fills_is_not_ready(client: TestClient, monkeypatch: pytest.
         (OperationalError("INSERT", {}, sqlite3.OperationalError("database is locked")), 503),
         (OperationalError("INSERT", {}, sqlite3.OperationalError("attempt to write a readonly database")), 503),
         (MemoryError(), 503),
+        (RuntimeError("can't start new thread"), 503),
         (RuntimeError("a mistake of ours"), 500),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import pytest
@@ -170,3 +171,23 @@ def test_uploads_make_room_oldest_first(store: Store) -> None:
             work.add_recording(connection, row)
         found = retention.forget(connection, retention.RetentionLimits(0, 0, 0, upload_bytes=250))
     assert found.upload_files == ("0.csv", "1.csv", "2.csv")
+
+
+def test_a_round_that_fails_for_whatever_reason_is_not_the_last(
+    store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("sprung.service.housekeeping.PERIOD_SECONDS", 0.01)
+    housekeeping = Housekeeping(Settings(data_dir=tmp_path), store)
+    rounds, twice = [0], threading.Event()
+
+    def once(now: int) -> None:
+        rounds[0] += 1
+        if rounds[0] > 1:
+            twice.set()
+        raise RuntimeError("nobody thought of this")
+
+    monkeypatch.setattr(housekeeping, "once", once)
+    housekeeping.start()
+    assert twice.wait(10)
+    housekeeping.close()
+    assert "tries again" in caplog.text

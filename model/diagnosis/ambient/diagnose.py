@@ -67,7 +67,7 @@ def diagnose_unforced(system: System, prepared: Prepared, record: Recorded, opti
             "lowest mode, above the sensors' noise; lengthen `window`, or measure what excites the structure"
         )
     tell(0.6, "what all windows say together")
-    split = signals.start + options.train_share * signals.samples / signals.sample_rate
+    split = signals.start + options.rules.record.fitted * signals.samples / signals.sample_rate
     first = [w for w in windows if w.end <= split] or windows
     pooled = pool(first if len(first) >= rules.independent else windows, rules)
     held = [w for w in windows if w.begin >= split - 1e-9]

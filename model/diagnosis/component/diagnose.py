@@ -48,7 +48,7 @@ from sprung.model.diagnosis.report.report import (
 )
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
-from sprung.model.laws import CATALOGUE, Law
+from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -105,7 +105,7 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     """
     tell(0.05, "channels, motion and noise")
     pieces, own = pieces_of(options.catalogue)
-    records = component_records(system, record.values, record.sample_rate, options.train_share, options.rules, own)
+    records = component_records(system, record.values, record.sample_rate, options.rules, own)
     judged = []
     for number, one in enumerate(records):
 
@@ -120,11 +120,18 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
 
 
 def pieces_of(catalogue: Sequence[Law]) -> tuple[tuple[Piece, ...], tuple[Law, ...]]:
-    """The pieces of a catalogue's laws, and its laws that are not ours, of which `own` makes pieces where it can."""
+    """The pieces of a catalogue's laws, and the laws that have none, of which `own` makes pieces where it can.
+
+    Of our own laws without a piece, those that do not act at an element or that are nuisances need none.
+    """
     names = {law.name for law in catalogue}
-    return tuple(piece for piece in PIECES if piece.law.name in names), tuple(
-        law for law in catalogue if law not in CATALOGUE
-    )
+    pieced = {law.name for piece in PIECES for law in (piece.law, piece.acting) if law is not None}
+    others = [law for law in catalogue if law not in CATALOGUE or (_of_element(law) and law.name not in pieced)]
+    return tuple(piece for piece in PIECES if piece.law.name in names), tuple(others)
+
+
+def _of_element(law: Law) -> bool:
+    return isinstance(law, ElementLaw) and law.where == "element" and not law.nuisance
 
 
 def _judge(one: ComponentRecord, pieces: tuple[Piece, ...], rules: VerdictRules, tell: Told) -> Judged:

@@ -18,8 +18,8 @@ _KNEES = (0.9, 1.1, 1.3, 1.5, 1.7, 1.9, 2.2)  # over the rate at which tanh turn
 def low_valve(fit: ComponentFit, index: int) -> ComponentFit | None:
     """With the best valve in place of the friction at `index` of a fit; None: none acts there, or it is no friction."""
     piece, task = fit.model.pieces[index], fit.task
-    rival = piece.at_low_rates if isinstance(piece, Piece) else ""
-    valve = next((other for other in PIECES if other.effect == rival), None)
+    rival = piece.at_low_rates if isinstance(piece, Piece) else None
+    valve = next((other for other in PIECES if other.law is rival), None)
     if valve is None:
         return None
     corner, (smoothing,) = task.seen.slowest_corner(task.motion), fit.model.shapes[index]

@@ -104,7 +104,6 @@ def component_records(
     system: System,
     values: FloatArray,
     sample_rate: float,
-    share: float,
     rules: Rules = RULES,
     laws: tuple[Law, ...] = (),
 ) -> list[ComponentRecord]:
@@ -120,7 +119,7 @@ def component_records(
             "supports) and a sensor {kind: force, element: ...} on it"
         )
     names = [channel.name for channel in (*system.channels, *system.signals)]
-    return [_record(system, values, names, sample_rate, e, s, share, rules, laws) for e, s in elements.items()]
+    return [_record(system, values, names, sample_rate, e, s, rules, laws) for e, s in elements.items()]
 
 
 def _record(
@@ -130,7 +129,6 @@ def _record(
     sample_rate: float,
     element: str,
     sensor: str,
-    share: float,
     rules: Rules,
     laws: tuple[Law, ...],
 ) -> ComponentRecord:
@@ -171,7 +169,7 @@ def _record(
     task = ComponentTask(
         motion=motion.with_noise(left.deflection, left.rate),
         force=f[run],
-        split=int(share * (run.stop - run.start)),
+        split=int(rules.record.fitted * (run.stop - run.start)),
         nominal=NominalValues(*(_fixed(system, element, q) for q in ("stiffness", "damping"))),
         rules=rules.component,
         signals=covariates(system, values, sample_rate, element, notes),

@@ -111,7 +111,7 @@ class Piece:
     acting_parameters: Parameters | None = None
     believed: Believed = lambda fitted: True  # whether the record can have shown these values
     imitates: bool = False  # much that is none: it has to leave as little as several laws together
-    at_low_rates: str = ""  # law that is not sought at low rates, since it acts as this one does there
+    at_low_rates: ElementLaw | None = None  # law that is not sought at low rates, since it acts as this one does there
 
     @property
     def dissipates(self) -> bool:

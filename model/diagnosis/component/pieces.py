@@ -22,10 +22,18 @@ from sprung.model.diagnosis.component.piece import (
     Values,
     rates_at,
 )
-from sprung.model.laws import ElementLaw, SpringDamper, find_law, grid
+from sprung.model.laws import ElementLaw, SpringDamper, grid
+from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_ASYMMETRY, DAMPER_BLOWOFF, QUADRATIC_DAMPING
+from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
 from sprung.model.laws.following import Covariate, following_law
+from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
+from sprung.model.laws.gas import GAS_SPRING
+from sprung.model.laws.hysteresis import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
+from sprung.model.laws.lost_motion import FRICTION_BACKLASH, PINCHED_HYSTERESIS
 from sprung.model.laws.paths import stop_path
 from sprung.model.laws.reversals import GAMMA
+from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, PROGRESSIVE_STOP
+from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
 from sprung.model.signals import FloatArray
 
 _SHARPEST = 1e-6  # an exponent this close to 1 is 1
@@ -106,16 +114,9 @@ def _stops(fitted: FittedPiece) -> bool:
     return _held_within(fitted) and bool(hardest > fitted.rules.stops * fitted.element.stiffness)
 
 
-def _wider(name: str) -> ElementLaw:
-    law = _law(name).wider
-    assert law is not None
-    return law
-
-
-def _law(name: str) -> ElementLaw:
-    law = find_law(name)
-    assert isinstance(law, ElementLaw)
-    return law
+def _wider(law: ElementLaw) -> ElementLaw:
+    assert law.wider is not None
+    return law.wider
 
 
 def _yield_words(a: FloatArray, s: Shape, e: SpringDamper) -> Values:
@@ -125,7 +126,7 @@ def _yield_words(a: FloatArray, s: Shape, e: SpringDamper) -> Values:
 # --- friction and hysteresis ------------------------------------------------------------------------------------
 
 _COULOMB = Piece(
-    _law("coulomb_friction"),
+    COULOMB_FRICTION,
     ("smoothing",),
     lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.5, 7)),
     lambda seen: [(1e-3 * seen.rate_rms, 0.8 * seen.rate_rms)],
@@ -134,10 +135,10 @@ _COULOMB = Piece(
     lambda p: (p[1],),
     lambda a, s, e: {"breakaway_force": (a[0], "N")},
     kind=FRICTION,
-    at_low_rates="damper_blowoff",
+    at_low_rates=DAMPER_BLOWOFF,
 )
 _STRIBECK = Piece(
-    _law("stribeck"),
+    STRIBECK,
     ("smoothing", "stribeck_rate"),
     lambda seen: grid(seen.rate_rms * np.geomspace(0.005, 0.2, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 4)),
     lambda seen: [(1e-3 * seen.rate_rms, 0.5 * seen.rate_rms), (0.01 * seen.rate_rms, 1.5 * seen.rate_rms)],
@@ -150,7 +151,7 @@ _STRIBECK = Piece(
     believed=_falls,
 )
 _DAHL = Piece(
-    _law("dahl"),
+    DAHL,
     ("yield_displacement",),
     lambda seen: grid(_yields(seen)),
     lambda seen: [_yield_limits(seen)],
@@ -162,7 +163,7 @@ _DAHL = Piece(
     plain=1,
 )
 _LUGRE = Piece(
-    _law("lugre"),
+    LUGRE,
     ("yield_displacement", "stribeck_rate", "excess"),
     lambda seen: grid(
         seen.travel * np.geomspace(0.004, 0.3, 4), seen.rate_rms * np.geomspace(0.05, 0.8, 3), [0.3, 1.5]
@@ -190,7 +191,7 @@ def _loop_shape(p: Sequence[float]) -> tuple[float, ...]:
 
 
 _BOUC_WEN = Piece(
-    _law("bouc_wen"),
+    BOUC_WEN,
     ("yield_displacement", "n"),
     lambda seen: grid(_yields(seen), [1.0, 2.0]),
     lambda seen: [_yield_limits(seen), (1.0, 8.0)],
@@ -201,7 +202,7 @@ _BOUC_WEN = Piece(
     kind=HYSTERESIS,
 )
 _FREE_BOUC_WEN = Piece(
-    _wider("bouc_wen"),
+    _wider(BOUC_WEN),
     ("yield_displacement", "n", "gamma"),
     lambda seen: grid(_yields(seen)[::2], [1.0], [-0.6, 0.0, 1.5]),
     lambda seen: [_yield_limits(seen), (1.0, 8.0), (-0.95, 4.0)],
@@ -212,7 +213,7 @@ _FREE_BOUC_WEN = Piece(
     kind=HYSTERESIS,
 )
 _PINCHED = Piece(
-    _law("pinched_hysteresis"),
+    PINCHED_HYSTERESIS,
     ("yield_displacement", "pinching_width"),
     lambda seen: grid(seen.travel * np.geomspace(0.01, 0.4, 5), seen.travel * np.array([0.1, 0.25, 0.5])),
     lambda seen: [_yield_limits(seen), (0.03 * seen.travel, 1.0 * seen.travel)],
@@ -231,7 +232,7 @@ def _inner(a: FloatArray, s: Shape) -> float:
 
 
 _BACKLASH = Piece(
-    _wider("friction_backlash"),
+    _wider(FRICTION_BACKLASH),
     ("gap", "reach"),
     lambda seen: grid(seen.travel * np.geomspace(0.02, 0.9, 7), seen.travel * np.geomspace(0.01, 0.5, 6)),
     lambda seen: [(2e-3 * seen.travel, 1.8 * seen.travel), (1e-3 * seen.travel, 1.5 * seen.travel)],
@@ -245,9 +246,9 @@ _BACKLASH = Piece(
 
 # --- dampers ----------------------------------------------------------------------------------------------------
 
-_QUADRATIC = Piece(_law("quadratic_damping"), (), _none, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
+_QUADRATIC = Piece(QUADRATIC_DAMPING, (), _none, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
 _BLOWOFF = Piece(
-    _law("damper_blowoff"),
+    DAMPER_BLOWOFF,
     ("knee",),
     lambda seen: grid(rates_at(seen, [0.2, 0.35, 0.5, 0.65, 0.8, 0.9])),
     lambda seen: [_knee_limits(seen)],
@@ -258,7 +259,7 @@ _BLOWOFF = Piece(
     believed=_opens_late_enough,
 )
 _TWO_KNEES = Piece(
-    _wider("damper_blowoff"),
+    _wider(DAMPER_BLOWOFF),
     ("knee", "knee_compression"),
     lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7]), rates_at(seen, [0.2, 0.4, 0.7])),
     lambda seen: [_knee_limits(seen)] * 2,
@@ -269,7 +270,7 @@ _TWO_KNEES = Piece(
     believed=_opens_late_enough,
 )
 _ASYMMETRY = Piece(
-    _law("damper_asymmetry"),
+    DAMPER_ASYMMETRY,
     (),
     _none,
     lambda seen: [],
@@ -279,7 +280,7 @@ _ASYMMETRY = Piece(
     believed=lambda fitted: abs(fitted.values["a"]) <= 1.0,
 )
 _ASYMMETRY_OF_VALVES = Piece(
-    _wider("damper_asymmetry"),
+    _wider(DAMPER_ASYMMETRY),
     ("knee",),
     lambda seen: grid(rates_at(seen, [0.2, 0.4, 0.7])),
     lambda seen: [_knee_limits(seen)],
@@ -290,7 +291,7 @@ _ASYMMETRY_OF_VALVES = Piece(
     believed=lambda fitted: _opens_late_enough(fitted) and abs(fitted.values["a"]) <= 1.0,
 )
 _SERIES = Piece(
-    _law("series_stiffness"),
+    SERIES_STIFFNESS,
     ("tau",),
     lambda seen: grid(np.geomspace(2 * seen.step, 0.1 * seen.seconds, 9)),
     lambda seen: [(0.5 * seen.step, seen.seconds)],
@@ -298,14 +299,14 @@ _SERIES = Piece(
     lambda a, s, e: (a[0],),
     lambda p: (0.1,),
     lambda a, s, e: {"relaxation_time": (s[0], "s")},
-    acting=_law("air_spring"),  # the branch of spring and damper in series, with a damper beside it that is free
+    acting=AIR_SPRING,  # the branch of spring and damper in series, with a damper beside it that is free
     acting_parameters=lambda a, s, e: (a[0], s[0]),
 )
 
 # --- springs ----------------------------------------------------------------------------------------------------
 
 _CUBIC = Piece(
-    _law("cubic_stiffness"),
+    CUBIC_STIFFNESS,
     (),
     _none,
     lambda seen: [],
@@ -315,7 +316,7 @@ _CUBIC = Piece(
     kind=ELASTIC,
 )
 _CUBIC_OFF_CENTRE = Piece(
-    _wider("cubic_stiffness"),
+    _wider(CUBIC_STIFFNESS),
     (),
     _none,
     lambda seen: [],
@@ -328,7 +329,7 @@ _CUBIC_OFF_CENTRE = Piece(
     imitates=True,
 )
 _BUMP_STOP = Piece(
-    _law("bump_stop"),
+    BUMP_STOP,
     ("gap",),
     lambda seen: grid(seen.travel * np.array([0.3, 0.5, 0.65, 0.8, 0.9])),
     lambda seen: [(0.1 * seen.travel, 0.97 * seen.travel)],
@@ -339,7 +340,7 @@ _BUMP_STOP = Piece(
     believed=_held_within,
 )
 _TWO_STOPS = Piece(
-    _wider("bump_stop"),
+    _wider(BUMP_STOP),
     ("gap", "gap_compression"),
     lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.7, 0.85])] * 2),
     lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2,
@@ -352,7 +353,7 @@ _TWO_STOPS = Piece(
     imitates=True,
 )
 _PROGRESSIVE_STOP = Piece(
-    _law("progressive_stop"),
+    PROGRESSIVE_STOP,
     ("gap", "gap_compression", "exponent"),
     lambda seen: grid(*[seen.travel * np.array([0.3, 0.5, 0.75])] * 2, [1.5, 2.5]),
     lambda seen: [(0.25 * seen.travel, 0.97 * seen.travel)] * 2 + [(1.0, 3.5)],  # nearer, it is a progressive spring
@@ -365,7 +366,7 @@ _PROGRESSIVE_STOP = Piece(
     imitates=True,
 )
 _CLEARANCE = Piece(
-    _law("clearance"),
+    CLEARANCE,
     ("gap",),
     lambda seen: grid(seen.travel * np.array([0.05, 0.1, 0.2, 0.35, 0.55, 0.75])),
     lambda seen: [(0.01 * seen.travel, 0.9 * seen.travel)],
@@ -376,7 +377,7 @@ _CLEARANCE = Piece(
     believed=_loose_within,
 )
 _GAS_SPRING = Piece(
-    _law("gas_spring"),
+    GAS_SPRING,
     ("length",),
     lambda seen: grid(seen.travel * np.array([1.3, 2.0, 4.0, 10.0])),
     lambda seen: [(1.1 * seen.travel, 30.0 * seen.travel)],
@@ -388,7 +389,7 @@ _GAS_SPRING = Piece(
 )
 
 _FRACTIONAL = Piece(
-    _law("fractional_stiffness"),
+    FRACTIONAL_STIFFNESS,
     ("order",),
     lambda seen: grid([0.1, 0.2, 0.35, 0.55]),
     lambda seen: [(0.03, 0.9)],
@@ -401,9 +402,9 @@ _FRACTIONAL = Piece(
 # --- drift ------------------------------------------------------------------------------------------------------
 
 
-def _drift(effect: str, quantity: str) -> Piece:
+def _drift(law: ElementLaw, quantity: str) -> Piece:
     return Piece(
-        _law(effect),
+        law,
         ("tau",),
         lambda seen: grid(seen.seconds * np.array([0.1, 0.3, 1.0])),
         lambda seen: [(0.03 * seen.seconds, 3.0 * seen.seconds)],
@@ -438,8 +439,8 @@ PIECES: tuple[Piece, ...] = (
     _CLEARANCE,
     _GAS_SPRING,
     _FRACTIONAL,
-    _drift("time_varying_stiffness", "stiffness"),
-    _drift("time_varying_damping", "damping"),
+    _drift(TIME_VARYING_STIFFNESS, "stiffness"),
+    _drift(TIME_VARYING_DAMPING, "damping"),
 )
 
 # --- what follows a measured signal -----------------------------------------------------------------------------

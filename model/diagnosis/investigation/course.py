@@ -44,9 +44,6 @@ class Options:
     project: bool = True  # take out of every candidate what the nominal parameters can imitate
     multiplicity: bool = True  # account for the number of candidates tried
     held_out: bool = True  # accept a finding only if it improves the part that no fit saw
-    alpha: float = 1e-3  # chance of a false finding per recording before the held-out check
-    train_share: float = 0.7  # of the recording, from its start
-    most_findings: int = 6
     unnamed: bool = True  # whether forces without a name, and their formulas, are sought, too
     file: str = ""  # name of the recording, for the report
     catalogue: tuple[Law, ...] = CATALOGUE

@@ -71,7 +71,7 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
     """Finding after finding until the rest is noise."""
     # what a delay, scale or position leaves, estimated as it is, is no physics
     uncertain = any(fault.value is not None for fault in state.setup_faults)
-    for number in range(len(state.found), 0 if uncertain else state.options.most_findings):
+    for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
         state = _next_finding(state, number, tell)
         if state.problem.worked_out:
@@ -122,7 +122,7 @@ def begun(system: System, record: Recorded, options: Options, tell: Progress) ->
     tell(0.02, "channels and noise")
     options = replace(options, work=options.work or WorkBudget(options.rules.fit.work))
     prepared = prepare(system, system.undistorted(record.values), record.sample_rate, options.rules.record)
-    signals, split = cut(prepared.signals, options.train_share)
+    signals, split = cut(prepared.signals, options.rules.record.fitted)
     declared = declared_noise(system, signals, options.rules.record)
     tell(0.05, "nominal structure identified again; screening all laws at all places")
     start = nominal(system, signals, declared, split, options)
@@ -166,7 +166,7 @@ def _without_input_faults(
     faults: list[InputFault] = []
     doubts: list[str] = []
     for _ in range(options.rules.acceptance.input_faults):
-        hit = best_input_fault(start.screening, options.alpha)
+        hit = best_input_fault(start.screening, options.rules.acceptance.alpha)
         if hit is None:
             break
         tell(0.25, f"input channel {hit.location}")
@@ -210,7 +210,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
 
     error = float(np.sqrt(np.mean(misfit(state.fit))))
     gross = not state.problem.process_noise and error > options.rules.selection.gross
-    hits = new(shortlist(state.last, options.alpha, options.multiplicity, options.rules, gross=gross))
+    hits = new(shortlist(state.last, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross))
     if hits or act_together(state):
         state = tried_wider(state)
     wide = widest(state)
@@ -240,7 +240,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         return state
     tests = state.last.tried(chosen.hit.family) if options.multiplicity else 1
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
-    if p_value > options.alpha:
+    if p_value > options.rules.acceptance.alpha:
         return state
     second = runner_up(state.problem, state.fit, new(state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
@@ -326,7 +326,7 @@ def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
     for force in forces:
         if not force.named and leader.gain < rules.says * force.gain:
             luck = chance(force.gain - leader.gain, max(1, force.freedom - leader.freedom), 1)
-            return force if luck < state.options.alpha else None
+            return force if luck < state.options.rules.acceptance.alpha else None
     follows = any(leader is one for one in forces) and missing(state.problem, leader.fit) > rules.missing
     return leader if follows else None
 

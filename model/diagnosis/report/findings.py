@@ -17,7 +17,6 @@ from sprung.model.diagnosis.rules import ReportRules
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
-from sprung.model.signals import FloatArray
 
 
 def findings_of(outcome: Outcome) -> list[Finding]:
@@ -64,7 +63,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
     course, findings = outcome.investigation, []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[course.given + index]
-        parameters, block = _free(term, *law_parameters(outcome.final, course.given + index))
+        parameters = _free(term, law_parameters(outcome.final, course.given + index))
         rival = found.runner_up
         family, advice = _look_alikes(found, course.options.rules.report)
         finding = Finding(
@@ -77,7 +76,6 @@ def _physics(outcome: Outcome) -> list[Finding]:
             runner_up_location=None if rival is None else rival.term.location,
             family=family,
             advice=advice,
-            parameter_covariance=block,
             look_alikes=_beaten(found),
             formula=formula_of(term)[0],
             memory=formula_of(term)[1],
@@ -86,14 +84,11 @@ def _physics(outcome: Outcome) -> list[Finding]:
     return findings
 
 
-def _free(
-    term: Term, parameters: tuple[LawParameter, ...], block: FloatArray
-) -> tuple[tuple[LawParameter, ...], FloatArray]:
-    """Parameters and their covariance without those that nothing depends on: where a body that only heaves is held."""
-    if not parameters or not any(term.fixed):
-        return parameters, block
-    free = [i for i, fixed in enumerate(term.fixed) if not fixed]
-    return tuple(parameters[i] for i in free), block[np.ix_(free, free)]
+def _free(term: Term, parameters: tuple[LawParameter, ...]) -> tuple[LawParameter, ...]:
+    """Parameters without those that nothing depends on: where a body that only heaves is held."""
+    if not any(term.fixed):
+        return parameters
+    return tuple(one for one, fixed in zip(parameters, term.fixed, strict=True) if not fixed)
 
 
 def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:

@@ -111,7 +111,6 @@ class Finding:
     family: str | None = None  # where no single law beats its look-alikes
     advice: str | None = None  # what would separate the look-alikes
     sentence: str = ""
-    parameter_covariance: NDArray[np.float64] | None = None  # of `parameters`, shape (p, p)
     quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
     # evidence by which it beats each law that similar data may suggest and that was fitted
     look_alikes: Mapping[str, float] = field(default_factory=dict)

@@ -52,13 +52,13 @@ def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ..
     return tuple(values)
 
 
-def law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], FloatArray]:
+def law_parameters(fit: Fit, index: int) -> tuple[LawParameter, ...]:
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
     sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), SIMULATED * np.abs(term.parameters))
     hidden = not term.law.named
     units = {channel.name: channel.unit for channel in fit.forward.system.channels}
-    parameters = tuple(
+    return tuple(
         LawParameter(
             spec.name,
             float(value),
@@ -68,7 +68,6 @@ def law_parameters(fit: Fit, index: int) -> tuple[tuple[LawParameter, ...], Floa
         for spec, value, s in zip(term.law.parameters, term.parameters, sigma, strict=True)
         if not hidden
     )
-    return parameters, block
 
 
 def _with_corner(fit: Fit, term: Term, covariance: FloatArray) -> FloatArray:

@@ -25,7 +25,7 @@ def deviations(seed: int, motion: str) -> list[float]:
     again.uniform(size=3)  # spring, damper and preload of the bench
     truth = rig.made(again).truth
     record = naming.measured(d, force, None, random)
-    task = component_records(naming.BENCH, record.values, naming.RATE, 0.7, RULES)[0].task
+    task = component_records(naming.BENCH, record.values, naming.RATE, RULES)[0].task
     fit = refined(task, ComponentModel((LUGRE,), ((truth["yield_displacement"], 0.03, 0.5),)))
     full, names = covariance(fit)
     stated = spread(fit, 0, full + left_open(fit), names)[1]

@@ -23,5 +23,5 @@ def test_an_offset_is_told_in_the_unit_of_its_channel(law: str, unit: str) -> No
         covariance=np.eye(1),
         forward=SimpleNamespace(system=quarter_car()),
     )
-    parameters, _ = law_parameters(fit, 0)
+    parameters = law_parameters(fit, 0)
     assert [one.unit for one in parameters] == [unit]

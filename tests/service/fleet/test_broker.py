@@ -17,6 +17,7 @@ from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System
 from sprung.service.engine import Engine
+from sprung.service.errors import UserError
 from sprung.service.fleet import broker as module
 from sprung.service.fleet.broker import Broker, BrokerMessage, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
@@ -147,6 +148,7 @@ def nats_server(tmp_path: Path) -> Iterator[tuple[str, Callable[[], None]]]:
 
     def start() -> None:
         command = [program, "-a", "127.0.0.1", "-p", str(port), "-js", "-sd", str(tmp_path / "nats")]
+        command += ["--user", "sprung", "--pass", "secret"]
         running.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
         for _ in range(200):
             try:
@@ -161,7 +163,7 @@ def nats_server(tmp_path: Path) -> Iterator[tuple[str, Callable[[], None]]]:
         start()
 
     start()
-    yield f"nats://127.0.0.1:{port}", kill_and_start
+    yield f"nats://sprung:secret@127.0.0.1:{port}", kill_and_start
     running[-1].kill()
     running[-1].wait()
 
@@ -198,6 +200,16 @@ def test_nats_keeps_messages_over_kills_of_both_sides(
     asyncio.run(until(opened, ingest, counts, lambda: counts.messages >= 4))
     assert pipeline.state("north-1").used == 40
     assert counts.messages == 4  # each once: the server dropped what was published twice
+
+
+def test_who_has_no_password_is_not_let_in_and_no_line_shows_one(
+    nats_server: tuple[str, Callable[[], None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sprung.service.fleet.nats_broker.FIRST_ANSWER_SECONDS", 2.0)
+    for address in (nats_server[0].replace("secret", "guessed"), nats_server[0].replace("sprung:secret@", "")):
+        with pytest.raises(UserError, match="Authorization Violation") as refused:
+            asyncio.run(NatsBroker.open(address, 1.0))
+        assert "guessed" not in str(refused.value)
 
 
 def test_a_message_comes_again_before_those_behind_it_stop_waiting() -> None:
