@@ -46,7 +46,7 @@ def missing() -> str:
     return tried.stderr.strip()
 
 
-class Watched:
+class ScarceService:
     """A service on a small disk, whose windows and health are asked for in rounds."""
 
     def __init__(self, folder: Path, ride: RestlessRide) -> None:
@@ -109,7 +109,7 @@ class Watched:
 
 
 @contextmanager
-def disk_full(watched: Watched) -> Iterator[None]:
+def disk_full(watched: ScarceService) -> Iterator[None]:
     """Every byte of its disk taken."""
     filler = watched.data / "filler"
     with suppress(OSError), open(filler, "wb", buffering=0) as file:
@@ -123,7 +123,7 @@ def disk_full(watched: Watched) -> Iterator[None]:
 
 
 @contextmanager
-def locked(watched: Watched) -> Iterator[None]:
+def locked(watched: ScarceService) -> Iterator[None]:
     """Another process writes to the store and does not end."""
     command = watched.inside(LOCK)
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as other:
@@ -134,25 +134,25 @@ def locked(watched: Watched) -> Iterator[None]:
 
 
 @contextmanager
-def _limited(watched: Watched, kind: int, value: int) -> Iterator[None]:
+def _limited(watched: ScarceService, kind: int, value: int) -> Iterator[None]:
     before = resource.prlimit(watched.pid, kind)
     resource.prlimit(watched.pid, kind, (value, before[1]))
     yield
     resource.prlimit(watched.pid, kind, before)
 
 
-def few_files(watched: Watched) -> AbstractContextManager[None]:
+def few_files(watched: ScarceService) -> AbstractContextManager[None]:
     """A few more files may be opened."""
     highest = max(int(path.name) for path in Path(f"/proc/{watched.pid}/fd").iterdir())
     return _limited(watched, resource.RLIMIT_NOFILE, highest + 1 + SPARE_FILES)
 
 
-def no_files(watched: Watched) -> AbstractContextManager[None]:
+def no_files(watched: ScarceService) -> AbstractContextManager[None]:
     """No file can be opened: not even a connection accepted."""
     return _limited(watched, resource.RLIMIT_NOFILE, 3)
 
 
-def little_memory(watched: Watched) -> AbstractContextManager[None]:
+def little_memory(watched: ScarceService) -> AbstractContextManager[None]:
     """The process may not grow any more."""
     lines = Path(f"/proc/{watched.pid}/status").read_text().splitlines()
     (kilobytes,) = (int(line.split()[1]) for line in lines if line.startswith("VmData"))
@@ -173,7 +173,7 @@ store = sqlite3.connect(sys.argv[1])
 starts = [row[0] for row in store.execute("SELECT start_ns FROM windows")]
 print(json.dumps({"starts": starts, "integrity": store.execute("PRAGMA integrity_check").fetchone()[0]}))
 """
-Scarcity = Callable[[Watched], AbstractContextManager[None]]
+Scarcity = Callable[[ScarceService], AbstractContextManager[None]]
 SCARCITIES: dict[str, Scarcity] = {
     "disk full": disk_full,
     "store locked": locked,
@@ -188,7 +188,7 @@ def scarcity(folder: Path, seconds: float) -> Iterator[dict[str, Any]]:
     if reason := missing():
         yield {"figure": "scarcity", "value": None, "skipped": f"no disk of its own: {reason}"}
         return
-    watched = Watched(folder / "scarce", RestlessRide())
+    watched = ScarceService(folder / "scarce", RestlessRide())
     with watched.served as served:
         served.ready()
         for name, taken in SCARCITIES.items():
@@ -219,7 +219,7 @@ def scarcity(folder: Path, seconds: float) -> Iterator[dict[str, Any]]:
         }
 
 
-def _back(watched: Watched) -> float | None:
+def _back(watched: ScarceService) -> float | None:
     """Seconds until all is well again; None: it is not."""
     begun = time.monotonic()
     while time.monotonic() - begun < BACK_SECONDS and watched.served.process.alive:
