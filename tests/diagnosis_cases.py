@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +16,7 @@ from sprung.model.system import System, parse_system
 STIFFNESS = {"primary": 2.2e6, "secondary": 4.6e5}
 DAMPING = {"primary": 1.1e4, "secondary": 1.8e4}
 FINE = 10  # steps per sample
+Force = Callable[[float, float], float]  # of deflection, m, and rate, m/s; N
 
 
 def quarter_car() -> System:
@@ -29,7 +31,9 @@ class MadeRecord:
     extra: dict = field(default_factory=dict)
 
 
-def simulate(law=None, *, seconds: float = 20.0, seed: int = 0, noise: float = 1.0, level: float = 1.0) -> MadeRecord:
+def simulate(
+    law: Force | None = None, *, seconds: float = 20.0, seed: int = 0, noise: float = 1.0, level: float = 1.0
+) -> MadeRecord:
     """Columns wheel displacement, velocity, four accelerations; `law(d, v)` adds a force to the secondary element.
 
     Road of random phases from 0.5 to 18 Hz, Runge-Kutta at 1 kHz, every channel low-passed at 42 Hz alike, decimated.
@@ -56,14 +60,14 @@ def _road(time: np.ndarray, phase: np.ndarray, level: float) -> tuple[np.ndarray
     return road, slope
 
 
-def _quarter_car(law, w: list[float], dw: list[float], h: float) -> np.ndarray:
+def _quarter_car(law: Force, w: list[float], dw: list[float], h: float) -> np.ndarray:
     """Accelerations of car and bogie, (T, 2), by Runge-Kutta; w, dw: the road at every half step.
 
     In plain numbers, one after the other: arrays of two are slower by a factor of ten.
     """
     k1, c1, k2, c2 = STIFFNESS["primary"], DAMPING["primary"], STIFFNESS["secondary"], DAMPING["secondary"]
 
-    def accelerations(z1, z2, v1, v2, i):
+    def accelerations(z1: float, z2: float, v1: float, v2: float, i: int) -> tuple[float, float]:
         upper = k2 * (z1 - z2) + c2 * (v1 - v2) + law(z1 - z2, v1 - v2)
         return -upper / 8000, (upper - k1 * (z2 - w[i]) - c1 * (v2 - dw[i])) / 1300
 

@@ -2,6 +2,9 @@
 
 import json
 from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -12,8 +15,9 @@ from mcap.writer import CompressionType, Writer
 from mcap_protobuf.writer import Writer as ProtobufWriter
 from mcap_ros2.writer import Writer as Ros2Writer
 
-from sprung.model.signals import Channel
+from sprung.model.signals import Channel, FloatArray, IntArray
 from sprung.replay import open_recording
+from sprung.replay.recording import Recording
 
 START = 1_790_000_000_000_000_000
 STEP = 10_000_000
@@ -26,13 +30,22 @@ NUMBERS = np.arange(ROWS)
 LEFT, RIGHT = np.round(np.sin(NUMBERS / 7.0), 3), np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
 VALUES = np.stack([LEFT, RIGHT], axis=1)
 TIMES = START + NUMBERS * STEP
+Samples = dict[int, tuple[IntArray, FloatArray]]  # of each channel: times, ns, and values
 
 
-def document(row):
+def document(row: int) -> dict[str, Any]:
     return {"left": LEFT[row], "axes": [{"right": 0.0}, {"right": RIGHT[row]}]}
 
 
-def write_json(path, *, chunk=4096, compression=CompressionType.ZSTD, close=True, chunked=True, crcs=True):
+def write_json(
+    path: Path,
+    *,
+    chunk: int = 4096,
+    compression: CompressionType = CompressionType.ZSTD,
+    close: bool = True,
+    chunked: bool = True,
+    crcs: bool = True,
+) -> None:
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk, compression=compression, use_chunking=chunked, enable_crcs=crcs)
         writer.start()
@@ -49,7 +62,7 @@ def write_json(path, *, chunk=4096, compression=CompressionType.ZSTD, close=True
             writer.finish()
 
 
-def protobuf_class():
+def protobuf_class() -> Any:
     """message Body { Timestamp timestamp; double left; repeated Axis axes; }"""
     file = descriptor_pb2.FileDescriptorProto(name="body.proto", package="t", syntax="proto3")
     file.dependency.append("google/protobuf/timestamp.proto")
@@ -67,7 +80,7 @@ def protobuf_class():
     return message_factory.GetMessageClass(pool.FindMessageTypeByName("t.Body"))
 
 
-def write_protobuf(path):
+def write_protobuf(path: Path) -> None:
     kind = protobuf_class()
     with path.open("wb") as file, ProtobufWriter(file) as writer:
         for row in range(ROWS):
@@ -94,7 +107,7 @@ float32 right
 """
 
 
-def write_ros2(path, stamped=True):
+def write_ros2(path: Path, stamped: bool = True) -> None:
     with path.open("wb") as file:
         writer = Ros2Writer(file)
         schema = writer.register_msgdef("test_msgs/Body", ROS_BODY)
@@ -106,14 +119,14 @@ def write_ros2(path, stamped=True):
         writer.finish()
 
 
-def database():
+def database() -> Database:
     conversion = BaseConversion.factory(scale=0.001, offset=0)
     wide = {"is_signed": True, "conversion": conversion, "minimum": -30, "maximum": 30}
     signals = [Signal("Left", 0, 16, **wide), Signal("Right", 23, 16, byte_order="big_endian", **wide)]
     return Database([Message(0x310, "Body", 8, signals)])
 
 
-def frame(row, frame_id=0x310, **options):
+def frame(row: int, frame_id: int = 0x310, **options: Any) -> can.Message:
     data = database_message.encode({"Left": LEFT[row], "Right": RIGHT[row]})
     return can.Message(
         timestamp=int(TIMES[row]) / 1e9, arbitration_id=frame_id, is_extended_id=False, data=data, **options
@@ -123,7 +136,7 @@ def frame(row, frame_id=0x310, **options):
 database_message = database().messages[0]
 
 
-def write_can(path):
+def write_can(path: Path) -> None:
     """Every tenth cycle brings a frame of another id, an extended one, a remote frame and an error frame."""
     with can.Logger(str(path)) as logger:
         for row in range(ROWS):
@@ -137,12 +150,14 @@ def write_can(path):
                 logger.on_message_received(remote)
 
 
-def write_csv(path):
+def write_csv(path: Path) -> None:
     rows = [f"{NUMBERS[i] / 100:.2f},{RIGHT[i]},{LEFT[i]},x" for i in range(ROWS)]
     path.write_text("\n".join(["time,right,left,note", *rows]) + "\n")
 
 
-def read(path, dbc=None, channels=CHANNELS, **options):
+def read(
+    path: Path, dbc: Path | Database | None = None, channels: Sequence[Channel] = CHANNELS, **options: Any
+) -> tuple[Recording, Samples]:
     """(recording, {channel: (times, values)})."""
     recording = open_recording(path, channels, dbc=dbc, **options)
     parts = defaultdict(list)
@@ -156,7 +171,18 @@ def read(path, dbc=None, channels=CHANNELS, **options):
     }
 
 
-def uff58(node, direction, values, *, kind=4, even=True, binary=None, date="NONE", unit="N", times=NUMBERS / 100):
+def uff58(
+    node: int,
+    direction: int,
+    values: FloatArray,
+    *,
+    kind: int = 4,
+    even: bool = True,
+    binary: str | None = None,
+    date: str = "NONE",
+    unit: str = "N",
+    times: FloatArray = NUMBERS / 100,
+) -> bytes:
     """One dataset 58 as its definition has it."""
     head = [
         f"    58{'' if binary is None else 'b'}",

@@ -2,6 +2,7 @@
 
 import pickle
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +46,7 @@ sensors:
 """
 
 
-def test_the_vehicle_has_the_sizes_of_the_paper():
+def test_the_vehicle_has_the_sizes_of_the_paper() -> None:
     system = load_system()
     A, B, C, D = system.mechanics.matrices()
     assert A.shape == (18, 18)
@@ -59,7 +60,7 @@ def test_the_vehicle_has_the_sizes_of_the_paper():
     assert system.hop == 50
 
 
-def test_modes_of_the_vehicle_are_the_known_ones():
+def test_modes_of_the_vehicle_are_the_known_ones() -> None:
     system = load_system()
     modes = system.mechanics.modes(system.bodies)
     assert np.allclose(
@@ -69,7 +70,7 @@ def test_modes_of_the_vehicle_are_the_known_ones():
     assert all("bogie" in mode.body for mode in modes[3:])
 
 
-def test_damping_ratios_are_those_of_the_undamped_energies():
+def test_damping_ratios_are_those_of_the_undamped_energies() -> None:
     system = load_system()
     A, *_ = system.mechanics.matrices(damping=1e-6 * system.mechanics.damping)
     light = np.sort(np.abs(np.linalg.eigvals(A)))[::2]
@@ -78,7 +79,7 @@ def test_damping_ratios_are_those_of_the_undamped_energies():
     assert np.allclose(light, undamped, rtol=1e-5)
 
 
-def test_matrices_are_linear_in_the_element_values():
+def test_matrices_are_linear_in_the_element_values() -> None:
     mechanics = load_system().mechanics
     rng = np.random.default_rng(0)
     k, c = rng.uniform(1, 2, (2, 12)), rng.uniform(1, 2, (2, 12))
@@ -89,7 +90,7 @@ def test_matrices_are_linear_in_the_element_values():
         assert np.allclose(one + two - none, both)
 
 
-def test_a_single_oscillator_has_its_closed_form_mode():
+def test_a_single_oscillator_has_its_closed_form_mode() -> None:
     system = parse_system(OSCILLATOR)
     (mode,) = system.mechanics.modes(system.bodies)
     assert mode.frequency == pytest.approx(20 / (2 * np.pi))
@@ -97,7 +98,7 @@ def test_a_single_oscillator_has_its_closed_form_mode():
     assert [p.name for p in system.parameters] == ["spring.stiffness", "spring.damping", "mass.mass"]
 
 
-def test_addresses_and_comments_do_not_change_the_digest_and_values_do():
+def test_addresses_and_comments_do_not_change_the_digest_and_values_do() -> None:
     assert parse_system(TEXT.replace("mcap: /car/", "mcap: /wagon/")).digest == load_system().digest
     assert parse_system(TEXT.replace("mass: 32000", "mass: 32001")).digest != load_system().digest
 
@@ -125,20 +126,20 @@ def test_addresses_and_comments_do_not_change_the_digest_and_values_do():
         ("stiffness: 1.22e+6", "stiffness: .inf", r"finite number"),
     ],
 )
-def test_a_wrong_file_is_one_line_that_names_line_and_key(old, new, message):
+def test_a_wrong_file_is_one_line_that_names_line_and_key(old: str, new: str, message: str) -> None:
     with pytest.raises(SystemFileError, match=message) as caught:
         parse_system(TEXT.replace(old, new, 1))
     assert "\n" not in str(caught.value)
 
 
-def test_sensors_that_miss_a_body_are_refused_by_its_name():
+def test_sensors_that_miss_a_body_are_refused_by_its_name() -> None:
     blind = re.sub(r"  bogie1_\d[lr]: \{kind.*\n", "", TEXT)
     blind = re.sub(r"  (bogie2_\d[lr]|car_1r|car_2[lr]): \{kind.*\n", "", blind)
     with pytest.raises(SystemFileError, match=r"sensors: no sensor sees the .* Hz mode of"):
         parse_system(blind)
 
 
-def test_a_missing_file_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(SystemFileError, match=r"nowhere.yaml: cannot read"):
         load_system(tmp_path / "nowhere.yaml")
 

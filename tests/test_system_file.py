@@ -2,6 +2,7 @@
 
 import json
 from datetime import date
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -35,19 +36,19 @@ sensors:
 """
 
 
-def problems(text):
+def problems(text: str) -> tuple[str, ...]:
     with pytest.raises(SystemFileError) as caught:
         parse_system(text, "rig.yaml")
     assert "\n" not in str(caught.value)
     return caught.value.problems
 
 
-def converted(system, name, recorded):
+def converted(system: System, name: str, recorded: float) -> float:
     channel = next(c for c in system.channels if c.name == name)
     return channel.gain * recorded + channel.offset
 
 
-def test_recorded_numbers_become_si_by_scale_offset_sign_and_unit():
+def test_recorded_numbers_become_si_by_scale_offset_sign_and_unit() -> None:
     system = parse_system(RIG)
     assert converted(system, "rod.displacement", 12.0) == pytest.approx(0.012)
     assert converted(system, "top", 1.0) == 9.80665
@@ -80,11 +81,11 @@ def test_recorded_numbers_become_si_by_scale_offset_sign_and_unit():
         ("msec", "s", 1e-3),
     ],
 )
-def test_units_are_what_the_standards_say(unit, si, one):
+def test_units_are_what_the_standards_say(unit: str, si: str, one: float) -> None:
     assert to_si(unit, si, None, 0.0, 1) == (pytest.approx(one, rel=1e-12), 0.0)
 
 
-def test_every_unit_of_the_tables_is_found_by_its_own_name():
+def test_every_unit_of_the_tables_is_found_by_its_own_name() -> None:
     for si, names in FACTORS.items():
         assert names[si] == 1.0
         for name, factor in names.items():
@@ -94,7 +95,7 @@ def test_every_unit_of_the_tables_is_found_by_its_own_name():
     assert to_si("K", "degC", None, 0.0, 1) == (1.0, -273.15)
 
 
-def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale():
+def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale() -> None:
     with pytest.raises(UnitError, match=r"'mm' is no unit of N; known are N, mN"):
         to_si("mm", "N", None, 0.0, 1)
     with pytest.raises(UnitError, match=r"did you mean 'kN'"):
@@ -104,7 +105,7 @@ def test_a_unit_of_something_else_is_refused_and_volts_need_a_scale():
     assert to_si("mV", "N", 2000.0, 5.0, -1) == (-2.0, -5.0)
 
 
-def test_a_rate_sensor_measures_the_degree_of_freedom_that_turns():
+def test_a_rate_sensor_measures_the_degree_of_freedom_that_turns() -> None:
     mechanics = parse_system(RIG).mechanics
     _, _, C, D = mechanics.matrices()
     rate = {dof: mechanics.n + i for i, dof in enumerate(mechanics.dofs)}
@@ -116,7 +117,7 @@ def test_a_rate_sensor_measures_the_degree_of_freedom_that_turns():
     assert line.endswith("sensors.pitches.body: mass has no pitch_inertia, so it does not pitch")
 
 
-def test_time_of_tables_has_a_column_a_unit_and_an_epoch():
+def test_time_of_tables_has_a_column_a_unit_and_an_epoch() -> None:
     time = parse_system(RIG).time
     assert (time.name, time.seconds, time.rate) == ("Zeit", 1e-3, None)
     assert time.epoch == 1_790_000_000_000_000_000 - 800 * 10**9
@@ -126,7 +127,7 @@ def test_time_of_tables_has_a_column_a_unit_and_an_epoch():
     assert 719529 * 86400 * 10**9 + days.epoch == 0  # datenum of 1970-01-01
 
 
-def test_what_only_says_where_data_are_does_not_change_the_digest():
+def test_what_only_says_where_data_are_does_not_change_the_digest() -> None:
     base = parse_system(RIG).digest
     moved = RIG.replace("unit: mm", "unit: in, sign: -1").replace("column: stroke", "csv: x").replace("Zeit", "t")
     assert parse_system(moved).digest == base
@@ -151,13 +152,13 @@ def test_what_only_says_where_data_are_does_not_change_the_digest():
         ),
     ],
 )
-def test_a_support_may_give_any_of_its_motions(old, new, channels):
+def test_a_support_may_give_any_of_its_motions(old: str, new: str, channels: list[str]) -> None:
     system = System(parse_system_file(QUARTER_CAR.replace(old, new)))
     assert [c.name for c in system.inputs] == channels
     assert [c.unit for c in system.inputs] == [SI[name.split(".")[1]] for name in channels]
 
 
-def test_track_load_speed_and_tests_without_a_body_can_be_said():
+def test_track_load_speed_and_tests_without_a_body_can_be_said() -> None:
     track = "road: {kind: track, rail: left, position: [0.0, 1.0]}"
     system = System(
         parse_system_file(
@@ -205,7 +206,9 @@ estimate: [stiffness, colour]
 """
 
 
-def test_everything_that_is_wrong_is_told_at_once_in_plain_words(tmp_path, capfd):
+def test_everything_that_is_wrong_is_told_at_once_in_plain_words(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     lines = problems(BROKEN)
     for part in (
         "line 3: sample_rate: a number is expected, not 'fast'",
@@ -241,7 +244,7 @@ def test_everything_that_is_wrong_is_told_at_once_in_plain_words(tmp_path, capfd
     assert len(capfd.readouterr().err.splitlines()) == 1
 
 
-def test_the_schema_for_editors_knows_short_forms_and_every_kind(capfd):
+def test_the_schema_for_editors_knows_short_forms_and_every_kind(capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["system", "--schema"]) == 0
     schema = json.loads(capfd.readouterr().out)
     assert schema == json_schema()

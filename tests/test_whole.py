@@ -15,7 +15,7 @@ SHARED = Path(__file__).parents[1].parent / "shared" / "recordings"
 DRIFTING = (("secondary_2l.damping", 0.45, 250.0), ("primary_12r.stiffness", 0.2, 300.0))
 
 
-def replay(capsys, *arguments) -> tuple[int, list[dict], str]:
+def replay(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[dict], str]:
     status = main(["replay", *map(str, arguments), "--json"])
     captured = capsys.readouterr()
     return status, [json.loads(line) for line in captured.out.splitlines()], captured.err
@@ -33,7 +33,7 @@ def labels(name: str) -> dict[str, float]:
     return {f"{e}.{q}": v for q in ("stiffness", "damping") for e, v in truth[q].items()}
 
 
-def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys):
+def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys: pytest.CaptureFixture[str]) -> None:
     status, lines, _ = replay(capsys, DRIFT)
     summary = lines[-1]["summary"]
     assert status == 1  # the vehicle has alarms
@@ -51,7 +51,9 @@ def test_the_bundled_recording_shows_two_parameters_drift_and_no_other(capsys):
         assert np.abs(ratio / np.median(ratio[seconds > 300]) - 1)[seconds > 60].max() < 0.03
 
 
-def test_a_healthy_vehicle_is_measured_within_its_intervals_and_raises_no_alarm(capsys):
+def test_a_healthy_vehicle_is_measured_within_its_intervals_and_raises_no_alarm(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     status, lines, _ = replay(capsys, shared("healthy-120s.mcap"))
     summary = lines[-1]["summary"]
     truth = labels("healthy-120s.mcap")
@@ -62,7 +64,7 @@ def test_a_healthy_vehicle_is_measured_within_its_intervals_and_raises_no_alarm(
 
 
 @pytest.mark.parametrize(("name", "foreign"), [("lossy-30s.mcap", False), ("lossy-30s.blf", True)])
-def test_losses_are_counted_and_told_in_one_line(capsys, name, foreign):
+def test_losses_are_counted_and_told_in_one_line(capsys: pytest.CaptureFixture[str], name: str, foreign: bool) -> None:
     status, lines, errors = replay(capsys, shared(name))
     summary = lines[-1]["summary"]
     truth = labels(name)
@@ -76,7 +78,7 @@ def test_losses_are_counted_and_told_in_one_line(capsys, name, foreign):
     assert np.sum(np.array(z) < 3) >= 22
 
 
-def test_a_truncated_file_is_used_up_to_its_end(capsys):
+def test_a_truncated_file_is_used_up_to_its_end(capsys: pytest.CaptureFixture[str]) -> None:
     status, lines, errors = replay(capsys, shared("truncated-30s.mcap"))
     assert status == 1
     assert len(errors.strip().splitlines()) == 1
@@ -85,7 +87,9 @@ def test_a_truncated_file_is_used_up_to_its_end(capsys):
 
 
 @pytest.mark.slow
-def test_the_same_ride_as_mcap_and_as_can_gives_the_same_estimates(capsys, tmp_path):
+def test_the_same_ride_as_mcap_and_as_can_gives_the_same_estimates(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """The healthy recording, its values rounded as the CAN database does, written as CSV: MCAP against quantised."""
     from sprung.replay.record import load_record
 

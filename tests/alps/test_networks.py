@@ -24,7 +24,7 @@ from sprung.model.alps.posterior import (
     von_mises_divergence,
     von_mises_sample,
 )
-from sprung.model.alps.task import WINDOW
+from sprung.model.alps.task import WINDOW, Task
 
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
 SIZES = NetworkConfig()
@@ -127,7 +127,7 @@ def test_estimates_start_in_the_middle_and_stay_positive() -> None:
 
 @pytest.mark.parametrize("method", KINDS)
 @pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
-def test_every_method_learns_from_a_batch_through_all_its_parts(task, method) -> None:
+def test_every_method_learns_from_a_batch_through_all_its_parts(task: Task, method: str) -> None:
     torch.manual_seed(0)
     network = Network(task, method, SIZES)
     embeddings = torch.randn(2, WINDOW, SIZES.embedding)
@@ -144,7 +144,7 @@ def test_every_method_learns_from_a_batch_through_all_its_parts(task, method) ->
 
 
 @pytest.mark.parametrize("method", ["alps", "no_attention"])
-def test_with_physics_positions_are_an_affine_image_of_the_embedding(method) -> None:
+def test_with_physics_positions_are_an_affine_image_of_the_embedding(method: str) -> None:
     task = two_body.TASK
     network = Network(task, method, SIZES).requires_grad_(False)
     left, right = torch.randn(2, 1, WINDOW, SIZES.embedding)

@@ -13,14 +13,14 @@ from sprung.model.alps import mass_spring_damper, pendulum, two_body
 from sprung.model.alps.config import NetworkConfig
 from sprung.model.alps.encoder import AttentionEncoder
 from sprung.model.alps.rollout import held, runge_kutta
-from sprung.model.alps.task import ROLLOUT, WINDOW, Task, windows
+from sprung.model.alps.task import ROLLOUT, WINDOW, Rollouts, Task, windows
 
 SIZES = NetworkConfig()
 TASKS = [pendulum.TASK, mass_spring_damper.TASK, two_body.TASK]
 each_task = pytest.mark.parametrize("task", TASKS, ids=lambda task: task.name)
 
 
-def rollouts(task: Task, count: int = 6):
+def rollouts(task: Task, count: int = 6) -> Rollouts:
     return task.sample(count, np.random.default_rng(3), task.seen)
 
 

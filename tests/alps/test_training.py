@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,15 @@ from sprung.model.alps.fit import OutOfTime, Split, TimeLimit
 from sprung.model.alps.frames import FrameAutoencoder
 from sprung.model.alps.losses import tempered
 from sprung.model.alps.task import WINDOW, Task
-from sprung.model.alps.train_system import full_state_system, generate, smoothed, to_points, to_states, train_task
+from sprung.model.alps.train_system import (
+    TrainData,
+    full_state_system,
+    generate,
+    smoothed,
+    to_points,
+    to_states,
+    train_task,
+)
 from sprung.model.identification.refine import Refiner
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
@@ -44,7 +53,7 @@ TINY = TrainingConfig(
 
 
 @pytest.fixture(scope="module")
-def train_data():
+def train_data() -> TrainData:
     return generate(True, np.random.default_rng(0), 4)
 
 
@@ -70,7 +79,7 @@ def test_an_interrupted_run_ends_in_the_same_weights(tmp_path: Path) -> None:
     folder.mkdir()
 
     class Stops(TimeLimit):
-        def check(self, run) -> None:  # type: ignore[no-untyped-def]
+        def check(self, run: Any) -> None:  # type: ignore[no-untyped-def]
             if run.step == 3:
                 run.save()
                 raise OutOfTime("stopped")
@@ -154,7 +163,7 @@ def test_a_lost_simulation_counts_little() -> None:
     assert lost < 0.5
 
 
-def test_train_trajectories_have_the_papers_sizes(train_data) -> None:
+def test_train_trajectories_have_the_papers_sizes(train_data: TrainData) -> None:
     assert train_data.measured.shape == (4, 500, 18)
     assert train_data.observations.shape == (4, 500, 12)
     assert train_data.known.shape == (4, 500, 16)
@@ -165,24 +174,24 @@ def test_train_trajectories_have_the_papers_sizes(train_data) -> None:
     )
 
 
-def test_true_states_are_what_the_simulator_gives_from_their_first(train_data) -> None:
+def test_true_states_are_what_the_simulator_gives_from_their_first(train_data: TrainData) -> None:
     task = train_task(train_data)
     path = task.simulate(train_data.states[:, 0], train_data.log_ratio, train_data.known)
     error = (path - train_data.states).square().mean((0, 1)).sqrt() / train_data.size
     assert float(error.max()) < 0.01
 
 
-def test_measured_states_have_one_percent_noise(train_data) -> None:
+def test_measured_states_have_one_percent_noise(train_data: TrainData) -> None:
     ratio = (train_data.measured - train_data.states).std((0, 1)) / train_data.size
     np.testing.assert_allclose(ratio.numpy(), 0.01, rtol=0.1)
 
 
-def test_points_and_states_are_two_views_of_the_same_motion(train_data) -> None:
+def test_points_and_states_are_two_views_of_the_same_motion(train_data: TrainData) -> None:
     states = train_data.states.numpy()
     np.testing.assert_allclose(to_states(to_points(states)), states, atol=1e-12)
 
 
-def test_refinement_from_states_reaches_its_bound_from_the_nominal_values(train_data) -> None:
+def test_refinement_from_states_reaches_its_bound_from_the_nominal_values(train_data: TrainData) -> None:
     system = full_state_system(load_system(), train_data.noise.numpy())
     measured = np.concatenate([train_data.known.numpy(), to_points(train_data.measured.numpy())], axis=2)[:, :100]
     found = Refiner(system).refine(measured)
@@ -193,7 +202,7 @@ def test_refinement_from_states_reaches_its_bound_from_the_nominal_values(train_
     assert float(np.abs(error).mean()) < 0.006
 
 
-def test_a_start_from_the_whole_window_carries_less_noise_than_its_first_sample(train_data) -> None:
+def test_a_start_from_the_whole_window_carries_less_noise_than_its_first_sample(train_data: TrainData) -> None:
     system = load_system()
     simulator = LinearSimulator(system)
     measured, known = train_data.measured[:, :100], train_data.known[:, :100]
@@ -228,7 +237,7 @@ def test_the_papers_estimator_finds_constant_parameters_without_labels(tmp_path:
 
 
 @pytest.mark.parametrize("method", ["cdm", "alps_smoothed", "alps_from_sensors", "alps_known_sensors", "no_fourier"])
-def test_every_train_method_takes_a_step(method, tmp_path: Path, train_data) -> None:
+def test_every_train_method_takes_a_step(method: str, tmp_path: Path, train_data: TrainData) -> None:
     config = train_fit.TrainConfig(updates=2, batch=2, checkpoint_every=50)
     model = train_fit.fit(method, train_data, config, tmp_path, TimeLimit(), "test")
     figures = train_fit.figures(model, train_data, hop=200)
@@ -310,7 +319,7 @@ def test_positions_rest_as_opened_while_rates_are_learned(tmp_path: Path) -> Non
     assert float(moved.detach().abs().max()) > 1e-4
 
 
-def test_the_bound_falls_with_windows_and_rises_where_the_sensors_are_unknown(train_data) -> None:
+def test_the_bound_falls_with_windows_and_rises_where_the_sensors_are_unknown(train_data: TrainData) -> None:
     system, truth = load_system(), train_data.log_ratio[0]
     windows = [values[0].unflatten(0, (5, 100)) for values in (train_data.states, train_data.known)]
     one = shared_bound(system, truth, *[w[:1] for w in windows], free=False)

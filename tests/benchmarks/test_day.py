@@ -1,11 +1,13 @@
 """Months of service in estimate space: estimates are drawn as they state, and a hidden fault is found and named."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 
 from sprung.benchmarks import day
-from sprung.benchmarks.day import library
+from sprung.benchmarks.day import Life, Pool, library
 from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.timetable import Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
@@ -20,13 +22,13 @@ CARRIED = np.array([0.2, -0.05, -0.02, 0.01, -0.02])
 
 
 @pytest.fixture(scope="module")
-def windows():
+def windows() -> list[Pool]:
     found = library(load_system(), 6, 3)
     prior = np.array([part.std for part in deviations(load_system()) if part.kind not in ("gain", "delay")])
     return [day.pool([found[k], found[k - 1]], prior) for k in range(len(found))]
 
 
-def test_estimates_scatter_about_the_truth_as_they_state(windows):
+def test_estimates_scatter_about_the_truth_as_they_state(windows: list[Pool]) -> None:
     system, rng = load_system(), np.random.default_rng(1)
     truth, off = rng.normal(0, 0.1, 24), np.zeros(len(deviations(system)))
     at = [part.kind in CARGO for part in deviations(system)]
@@ -43,14 +45,16 @@ def test_estimates_scatter_about_the_truth_as_they_state(windows):
     assert np.all(np.abs(slopes.mean(axis=0)) < 5 * spread + 1e-6)
 
 
-def test_a_damper_that_loses_a_seventh_is_found_beside_weather_and_loads(windows, monkeypatch):
+def test_a_damper_that_loses_a_seventh_is_found_beside_weather_and_loads(
+    windows: list[Pool], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(day, "SETTLED_DAYS", 0.5)
     life = day.live(load_system(), windows, 1.2, 5, measured=True, fault="secondary_1r.damping")
     assert life.isolated or life.found_after is None  # another alarm never comes first
     assert life.strangers == []
 
 
-def test_a_drawn_load_gives_the_mass_matrix_of_the_generator():
+def test_a_drawn_load_gives_the_mass_matrix_of_the_generator() -> None:
     system, service = load_system(), Service()
     empty = system.mechanics.mass[:3]
     terms = day.boarded(np.random.default_rng(3), service, empty)
@@ -67,7 +71,7 @@ def test_a_drawn_load_gives_the_mass_matrix_of_the_generator():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-6)
 
 
-def test_every_window_of_a_day_goes_through_once_and_in_order():
+def test_every_window_of_a_day_goes_through_once_and_in_order() -> None:
     engine, vehicle = load_engine(settings_with({})), read_vehicle(SYSTEM)
     timetable = draw_timetable(vehicle, Service(dwell=(1.0, 2.0)), 42.0, 4)
     moments = list(through(engine, vehicle, timetable))
@@ -77,12 +81,14 @@ def test_every_window_of_a_day_goes_through_once_and_in_order():
     assert last.used + last.rejected + last.idle == len(moments)
 
 
-def test_vehicles_that_are_done_are_not_lived_again(windows, monkeypatch, tmp_path):
+def test_vehicles_that_are_done_are_not_lived_again(
+    windows: list[Pool], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(day, "library", lambda *_: [])
     monkeypatch.setattr(day.Lives, "pools", windows)
     lived = []
 
-    def live(_system, _windows, days, seed, **_):
+    def live(_system: object, _windows: object, days: float, seed: int, **_: object) -> Life:
         lived.append(seed)
         return day.Life(days, 100, 0, [], 0, None, False)
 

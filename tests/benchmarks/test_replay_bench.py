@@ -3,7 +3,7 @@
 from sprung.benchmarks.decode import run
 
 
-def test_the_decode_benchmark_gives_two_figures():
+def test_the_decode_benchmark_gives_two_figures() -> None:
     figures = list(run(seconds=2.0))
     assert [figure["name"] for figure in figures] == ["CAN decoding", "MCAP decoding"]
     for figure in figures:

@@ -1,6 +1,7 @@
 """The generator's working day: what is drawn, and whether it is the vehicle that it says."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,7 +22,7 @@ PLAIN = Service(
 )  # fmt: skip
 
 
-def test_stops_come_as_often_as_the_service_says_and_the_train_stands_there():
+def test_stops_come_as_often_as_the_service_says_and_the_train_stands_there() -> None:
     timetable = draw_timetable(VEHICLE, Service(), 7200.0, 1)
     standing = timetable.speed == 0
     arrivals = timetable.time[1:][standing[1:] & ~standing[:-1]]
@@ -32,7 +33,7 @@ def test_stops_come_as_often_as_the_service_says_and_the_train_stands_there():
     assert np.all(np.abs(loads) <= 0.3)
 
 
-def test_a_standing_train_shows_noise_and_a_running_one_its_own_values():
+def test_a_standing_train_shows_noise_and_a_running_one_its_own_values() -> None:
     timetable = draw_timetable(VEHICLE, PLAIN, 80.0, 2)
     values = np.concatenate(list(run_day(VEHICLE, timetable)))
     noise = np.concatenate([VEHICLE.input_noise.ravel(), VEHICLE.sensor_noise])
@@ -47,7 +48,7 @@ def test_a_standing_train_shows_noise_and_a_running_one_its_own_values():
     assert np.abs(error / std).max() < 4.0
 
 
-def test_a_rail_has_the_spectrum_that_it_is_drawn_from():
+def test_a_rail_has_the_spectrum_that_it_is_drawn_from() -> None:
     timetable = replace(draw_timetable(VEHICLE, PLAIN, 60.0, 3), service=replace(PLAIN, level=(1.0, 1.0)))
     heights = Rails(timetable, 100_000.0, LOW_TRACK).at(1.0, np.arange(0, 100_000, 0.1))
     power = np.abs(np.fft.rfft(heights)) ** 2 * 0.1 / len(heights) * 2 / (2 * np.pi)
@@ -56,7 +57,7 @@ def test_a_rail_has_the_spectrum_that_it_is_drawn_from():
     assert np.mean(power[band] / errib176(wave[band], LOW_TRACK)) == pytest.approx(1.0, abs=0.05)
 
 
-def test_the_load_is_where_the_timetable_puts_it():
+def test_the_load_is_where_the_timetable_puts_it() -> None:
     """A load in front of the middle presses more on the front springs: the pitch responds to a vertical force."""
     still = modes(VEHICLE, np.zeros(24), 0.3, 0.0, np.ones(2))
     ahead = modes(VEHICLE, np.zeros(24), 0.3, 2.0, np.ones(2))
@@ -69,7 +70,7 @@ def test_the_load_is_where_the_timetable_puts_it():
     assert ahead.direct[front] @ force < ahead.direct[rear] @ force
 
 
-def test_faults_change_what_they_name():
+def test_faults_change_what_they_name() -> None:
     faults = (Fault("secondary_1l.damping", 30.0, 0.8), Fault("bogie1_1l.gain", 10.0, 1.05, 20.0))
     timetable = draw_timetable(VEHICLE, replace(PLAIN, faults=faults), 60.0, 4)
     before, after = (timetable.log_ratio(VEHICLE, t) for t in (29.0, 31.0))
@@ -82,7 +83,7 @@ def test_faults_change_what_they_name():
 
 
 @pytest.mark.parametrize("kind", ["blf", "mcap"])
-def test_a_day_is_read_back_by_the_product(tmp_path, kind):
+def test_a_day_is_read_back_by_the_product(tmp_path: Path, kind: str) -> None:
     path = tmp_path / f"day.{kind}"
     write_day(VEHICLE, PLAIN, 25.0, 5, path)
     system = load_system()

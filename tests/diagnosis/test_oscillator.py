@@ -10,7 +10,7 @@ import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.baseline import baseline
-from sprung.model.diagnosis.fit.jacobian import linearise
+from sprung.model.diagnosis.fit.jacobian import Linearised, linearise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import along_measured_motion
 from sprung.model.diagnosis.record.signals import Signals, declared_noise, transform
@@ -94,7 +94,7 @@ def linear() -> MadeRecord:
     return simulate(lambda d, v, z: 0.0, seconds=12.0)
 
 
-def test_values_far_from_nominal_are_found_although_the_resonance_is_narrow(linear):
+def test_values_far_from_nominal_are_found_although_the_resonance_is_narrow(linear: MadeRecord) -> None:
     """20 % of stiffness are ten widths of the resonance: a free run from nominal sees no direction to go."""
     signals, system = signals_of(linear), parse_system(SYSTEM)
     problem, fit = baseline(system, signals, declared_noise(system, signals), 3360)
@@ -105,12 +105,12 @@ def test_values_far_from_nominal_are_found_although_the_resonance_is_narrow(line
     assert problem.noise.force[0] == pytest.approx(0.02, rel=0.3)
 
 
-def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear):
+def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear: MadeRecord) -> None:
     system, signals = parse_system(SYSTEM), signals_of(linear)
     noise = replace(declared_noise(system, signals), force=np.array([2.0]))
     problem = Problem(system, transform(signals, noise), signals.sensor_index, noise)
 
-    def linearised(theta: np.ndarray):
+    def linearised(theta: np.ndarray) -> Linearised:
         return linearise(problem, *along_measured_motion(problem, Point(theta, (), np.zeros(2))))
 
     here = np.array([0.1, -0.1])
@@ -121,7 +121,7 @@ def test_slopes_of_the_log_determinant_agree_with_finite_differences(linear):
 
 
 @pytest.mark.slow
-def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
+def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values() -> None:
     gap, stop = 1.2e-3, 2e5
     report = diagnose(
         parse_system(SYSTEM),
@@ -138,7 +138,7 @@ def test_hard_stops_of_a_lightly_damped_mass_are_named_with_their_values():
     assert values["spring.damping"] == pytest.approx(DAMPING, rel=0.05)
 
 
-def test_friction_shows_in_a_free_decay_without_any_input():
+def test_friction_shows_in_a_free_decay_without_any_input() -> None:
     """No excitation: a model with everything scaled down fits ever better, were it not for the determinant."""
     record = simulate(lambda d, v, z: 3.0 * np.tanh(v / 5e-3), seconds=4.0, level=0.0, start=0.01)
     record.values[:, 0] = 0.0
@@ -152,7 +152,7 @@ def test_friction_shows_in_a_free_decay_without_any_input():
 
 
 @pytest.mark.slow
-def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family():
+def test_hysteresis_that_stiffens_while_it_is_loaded_is_of_the_bouc_wen_family() -> None:
     """The loop of the Bouc-Wen benchmark (Noel and Schoukens 2016): gamma -1.375, where the common form has 0.5."""
     alpha, beta, gamma = 2e4, 800.0, -1.375
     report = diagnose(

@@ -40,7 +40,7 @@ class HealthyRecord:
                 self.values[:, self.column(f"{wheel}.velocity")] += depth * weight * omega * np.sin(angle)
 
 
-def test_a_flat_on_one_wheel_is_found_named_and_sized():
+def test_a_flat_on_one_wheel_is_found_named_and_sized() -> None:
     record = HealthyRecord(31)
     record.hide_dip("wheel_flat", "wheel_12r", 1e-4, 9.37, 0.3)
     report = diagnose(SYSTEM, record)
@@ -52,7 +52,7 @@ def test_a_flat_on_one_wheel_is_found_named_and_sized():
 
 
 @pytest.mark.slow
-def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
+def test_rail_joints_are_told_from_a_flat_by_the_other_wheel() -> None:
     record = HealthyRecord(32)
     for wheel in ("wheel_21l", "wheel_21r"):
         record.hide_dip("rail_joints", wheel, 3e-4, 1.7, 0.6)
@@ -63,7 +63,7 @@ def test_rail_joints_are_told_from_a_flat_by_the_other_wheel():
 
 
 @pytest.mark.slow
-def test_a_late_axle_is_a_fault_of_the_measurement():
+def test_a_late_axle_is_a_fault_of_the_measurement() -> None:
     record = HealthyRecord(33)
     for wheel in ("wheel_21l", "wheel_21r"):
         for quantity in ("displacement", "velocity"):

@@ -25,7 +25,7 @@ NO_WINDOW = {"same-time.mcap", "apart.mcap"}
 
 
 @pytest.mark.parametrize("name", SEEDS)
-def test_mutants_are_read_or_refused(name):
+def test_mutants_are_read_or_refused(name: str) -> None:
     if name in NEEDS and importlib.util.find_spec(NEEDS[name]) is None:
         pytest.skip(f"{NEEDS[name]} is not installed")
     count = 15 if name == "mf4" else 60  # asammdf takes a tenth of a second for each
@@ -36,7 +36,7 @@ def test_mutants_are_read_or_refused(name):
 
 
 @pytest.mark.slow
-def test_a_thousand_mutants_of_every_format_in_bounded_memory():
+def test_a_thousand_mutants_of_every_format_in_bounded_memory() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "tests.fuzz", "--mutants=1000", "--seed=5"],
         stdout=subprocess.PIPE,
@@ -49,7 +49,7 @@ def test_a_thousand_mutants_of_every_format_in_bounded_memory():
 
 
 @pytest.mark.parametrize("path", HOSTILE, ids=lambda path: path.name)
-def test_a_hostile_file_costs_little_and_its_good_samples_are_kept(path):
+def test_a_hostile_file_costs_little_and_its_good_samples_are_kept(path: Path) -> None:
     tracemalloc.start()
     started = time.process_time()
     try:
@@ -71,5 +71,5 @@ def test_a_hostile_file_costs_little_and_its_good_samples_are_kept(path):
     assert peak < 2 * path.stat().st_size + (40 << 20)
 
 
-def test_the_corpus_is_small():
+def test_the_corpus_is_small() -> None:
     assert sum(path.stat().st_size for path in HOSTILE) < 600_000

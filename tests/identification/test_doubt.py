@@ -6,7 +6,7 @@ import pytest
 from sprung.model.identification.doubt import bounce_doubt, mass_doubt
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import System, load_system, parse_system
 from sprung.service.engine import make_tracker
 from tests.strut import TEXT
 
@@ -28,11 +28,11 @@ sensors:
 """
 
 
-def quarter_car(mass):
+def quarter_car(mass: float) -> System:
     return parse_system(QUARTER_CAR.format(mass=mass))
 
 
-def test_with_an_unknown_load_all_forces_scale_with_the_axle():
+def test_with_an_unknown_load_all_forces_scale_with_the_axle() -> None:
     system = quarter_car(40.0)
     assert system.doubtful_masses == {"unsprung": 0.03}
     doubt = mass_doubt(system, loads=True)
@@ -40,7 +40,7 @@ def test_with_an_unknown_load_all_forces_scale_with_the_axle():
     assert np.sqrt(doubt.deviations[-1, -1]) == pytest.approx(0.03, rel=0.05)
 
 
-def test_windows_of_a_heavier_axle_are_within_what_is_stated():
+def test_windows_of_a_heavier_axle_are_within_what_is_stated() -> None:
     runs = simulate_runs(quarter_car(41.6), np.zeros((12, 3)), 100, np.random.default_rng(5))
     estimates = Identifier(quarter_car(40.0)).identify(runs.values)
     told = Identifier(quarter_car("{value: 40.0, fixed: true}")).identify(runs.values)
@@ -50,7 +50,7 @@ def test_windows_of_a_heavier_axle_are_within_what_is_stated():
     assert np.abs(plain).max() > 6  # the mass is taken for certain
 
 
-def test_a_tracker_states_it_but_not_in_changes():
+def test_a_tracker_states_it_but_not_in_changes() -> None:
     system = quarter_car(40.0)
     certain = make_tracker(quarter_car("{value: 40.0, fixed: true}"))
     doubtful = make_tracker(system)
@@ -66,7 +66,7 @@ def test_a_tracker_states_it_but_not_in_changes():
     assert sure < 0.01
 
 
-def test_a_heavier_axle_is_no_gain_of_a_sensor_of_the_strut_s_force():
+def test_a_heavier_axle_is_no_gain_of_a_sensor_of_the_strut_s_force() -> None:
     """The axle is 4 % heavier; forces that are measured are not those of the file's masses."""
     text = TEXT.format(law="", sensor="")
     axles = {
@@ -88,7 +88,7 @@ def test_a_heavier_axle_is_no_gain_of_a_sensor_of_the_strut_s_force():
     assert [(f.channel, f.kind) for f in told["certain"][0]] == [("strut_f", "gain")]
 
 
-def test_stated_doubt_makes_no_other_vehicle():
+def test_stated_doubt_makes_no_other_vehicle() -> None:
     stated = quarter_car("{value: 40.0, std: 2.0}")
     assert stated.doubtful_masses == {"unsprung": pytest.approx(0.05)}
     assert stated.digest == quarter_car(40.0).digest
@@ -117,12 +117,12 @@ sensors:
 """
 
 
-def bogie(mass=2615.0, pitch=1476.0, arm=1.28):
+def bogie(mass: float = 2615.0, pitch: float = 1476.0, arm: float = 1.28) -> System:
     return parse_system(PITCHING.format(mass=mass, pitch=pitch, arm=arm))
 
 
 @pytest.mark.parametrize("off", [{"mass": 2667.0, "pitch": 1432.0}, {"pitch": 1432.0}, {"arm": 1.305}])
-def test_bodies_that_are_not_quite_those_of_the_file_blind_no_tracker(off):
+def test_bodies_that_are_not_quite_those_of_the_file_blind_no_tracker(off: dict[str, float]) -> None:
     """2 % of a bogie, 3 % of its inertia, 25 mm of a spring's place: windows go on fitting, no sensor is accused."""
     system, true = bogie(), bogie(**off)
     tracker = make_tracker(system)
@@ -140,13 +140,13 @@ def test_bodies_that_are_not_quite_those_of_the_file_blind_no_tracker(off):
         assert told["pitch inertia over mass"].change == pytest.approx(apart, abs=0.015)
 
 
-def test_what_is_fixed_or_stated_is_not_doubted_beside():
+def test_what_is_fixed_or_stated_is_not_doubted_beside() -> None:
     certain = parse_system(QUARTER_CAR.format(mass="{value: 40.0, fixed: true}"))
     assert mass_doubt(certain, loads=True, tracked=True).none
 
 
-def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it():
-    def stated(stiffness, rate):
+def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it() -> None:
+    def stated(stiffness: float, rate: float) -> float:
         law = f"damping: 1500.0, laws: [{{bump_stop: {{gap: 0.01, stiffness: {stiffness}}}}}]"
         text = QUARTER_CAR.format(mass=40.0).replace("damping: 1500.0", law)
         system = parse_system(text.replace("sample_rate: 100", f"sample_rate: {rate}"))

@@ -3,6 +3,7 @@
 import json
 import pickle
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,22 +16,25 @@ from sprung.model.identification.excitation import draw_log_ratios, simulate_run
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.identification.training import TrainingSettings, train
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import LinearSimulator
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import System, load_system, parse_system
 
 TINY = TrainingSettings(records=100, windows_per_record=2, steps=30, batch=64, checkpoint_every=10, recording_steps=6)
 SMALL_CAR = QUARTER_CAR.replace("window: 200", "window: 100")
 
 
 @pytest.fixture(scope="module")
-def vehicle():
+def vehicle() -> tuple[System, FloatArray, FloatArray]:
     system = load_system()
     rng = np.random.default_rng(77)
     truth = draw_log_ratios(system, 200, 0.5, rng)
     return system, truth, simulate_runs(system, truth, system.window, rng).values
 
 
-def test_the_shipped_estimator_is_near_the_bound_and_says_how_near(vehicle):
+def test_the_shipped_estimator_is_near_the_bound_and_says_how_near(
+    vehicle: tuple[System, FloatArray, FloatArray],
+) -> None:
     system, truth, windows = vehicle
     output = bundled_estimator(system).estimate(windows)
     error = output.log_ratio - truth
@@ -39,7 +43,7 @@ def test_the_shipped_estimator_is_near_the_bound_and_says_how_near(vehicle):
     assert 0.9 < (np.abs(error) < 1.96 * std).mean() < 0.98
 
 
-def test_its_start_needs_fewer_iterations_than_nominal_values(vehicle):
+def test_its_start_needs_fewer_iterations_than_nominal_values(vehicle: tuple[System, FloatArray, FloatArray]) -> None:
     system, _, windows = vehicle
     identifier = load_identifier(system)
     trained = np.mean([e.iterations for e in identifier.identify(windows[:64])])
@@ -47,19 +51,19 @@ def test_its_start_needs_fewer_iterations_than_nominal_values(vehicle):
     assert trained <= 0.5 * nominal
 
 
-def test_the_manifest_tells_how_the_weights_came_about():
+def test_the_manifest_tells_how_the_weights_came_about() -> None:
     manifest = json.loads((WEIGHTS / "manchester" / "manifest.json").read_text())
     assert manifest["system_digest"] == load_system().digest
     assert manifest["measured"]["coverage_95"] > 0.9
     assert manifest["seed"] == manifest["training"]["seed"]
 
 
-def test_a_model_of_another_system_is_refused():
+def test_a_model_of_another_system_is_refused() -> None:
     with pytest.raises(ModelError, match=r"trained for 'manchester-passenger'.*quarter-car.*sprung train"):
         load_estimator(WEIGHTS / "manchester", parse_system(QUARTER_CAR))
 
 
-def test_damaged_weights_and_pickles_are_refused(tmp_path):
+def test_damaged_weights_and_pickles_are_refused(tmp_path: Path) -> None:
     system = load_system()
     for name in ("manifest.json", "weights.safetensors"):
         (tmp_path / name).write_bytes((WEIGHTS / "manchester" / name).read_bytes())
@@ -80,25 +84,25 @@ def test_damaged_weights_and_pickles_are_refused(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def small_car():
+def small_car() -> System:
     """The quarter car: two accelerometers give the motion of both bodies."""
     return parse_system(SMALL_CAR)
 
 
-def test_training_twice_from_one_seed_gives_the_same_weights(small_car, tmp_path):
+def test_training_twice_from_one_seed_gives_the_same_weights(small_car: System, tmp_path: Path) -> None:
     digests = {train(small_car, tmp_path / str(i), settings=TINY).net.log_weight.sum().item() for i in range(2)}
     other = train(small_car, tmp_path / "other", settings=replace(TINY, seed=1)).net.log_weight.sum().item()
     assert len(digests) == 1
     assert other not in digests
 
 
-def test_training_that_was_interrupted_resumes_to_the_same_weights(small_car, tmp_path):
+def test_training_that_was_interrupted_resumes_to_the_same_weights(small_car: System, tmp_path: Path) -> None:
     whole = train(small_car, tmp_path / "whole", settings=TINY)
 
     class Stop(Exception):
         pass
 
-    def interrupt(stage, done, total, loss):
+    def interrupt(stage: str, done: int, total: int, loss: float) -> None:
         if stage == "train" and done >= 20:
             raise Stop
 
@@ -114,7 +118,7 @@ def test_training_that_was_interrupted_resumes_to_the_same_weights(small_car, tm
     assert load_estimator(tmp_path / "parts", small_car).samples == 100
 
 
-def test_recordings_without_labels_lower_the_misfit_of_a_badly_trained_model(small_car, tmp_path):
+def test_recordings_without_labels_lower_the_misfit_of_a_badly_trained_model(small_car: System, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     truth = np.repeat(rng.uniform(-0.3, 0.3, (1, 4)), 60, axis=0)
     windows = simulate_runs(small_car, truth, small_car.window, rng).values
@@ -127,13 +131,13 @@ def test_recordings_without_labels_lower_the_misfit_of_a_badly_trained_model(sma
     assert errors[1] < errors[0]
 
 
-def test_a_system_whose_sensors_give_no_motion_cannot_be_trained(tmp_path):
+def test_a_system_whose_sensors_give_no_motion_cannot_be_trained(tmp_path: Path) -> None:
     text = QUARTER_CAR.replace("  wheel: {kind: acceleration, body: unsprung, csv: a2, noise: 0.05}\n", "")
     with pytest.raises(ValueError, match="no force balance"):
         train(parse_system(text), tmp_path, settings=TINY)
 
 
-def test_progress_goes_from_simulation_through_training(small_car, tmp_path):
+def test_progress_goes_from_simulation_through_training(small_car: System, tmp_path: Path) -> None:
     seen = []
     training.train(small_car, tmp_path, settings=TINY, progress=lambda *a: seen.append(a[0]))
     assert seen[0] == "simulate"
@@ -141,7 +145,9 @@ def test_progress_goes_from_simulation_through_training(small_car, tmp_path):
 
 
 @pytest.mark.parametrize("terms", [(0.25, -0.05, -0.03, 0.02, 0.03), (-0.25, 0.04, 0.03, -0.01, 0.0)])
-def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
+def test_its_start_knows_a_load_so_that_one_iteration_is_enough(
+    vehicle: tuple[System, FloatArray, FloatArray], terms: tuple[float, ...]
+) -> None:
     system = vehicle[0]
     rng = np.random.default_rng(78)
     truth = np.hstack([draw_log_ratios(system, 48, 0.2, rng), np.tile(terms, (48, 1))])
@@ -160,7 +166,7 @@ def test_its_start_knows_a_load_so_that_one_iteration_is_enough(vehicle, terms):
     assert np.quantile(np.abs(off) / std, 0.99) < 0.2  # where it starts hardly shows in where it ends
 
 
-def test_linear_changes_of_masses_become_the_terms_of_a_load():
+def test_linear_changes_of_masses_become_the_terms_of_a_load() -> None:
     system = load_system()
     loading = LinearSimulator(system).loading
     terms = torch.tensor([[0.25, -0.08, 0.06, 0.02, -0.03]], dtype=torch.float64)

@@ -1,5 +1,6 @@
 """Gains, delays, loads and broken sensors: what windows say of them, and that no spring is blamed for them."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,9 @@ from sprung.model.identification.deviations import clock_groups, deviations
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import load_identifier
 from sprung.model.identification.refine import Refiner
-from sprung.model.system import MANCHESTER, load_system, parse_system
+from sprung.model.identifier import Identifies
+from sprung.model.signals import FloatArray
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from tests.tracker_windows import EPOCH
 
@@ -19,16 +22,16 @@ BOGIE = [20, 21, 22, 23]  # columns of the accelerometers of bogie 1
 
 
 @pytest.fixture(scope="module")
-def system():
+def system() -> System:
     return load_system()
 
 
 @pytest.fixture(scope="module")
-def identifier(system):
+def identifier(system: System) -> Identifies:
     return load_identifier(system)
 
 
-def record(seconds, seed, load=0.0, truth=None):
+def record(seconds: float, seed: int, load: float = 0.0, truth: FloatArray | None = None) -> FloatArray:
     """Clean samples (T, C) of running, the car heavier by `load`."""
     system = load_system()
     mechanics = system.mechanics
@@ -38,24 +41,24 @@ def record(seconds, seed, load=0.0, truth=None):
     return simulate_runs(system, values, int(100 * seconds), np.random.default_rng(seed)).clean[0]
 
 
-def late(samples, columns, delay):
+def late(samples: FloatArray, columns: Sequence[int], delay: float) -> FloatArray:
     out, time = samples.copy(), np.arange(len(samples)) / 100
     for c in columns:
         out[:, c] = make_interp_spline(time, samples[:, c], k=5)(np.clip(time - delay, 0, time[-1]))
     return out
 
 
-def noisy(system, samples, seed=0):
+def noisy(system: System, samples: FloatArray, seed: int = 0) -> FloatArray:
     noise = np.array([channel.noise for channel in system.channels])
     return samples + noise * np.random.default_rng(seed).standard_normal(samples.shape)
 
 
-def windows(system, samples, seed=0, hop=50):
+def windows(system: System, samples: FloatArray, seed: int = 0, hop: int = 50) -> FloatArray:
     values = noisy(system, samples, seed)
     return np.stack([values[i : i + 100] for i in range(0, len(values) - 99, hop)])
 
 
-def tracked(system, identifier, samples, seed=0):
+def tracked(system: System, identifier: Identifies, samples: FloatArray, seed: int = 0) -> tuple[Tracker, TrackerState]:
     """Tracker and state after overlapping windows, one of three weighed."""
     values = windows(system, samples, seed)
     estimates = identifier.examine(values, np.arange(len(values)) % 3 == 0)
@@ -66,11 +69,11 @@ def tracked(system, identifier, samples, seed=0):
     return tracker, state
 
 
-def after(first, second, seconds):
+def after(first: FloatArray, second: FloatArray, seconds: float) -> FloatArray:
     return np.concatenate([first[: int(100 * seconds)], second[int(100 * seconds) :]])
 
 
-def test_every_channel_may_deviate_and_channels_of_one_message_share_a_clock(system):
+def test_every_channel_may_deviate_and_channels_of_one_message_share_a_clock(system: System) -> None:
     found = deviations(system)
     assert [d.kind for d in found].count("gain") == [d.kind for d in found].count("delay") == 28
     own = "own_roll", "own_pitch", "reach_x", "reach_y"
@@ -82,7 +85,7 @@ def test_every_channel_may_deviate_and_channels_of_one_message_share_a_clock(sys
     assert len(set(groups[BOGIE])) == 1 and len(set(groups)) == 7
 
 
-def test_the_estimate_moves_with_a_gain_as_the_sensitivities_say(system):
+def test_the_estimate_moves_with_a_gain_as_the_sensitivities_say(system: System) -> None:
     refiner = Refiner(system)
     runs = windows(system, record(4, 1), hop=100)
     everything = np.ones(len(runs), dtype=bool)
@@ -96,13 +99,13 @@ def test_the_estimate_moves_with_a_gain_as_the_sensitivities_say(system):
         assert np.abs(wrong).max() < 0.1
 
 
-def test_what_a_window_says_of_deviations_is_as_uncertain_as_stated(system):
+def test_what_a_window_says_of_deviations_is_as_uncertain_as_stated(system: System) -> None:
     refined = Refiner(system).refine(windows(system, record(40, 2), hop=100), weigh=np.ones(40, dtype=bool))
     z = refined.score[:, :56] / np.sqrt(np.einsum("bhh->bh", refined.information)[:, :56])
     assert 0.9 < np.sqrt(np.mean(z**2)) < 1.1
 
 
-def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_claimed_to_be_known(system):
+def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_claimed_to_be_known(system: System) -> None:
     refined = Refiner(system).refine(windows(system, record(4, 3), hop=100), weigh=np.ones(4, dtype=bool))
     for part in (slice(0, 28), slice(28, 56)):
         common = np.zeros(refined.score.shape[1])
@@ -122,7 +125,9 @@ def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_clai
         (lambda x: x[:, [*range(20), 21, 20, *range(22, 28)]], "bogie1_1l|bogie1_1r", "swapped"),
     ],
 )
-def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(system, identifier, change, channel, kind):
+def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(
+    system: System, identifier: Identifies, change: Callable[[FloatArray], FloatArray], channel: str, kind: str
+) -> None:
     values = windows(system, change(record(6, 4)), hop=100)[1:5]
     found = identifier.examine(values, np.zeros(len(values), dtype=bool))
     named = [{(f.channel, f.kind) for f in e.faults} for e in found]
@@ -133,7 +138,9 @@ def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(system, 
 
 
 @pytest.mark.parametrize("kind", ["frozen", "saturated"])
-def test_a_stuck_sensor_is_named_and_the_window_used_without_it(system, identifier, kind):
+def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
+    system: System, identifier: Identifies, kind: str
+) -> None:
     values = windows(system, record(6, 5), hop=100)[1:5]
     most = 1.1 * values[:, :, 21].std()
     values[:, :, 21] = values[:, :1, 21] if kind == "frozen" else np.clip(values[:, :, 21], -most, most)
@@ -144,7 +151,9 @@ def test_a_stuck_sensor_is_named_and_the_window_used_without_it(system, identifi
 
 
 @pytest.mark.parametrize("gain", [0.02, 0.05, 0.1])
-def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(system, identifier, gain):
+def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(
+    system: System, identifier: Identifies, gain: float
+) -> None:
     healthy = record(70, 6)
     wrong = healthy * np.where(np.arange(28) == 20, 1 + gain, 1)
     tracker, state = tracked(system, identifier, after(healthy, wrong, 40))
@@ -156,7 +165,7 @@ def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(system, identifie
     assert np.abs(mean / std).max() < 3.5
 
 
-def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system, identifier):
+def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, identifier: Identifies) -> None:
     healthy = record(75, 7)
     tracker, state = tracked(system, identifier, after(healthy, late(healthy, [20], -0.003), 35))
     assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "bogie1_1l.delay")]
@@ -165,7 +174,7 @@ def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system, identifie
     assert np.abs(drift).max() < 0.025
 
 
-def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system, identifier):
+def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system: System, identifier: Identifies) -> None:
     tracker, state = tracked(system, identifier, late(record(20, 8), [8], 0.03))
     assert state.rejected <= 6 and not state.alarms
     assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {("wheel_21l.displacement", "delay")}
@@ -174,7 +183,7 @@ def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system, iden
 
 
 @pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
-def test_passengers_change_the_load_and_no_spring(system, identifier, load):
+def test_passengers_change_the_load_and_no_spring(system: System, identifier: Identifies, load: float) -> None:
     tracker, state = tracked(system, identifier, record(40, 7, load))
     assert state.alarms == ()
     assert tracker.sensors(state) == ()
@@ -184,7 +193,9 @@ def test_passengers_change_the_load_and_no_spring(system, identifier, load):
     assert np.abs(mean / spread).max() < 3.5
 
 
-def test_a_true_change_is_the_elements_and_all_dampers_together_are_one_message(system, identifier):
+def test_a_true_change_is_the_elements_and_all_dampers_together_are_one_message(
+    system: System, identifier: Identifies
+) -> None:
     one, every = np.zeros(24), np.zeros(24)
     one[8] = np.log(0.92)
     every[12:] = np.log(0.88)
@@ -198,7 +209,7 @@ def test_a_true_change_is_the_elements_and_all_dampers_together_are_one_message(
         assert np.array_equal(again.calibration.cross, state.calibration.cross)
 
 
-def test_a_declared_load_leaves_the_weights_usable():
+def test_a_declared_load_leaves_the_weights_usable() -> None:
     text = MANCHESTER.read_text()
 
     loaded = parse_system(text.replace("position: [0.0, 0.0]}", "position: [0.0, 0.0], load: true}", 1))
@@ -208,7 +219,9 @@ def test_a_declared_load_leaves_the_weights_usable():
 
 
 @pytest.mark.parametrize(("speed", "count"), [(4.0, 64), (35.0, 24)])
-def test_gains_are_read_without_bias_where_inputs_are_noisy(system, identifier, speed, count):
+def test_gains_are_read_without_bias_where_inputs_are_noisy(
+    system: System, identifier: Identifies, speed: float, count: int
+) -> None:
     """At walking pace the model answers to the noise of the inputs, which sensors do not show: along the inputs as
     measured all sensors would seem to show 4 % too little, five standard deviations."""
     rng = np.random.default_rng(12)

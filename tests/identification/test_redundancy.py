@@ -6,6 +6,7 @@ import torch
 
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.linearise import WindowModel
+from sprung.model.signals import FloatArray
 from sprung.model.simulate import fusion
 from sprung.model.system import BUNDLED, load_system
 
@@ -13,11 +14,13 @@ KEYS = [((0, 1e-5), (1, 5e-4)), ((0, 1e-5), (2, 0.1)), ((1, 1e-3), (2, 0.1)), ((
 
 
 @pytest.fixture(scope="module")
-def calibration():
+def calibration() -> DeviationSensitivity:
     return DeviationSensitivity(WindowModel(load_system(), 100))
 
 
-def motions(rng, count, samples=100, rate=100.0):
+def motions(
+    rng: np.random.Generator, count: int, samples: int = 100, rate: float = 100.0
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Windows (B, T) of displacements below 10 Hz, their velocities and accelerations."""
     frequency = np.arange(1, 121) / 12.0
     omega, time = 2 * np.pi * frequency, np.arange(samples) / rate
@@ -32,7 +35,9 @@ def motions(rng, count, samples=100, rate=100.0):
 
 
 @pytest.mark.parametrize("key", KEYS)
-def test_what_a_fit_leaves_is_a_projection_that_a_motion_passes(key, monkeypatch):
+def test_what_a_fit_leaves_is_a_projection_that_a_motion_passes(
+    key: tuple[tuple[int, float], ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     rng = np.random.default_rng(1)
     z = rng.standard_normal((4, 60, len(key)))
     dense = fusion.left_by_motion(z, 0.01, key)
@@ -44,20 +49,20 @@ def test_what_a_fit_leaves_is_a_projection_that_a_motion_passes(key, monkeypatch
     assert np.abs(fusion.left_by_motion(clean, 0.01, key)).max() < 2e-3 * np.abs(clean).max()
 
 
-def inputs(rng, count):
+def inputs(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray]:
     """Windows (B, T, 16) of the bundled vehicle's wheels, and their noise."""
     d, v, _ = motions(rng, 8 * count)
     both = np.stack([d, v], axis=2).reshape(count, 8, 100, 2)
     return np.moveaxis(both, 1, 2).reshape(count, 100, 16), np.tile([1e-5, 5e-4], 8)
 
 
-def of_inputs(calibration, values):
+def of_inputs(calibration: DeviationSensitivity, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     found = calibration.redundancy.evidence(torch.as_tensor(values), calibration.slope, calibration._bins)
     assert found is not None
     return found[0].numpy(), found[1].numpy()
 
 
-def test_what_it_says_of_gains_and_delays_is_as_uncertain_as_stated(calibration):
+def test_what_it_says_of_gains_and_delays_is_as_uncertain_as_stated(calibration: DeviationSensitivity) -> None:
     rng = np.random.default_rng(2)
     clean, noise = inputs(rng, 60)
     information, score = of_inputs(calibration, clean + noise * rng.standard_normal(clean.shape))
@@ -69,7 +74,9 @@ def test_what_it_says_of_gains_and_delays_is_as_uncertain_as_stated(calibration)
 
 
 @pytest.mark.parametrize(("column", "gain"), [(2, 0.02), (5, -0.03)])
-def test_a_gain_of_one_of_two_measurements_is_found_from_the_other(calibration, column, gain):
+def test_a_gain_of_one_of_two_measurements_is_found_from_the_other(
+    calibration: DeviationSensitivity, column: int, gain: float
+) -> None:
     rng = np.random.default_rng(3)
     clean, noise = inputs(rng, 20)
     clean[:, :, column] *= 1 + gain
@@ -81,7 +88,7 @@ def test_a_gain_of_one_of_two_measurements_is_found_from_the_other(calibration, 
     assert np.abs(z).max() < 4
 
 
-def test_a_support_that_is_measured_once_says_nothing():
+def test_a_support_that_is_measured_once_says_nothing() -> None:
     system = load_system(BUNDLED / "axleboxes.yaml")
     calibration = DeviationSensitivity(WindowModel(system, 100))
     values = torch.zeros(2, 100, len(system.inputs), dtype=torch.float64)

@@ -5,28 +5,29 @@ import pytest
 import torch
 from test_system import OSCILLATOR, QUARTER_CAR
 
-from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
+from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
 from sprung.model.identification.features import ForceBalance, magnitudes
 from sprung.model.identification.identify import Identifier, identifiability
 from sprung.model.identification.linearise import WindowModel
-from sprung.model.identification.refine import Refiner
+from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identifier import UnusableWindow
-from sprung.model.system import load_system, parse_system
+from sprung.model.signals import FloatArray
+from sprung.model.system import System, load_system, parse_system
 
 
 @pytest.fixture(scope="module")
-def vehicle():
+def vehicle() -> tuple[System, FloatArray, Runs]:
     system = load_system()
     rng = np.random.default_rng(11)
     truth = draw_log_ratios(system, 96, 0.5, rng)
     return system, truth, simulate_runs(system, truth, system.window, rng)
 
 
-def scores(refined, truth):
+def scores(refined: Refined, truth: FloatArray) -> FloatArray:
     return (refined.log_ratio - truth) / np.sqrt(np.diagonal(refined.covariance, axis1=1, axis2=2))
 
 
-def test_without_noise_the_truth_comes_back(vehicle):
+def test_without_noise_the_truth_comes_back(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     refined = Refiner(system).refine(runs.clean[:16])
     assert refined.converged.all()
@@ -34,7 +35,9 @@ def test_without_noise_the_truth_comes_back(vehicle):
     assert np.abs(refined.log_ratio - truth[:16]).mean() < 5e-4
 
 
-def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(vehicle):
+def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(
+    vehicle: tuple[System, FloatArray, Runs],
+) -> None:
     system, truth, runs = vehicle
     refiner = Refiner(system)
     from_nominal = refiner.refine(runs.values)
@@ -49,7 +52,7 @@ def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(ve
     assert near.iterations.mean() < 0.6 * from_nominal.iterations.mean()
 
 
-def test_one_window_alone_is_the_window_in_a_batch(vehicle):
+def test_one_window_alone_is_the_window_in_a_batch(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     refiner = Refiner(system)
     batch, alone = refiner.refine(runs.values[:5]), refiner.refine(runs.values[3:4])
@@ -57,7 +60,7 @@ def test_one_window_alone_is_the_window_in_a_batch(vehicle):
     assert np.allclose(batch.covariance[3], alone.covariance[0], rtol=1e-6, atol=1e-12)
 
 
-def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle):
+def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     model = WindowModel(system, system.window)
     data = model.batch(model.knots(runs.clean[:2]), runs.clean[:2], np.ones(12, dtype=bool))
@@ -73,7 +76,7 @@ def test_linearised_columns_are_the_derivatives_of_the_simulation(vehicle):
             assert torch.allclose(back, -direction, atol=3e-5)
 
 
-def test_a_missing_sensor_widens_the_uncertainty_and_nothing_breaks(vehicle):
+def test_a_missing_sensor_widens_the_uncertainty_and_nothing_breaks(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     refiner = Refiner(system)
     windows = runs.values[:48].copy()
@@ -88,7 +91,7 @@ def test_a_missing_sensor_widens_the_uncertainty_and_nothing_breaks(vehicle):
     assert np.allclose(refined.log_ratio[24:], whole.log_ratio[24:], atol=1e-6)
 
 
-def test_a_standing_vehicle_tells_nothing_and_says_so():
+def test_a_standing_vehicle_tells_nothing_and_says_so() -> None:
     system = load_system()
     noise = np.array([c.noise for c in system.channels])
     windows = noise * np.random.default_rng(0).standard_normal((2, 100, 28))
@@ -98,7 +101,7 @@ def test_a_standing_vehicle_tells_nothing_and_says_so():
         assert np.all(estimate.log_ratio == 0)
 
 
-def test_a_window_that_does_not_fit_says_so(vehicle):
+def test_a_window_that_does_not_fit_says_so(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     windows = runs.values[:4].copy()
     windows[:2, :, 20] *= 0.7  # one bogie sensor reads too little
@@ -106,7 +109,7 @@ def test_a_window_that_does_not_fit_says_so(vehicle):
     assert fits == [False, False, True, True]
 
 
-def test_a_missing_input_is_refused_by_name(vehicle):
+def test_a_missing_input_is_refused_by_name(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     windows = runs.values[:1].copy()
     windows[0, 7, 3] = np.nan
@@ -114,7 +117,7 @@ def test_a_missing_input_is_refused_by_name(vehicle):
         Identifier(system).identify(windows)
 
 
-def test_states_are_the_simulated_ones(vehicle):
+def test_states_are_the_simulated_ones(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     (estimate,) = Identifier(system).identify(runs.clean[:1], truth[:1], states=True)
     assert estimate.states.shape == (100, 18)
@@ -123,7 +126,7 @@ def test_states_are_the_simulated_ones(vehicle):
 
 
 @pytest.mark.parametrize("text", [OSCILLATOR, QUARTER_CAR])
-def test_other_systems_are_identified_with_masses_and_element_sensors(text):
+def test_other_systems_are_identified_with_masses_and_element_sensors(text: str) -> None:
     system = parse_system(text)
     rng = np.random.default_rng(3)
     truth = draw_log_ratios(system, 64, 0.3, rng)
@@ -135,7 +138,7 @@ def test_other_systems_are_identified_with_masses_and_element_sensors(text):
     assert 0.9 < (np.abs(z[refined.identifiable[refined.converged]]) < 1.96).mean() < 0.985
 
 
-def test_the_force_balance_holds_on_clean_windows(vehicle):
+def test_the_force_balance_holds_on_clean_windows(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     target, regressors = ForceBalance(system, system.window)(runs.clean[:8])
     ratio = torch.as_tensor(np.exp(truth[:8]))
@@ -145,13 +148,13 @@ def test_the_force_balance_holds_on_clean_windows(vehicle):
     assert float(wrong.norm() / target.norm()) > 0.1
 
 
-def test_magnitudes_are_the_absolute_discrete_fourier_transform():
+def test_magnitudes_are_the_absolute_discrete_fourier_transform() -> None:
     signal = torch.randn(2, 32, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     features = magnitudes(signal).reshape(2, 17, 3)
     assert np.allclose(features[1, :, 2], np.abs(np.fft.fft(signal[1, :, 2].numpy()))[:17])
 
 
-def test_identifiability_names_what_a_window_cannot_tell():
+def test_identifiability_names_what_a_window_cannot_tell() -> None:
     std = identifiability(load_system())
     assert np.all(std < 0.05)
     assert std[12:20].min() > std[:8].max()  # primary dampings are the hardest

@@ -13,7 +13,7 @@ from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refiner
 from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.fusion import motion, motion_noise, motion_shares
-from sprung.model.system import BUNDLED, load_system, parse_system
+from sprung.model.system import BUNDLED, System, load_system, parse_system
 from tests.test_system import QUARTER_CAR
 
 D, V, A = (
@@ -24,16 +24,16 @@ D, V, A = (
 MIXES = {"d": [D], "v": [V], "a": [A], "da": [D, A], "va": [V, A], "dva": [D, V, A]}
 
 
-def car(mix: str):
+def car(mix: str) -> System:
     return parse_system(QUARTER_CAR.replace(f"{D}, {V}", ", ".join(MIXES[mix])))
 
 
-def axleboxes():
+def axleboxes() -> System:
     return load_system(BUNDLED / "axleboxes.yaml")
 
 
 @pytest.mark.parametrize("mix", MIXES)
-def test_errors_are_what_the_intervals_say_and_offsets_do_not_matter(mix):
+def test_errors_are_what_the_intervals_say_and_offsets_do_not_matter(mix: str) -> None:
     system = car(mix)
     rng = np.random.default_rng(4)
     truth = draw_log_ratios(system, 160, 0.4, rng)
@@ -55,7 +55,7 @@ def test_errors_are_what_the_intervals_say_and_offsets_do_not_matter(mix):
 
 
 @pytest.mark.parametrize("mix", MIXES)
-def test_more_signals_of_one_motion_tell_more_never_less(mix):
+def test_more_signals_of_one_motion_tell_more_never_less(mix: str) -> None:
     system, truth = car(mix), np.zeros((8, 4))
     std = {}
     for less in [mix, *(one for one in "dva" if one in mix)]:
@@ -66,7 +66,7 @@ def test_more_signals_of_one_motion_tell_more_never_less(mix):
         assert (std[mix] < 1.02 * of_less).all()
 
 
-def test_the_stated_deviation_is_the_bound_of_the_time_domain():
+def test_the_stated_deviation_is_the_bound_of_the_time_domain() -> None:
     system = axleboxes()
     rng = np.random.default_rng(3)
     _, clean, truth = draw_windows(system, (2,), 2, rng, per_ride=2)
@@ -78,7 +78,7 @@ def test_the_stated_deviation_is_the_bound_of_the_time_domain():
         assert ((ratio > 0.9) & (ratio < 1.2)).all()
 
 
-def test_axleboxes_alone_are_as_accurate_as_they_say_behind_filters_with_offsets_and_drift():
+def test_axleboxes_alone_are_as_accurate_as_they_say_behind_filters_with_offsets_and_drift() -> None:
     system = axleboxes()
     values, _, truth = draw_windows(system, BELOW[1].orders, 96, np.random.default_rng(21), per_ride=4)
     estimates = Identifier(system).identify(values)
@@ -93,14 +93,14 @@ def test_axleboxes_alone_are_as_accurate_as_they_say_behind_filters_with_offsets
     assert 0.95 < np.median([e.chi_square for e in estimates]) < 1.06
 
 
-def test_a_standing_vehicle_with_accelerometers_is_uninformative():
+def test_a_standing_vehicle_with_accelerometers_is_uninformative() -> None:
     system = axleboxes()
     noise = np.array([channel.noise for channel in system.channels])
     values = noise * np.random.default_rng(0).standard_normal((4, system.window, len(noise))) + 0.05
     assert not any(e.informative for e in Identifier(system).identify(values))
 
 
-def test_motion_comes_back_from_its_derivatives_up_to_what_they_leave_open():
+def test_motion_comes_back_from_its_derivatives_up_to_what_they_leave_open() -> None:
     t = np.arange(300) / 100
     w = 2 * np.pi * 3.0
     signals = {0: np.sin(w * t), 1: w * np.cos(w * t), 2: -(w**2) * np.sin(w * t)}
@@ -115,14 +115,14 @@ def test_motion_comes_back_from_its_derivatives_up_to_what_they_leave_open():
             assert np.abs(d - signals[0]).max() < 5e-3
 
 
-def test_exact_signals_are_taken_as_they_are():
+def test_exact_signals_are_taken_as_they_are() -> None:
     t = np.arange(100) / 100
     d, v = motion({0: np.sin(t), 2: np.full(100, 7.0)}, 0.01, {0: 0.0, 2: 0.1})
     assert np.allclose(d, np.sin(t))
     assert np.allclose(v, np.cos(t), atol=1e-4)
 
 
-def test_integrated_noise_has_the_stated_spectrum():
+def test_integrated_noise_has_the_stated_spectrum() -> None:
     rng = np.random.default_rng(0)
     noise = {1: 1e-3, 2: 0.1}
     d, _ = motion({order: std * rng.standard_normal((600, 256)) for order, std in noise.items()}, 0.01, noise)
@@ -138,7 +138,7 @@ def test_integrated_noise_has_the_stated_spectrum():
     assert shares[1][0] > shares[1][-1]
 
 
-def test_trends_are_added_where_integration_leaves_them_open():
+def test_trends_are_added_where_integration_leaves_them_open() -> None:
     system = car("a")
     model = WindowModel(system, system.window)
     present = np.ones(4, dtype=bool)

@@ -11,7 +11,7 @@ from sprung.model.laws.trajectory import along
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0, 5.3, 8.0])
 @pytest.mark.parametrize("gamma", [-4.0, -1.375, 0.5, 4.0])
-def test_bouc_wen_stays_finite_where_the_tabulated_way_stands_still(exponent, gamma):
+def test_bouc_wen_stays_finite_where_the_tabulated_way_stands_still(exponent: float, gamma: float) -> None:
     """Growing branches with large exponents end on a plateau of the table: far motions are cut there."""
     time = np.arange(2000) / 200
     deflection = 0.5 * np.sin(2 * np.pi * time) + 0.2 * np.sin(7 * time)
@@ -20,7 +20,7 @@ def test_bouc_wen_stays_finite_where_the_tabulated_way_stands_still(exponent, ga
 
 
 @pytest.mark.parametrize("exponent", [5.3, 8.0])
-def test_large_exponents_agree_with_integration(exponent):
+def test_large_exponents_agree_with_integration(exponent: float) -> None:
     time = np.arange(4000) / 1000
     d = 3e-3 * np.sin(2 * np.pi * 1.3 * time) + 1e-3 * np.sin(2 * np.pi * 4.1 * time + 1)
     v = np.gradient(d, time)

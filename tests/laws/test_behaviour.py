@@ -1,5 +1,7 @@
 """What a law carries beside its force: branch, path, other starts, prior cost."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ V = np.gradient(D, TIME)
 
 
 @pytest.mark.parametrize(("name", "p"), [("series_stiffness", (1.2e6,)), ("air_spring", (3e5, 0.2))])
-def test_a_branch_is_the_law_that_its_memory_integrates(name, p):
+def test_a_branch_is_the_law_that_its_memory_integrates(name: str, p: tuple[float, ...]) -> None:
     law, element = find_law(name), SpringDamper(4e5, 2e4)
     branch = law.branch(p, element.damping)
     stepped = along(law, p, D, V, sample_rate=1000.0, element=element)
@@ -37,14 +39,14 @@ PATHS = {
 
 
 @pytest.mark.parametrize("law", [law for law in CATALOGUE if isinstance(law, ElementLaw) and law.path])
-def test_a_path_is_the_law_that_its_memory_integrates(law):
+def test_a_path_is_the_law_that_its_memory_integrates(law: ElementLaw) -> None:
     for one in (law, law.wider) if law.wider is not None else (law,):
         p, element = PATHS[one.name][: len(one.parameters)], SpringDamper(4e5, 2e4)
         slow = along(one, p, D, V, sample_rate=1000.0, element=element)
         np.testing.assert_allclose(force_along(one, p, D, V, TIME, element), slow, atol=0.01 * np.abs(slow).max())
 
 
-def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike():
+def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike() -> None:
     read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0, rate=0.05)
     (restart,) = find_law("series_stiffness").restarts(read)
     c, (ks,) = restart.damping * read.damping, restart.parameters
@@ -54,13 +56,13 @@ def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alik
     assert restart.stiffness == pytest.approx(max(softer, 0.5))
 
 
-def test_a_damper_without_a_spring_beside_it_has_other_starts_too():
+def test_a_damper_without_a_spring_beside_it_has_other_starts_too() -> None:
     """A slide on a guide: what is read has no stiffness."""
     (restart,) = find_law("series_stiffness").restarts(FittedElement(0.0, 200.0, 400.0, 12.0, 0.05))
     assert restart.stiffness == 1.0 and np.all(np.isfinite(restart.parameters))
 
 
-def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest():
+def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest() -> None:
     t = np.arange(4000) / 400
     rate = np.where(t < 2, np.cos(2 * np.pi * 20 * t + 0.1), 1e-9 * np.cos(2 * np.pi * 90 * t))
     assert reversal_step(rate) == pytest.approx(2 * np.pi * 20 / 400, rel=0.05)
@@ -68,11 +70,11 @@ def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest
 
 
 @pytest.mark.parametrize("p", [(9e4, 300.0, 1.0), (9e4, 300.0**2, 2.0, 0.2)])
-def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p):
+def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p: tuple[float, ...]) -> None:
     law = find_law("bouc_wen") if len(p) == 3 else find_law("bouc_wen").wider
     way = np.linspace(0, 1.0, 200)  # far beyond yielding
 
-    def yields(values):
+    def yields(values: Sequence[float]) -> float:
         return force_along(law, values, way, np.ones(200), np.arange(200) / 200, SpringDamper(4e5, 2e4))[-1]
 
     others = law.alike(p)
@@ -82,7 +84,7 @@ def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p):
         assert law.admits(other)
 
 
-def test_laws_that_contain_commoner_ones_must_beat_them():
+def test_laws_that_contain_commoner_ones_must_beat_them() -> None:
     rare = {law.name for law in CATALOGUE if law.prior_cost == RARE}
     assert rare == {
         *("air_spring", "fractional_stiffness", "anti_roll_bar", "wheel_flat", "rail_joints"),
@@ -91,7 +93,7 @@ def test_laws_that_contain_commoner_ones_must_beat_them():
     }
 
 
-def test_laws_of_rigs_are_no_candidates_for_a_vehicle():
+def test_laws_of_rigs_are_no_candidates_for_a_vehicle() -> None:
     """What needs the force of the element itself to be told from its look-alikes."""
     kept = {law.name for law in CATALOGUE if isinstance(law, ElementLaw) and not law.screened}
     assert kept == {

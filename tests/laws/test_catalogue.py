@@ -8,6 +8,8 @@ import pytest
 from sprung.model.laws import (
     CATALOGUE,
     ElementLaw,
+    Law,
+    Observed,
     SpringDamper,
     find_law,
     observe,
@@ -15,6 +17,7 @@ from sprung.model.laws import (
 from sprung.model.laws.base import CLOCK_LEAD, Motion
 from sprung.model.laws.stiffness import CLEARANCE
 from sprung.model.laws.trajectory import along, phi
+from sprung.model.signals import FloatArray
 
 SPRING = SpringDamper(4.3e5, 2.0e4)
 RATE = 1000.0
@@ -29,26 +32,28 @@ ONE_SIDED = {
 FEEDING = {"time_varying_stiffness"}  # a spring that stiffens while it is compressed gives more than it took
 
 
-def cycle(amplitude=0.004, frequency=1.25, seconds=8.0, rate=RATE):
+def cycle(
+    amplitude: float = 0.004, frequency: float = 1.25, seconds: float = 8.0, rate: float = RATE
+) -> tuple[FloatArray, FloatArray, float]:
     """A sine with whole periods: deflection, velocity, angular frequency."""
     t = np.arange(int(seconds * rate)) / rate
     omega = 2 * np.pi * frequency
     return amplitude * np.sin(omega * t), amplitude * omega * np.cos(omega * t), omega
 
 
-def seen():
+def seen() -> Observed:
     rng = np.random.default_rng(1)
     d = 0.003 * rng.standard_normal(2000)
     return observe(d, 0.05 * rng.standard_normal(2000), 100.0, *SPRING)
 
 
-def trial(law: ElementLaw):
+def trial(law: ElementLaw) -> FloatArray:
     trials = law.shapes(seen())
     return trials[len(trials) // 2]
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_every_trial_is_admissible_and_finite(law):
+def test_every_trial_is_admissible_and_finite(law: ElementLaw) -> None:
     trials = law.shapes(seen())
     assert trials.shape[1] == len(law.parameters) and len(trials) >= 1
     assert np.isfinite(trials).all()
@@ -57,7 +62,7 @@ def test_every_trial_is_admissible_and_finite(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_a_batch_of_trials_gives_what_each_gives_alone(law):
+def test_a_batch_of_trials_gives_what_each_gives_alone(law: ElementLaw) -> None:
     d, v, _ = cycle(seconds=1.6)
     trials = law.shapes(seen())
     together = along(law, trials.T[:, :, None], d, v, sample_rate=RATE, element=SPRING)
@@ -67,7 +72,7 @@ def test_a_batch_of_trials_gives_what_each_gives_alone(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_a_law_vanishes_at_its_absent_values(law):
+def test_a_law_vanishes_at_its_absent_values(law: ElementLaw) -> None:
     d, v, _ = cycle(0.02, seconds=1.6)
     absent = np.array(law.absent)
     present = np.abs(along(law, tuple(trial(law)), d, v, sample_rate=RATE, element=SPRING)).max()
@@ -79,7 +84,7 @@ def test_a_law_vanishes_at_its_absent_values(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_the_force_is_linear_in_the_strength_where_the_law_says_so(law):
+def test_the_force_is_linear_in_the_strength_where_the_law_says_so(law: ElementLaw) -> None:
     if law.strength is None:
         pytest.skip("no parameter is a strength")
     d, v, _ = cycle(seconds=1.6)
@@ -90,7 +95,7 @@ def test_the_force_is_linear_in_the_strength_where_the_law_says_so(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_symmetry_is_as_declared(law):
+def test_symmetry_is_as_declared(law: ElementLaw) -> None:
     d, v, _ = cycle(seconds=1.6)
     p = tuple(trial(law))
     there = along(law, p, d, v, sample_rate=RATE, element=SPRING)
@@ -99,7 +104,7 @@ def test_symmetry_is_as_declared(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_a_passive_element_creates_no_energy_over_a_cycle(law):
+def test_a_passive_element_creates_no_energy_over_a_cycle(law: ElementLaw) -> None:
     if law.name in FEEDING:
         pytest.skip("feeds energy by nature")
     for amplitude in (0.0005, 0.004, 0.02):
@@ -112,7 +117,7 @@ def test_a_passive_element_creates_no_energy_over_a_cycle(law):
 
 
 @pytest.mark.parametrize("law", LAWS, ids=ids)
-def test_the_force_changes_smoothly_with_every_parameter(law):
+def test_the_force_changes_smoothly_with_every_parameter(law: ElementLaw) -> None:
     d, v, _ = cycle(0.02, seconds=1.6)
     p = trial(law)
     base = along(law, tuple(p), d, v, sample_rate=RATE, element=SPRING)
@@ -130,7 +135,7 @@ def test_the_force_changes_smoothly_with_every_parameter(law):
 
 
 @pytest.mark.parametrize("law", CATALOGUE, ids=[law.name for law in CATALOGUE])
-def test_words_are_complete_and_look_alikes_exist(law):
+def test_words_are_complete_and_look_alikes_exist(law: Law) -> None:
     names = {other.name for other in CATALOGUE} | {"unknown"}
     assert law.looks_like and law.title
     assert set(law.confused_with) <= names - {law.name}
@@ -140,7 +145,7 @@ def test_words_are_complete_and_look_alikes_exist(law):
         assert parameter.low < parameter.high and parameter.unit and parameter.meaning
 
 
-def test_the_contracts_effects_are_all_there_with_parameters_in_its_order():
+def test_the_contracts_effects_are_all_there_with_parameters_in_its_order() -> None:
     expected = {
         "cubic_stiffness": ("k3",),
         "bump_stop": ("gap", "stiffness"),
@@ -166,45 +171,45 @@ def test_the_contracts_effects_are_all_there_with_parameters_in_its_order():
         assert find_law(name).names[: len(parameters)] == parameters
 
 
-def test_an_unknown_name_is_refused_with_the_names_there_are():
+def test_an_unknown_name_is_refused_with_the_names_there_are() -> None:
     with pytest.raises(ValueError, match="coulomb_friction"):
         find_law("colomb")
 
 
-def test_clearance_leaves_no_spring_force_inside_the_gap_and_full_slope_outside():
+def test_clearance_leaves_no_spring_force_inside_the_gap_and_full_slope_outside() -> None:
     d = np.linspace(-0.01, 0.01, 2001)
     total = SPRING.stiffness * d + CLEARANCE.force(Motion(d, 0 * d), (0.002,), SPRING)
     assert np.abs(total[np.abs(d) <= 0.002]).max() < 1e-9
     np.testing.assert_allclose(total[d > 0.0021], SPRING.stiffness * (d[d > 0.0021] - 0.002), rtol=1e-9)
 
 
-def test_friction_dissipates_four_f_a_per_cycle():
+def test_friction_dissipates_four_f_a_per_cycle() -> None:
     d, v, _ = cycle(0.004, 1.25, 0.8, rate=100_000.0)
     force = along(find_law("coulomb_friction"), (300.0, 1e-5), d, v, sample_rate=1e5, element=SPRING)
     assert np.sum(force * v) / 1e5 == pytest.approx(4 * 300.0 * 0.004, rel=1e-3)
 
 
-def test_quadratic_damping_dissipates_its_closed_form():
+def test_quadratic_damping_dissipates_its_closed_form() -> None:
     d, v, omega = cycle(0.004, 1.25, 0.8)
     force = along(find_law("quadratic_damping"), (3e5,), d, v, sample_rate=RATE, element=SPRING)
     peak = 0.004 * omega  # 8/3 c2 (A omega)^2 A per cycle
     assert np.sum(force * v) / RATE == pytest.approx(8 / 3 * 3e5 * peak**2 * 0.004, rel=1e-4)
 
 
-def test_the_cubic_has_three_quarters_of_its_peak_in_the_fundamental():
+def test_the_cubic_has_three_quarters_of_its_peak_in_the_fundamental() -> None:
     d, v, _ = cycle()
     force = along(find_law("cubic_stiffness"), (1e9,), d, v, sample_rate=RATE, element=SPRING)
     fundamental = 2 * np.mean(force * d) / 0.004  # amplitude of the sine part
     assert fundamental == pytest.approx(0.75 * 1e9 * 0.004**3, rel=1e-9)
 
 
-def test_bump_stop_stores_half_kb_times_squared_penetration():
+def test_bump_stop_stores_half_kb_times_squared_penetration() -> None:
     d = np.linspace(0, 0.01, 100_001)
     force = find_law("bump_stop").force(Motion(d, 0 * d), (0.004, 2e6), SPRING)
     assert np.trapezoid(force, d) == pytest.approx(0.5 * 2e6 * 0.006**2, rel=1e-6)
 
 
-def test_blow_off_and_asymmetry_have_the_contracts_slopes():
+def test_blow_off_and_asymmetry_have_the_contracts_slopes() -> None:
     v = np.linspace(-0.2, 0.2, 4001)
     c = SPRING.damping
     slope = np.gradient(c * v + find_law("damper_blowoff").force(Motion(0 * v, v), (0.05, 0.3), SPRING), v)
@@ -216,7 +221,7 @@ def test_blow_off_and_asymmetry_have_the_contracts_slopes():
 
 
 @pytest.mark.parametrize("name, branch", [("series_stiffness", True), ("air_spring", False)])
-def test_branches_have_the_frequency_response_of_a_maxwell_element(name, branch):
+def test_branches_have_the_frequency_response_of_a_maxwell_element(name: str, branch: bool) -> None:
     d, v, omega = cycle(frequency=5.0)
     ks, c = 1.2e6, SPRING.damping
     p = (ks,) if branch else (ks, c / ks)
@@ -229,7 +234,7 @@ def test_branches_have_the_frequency_response_of_a_maxwell_element(name, branch)
     np.testing.assert_allclose(phasor, expected, rtol=1e-5)
 
 
-def test_bouc_wen_saturates_at_its_yield_deflection():
+def test_bouc_wen_saturates_at_its_yield_deflection() -> None:
     t = np.arange(2000) / 1e3
     d, v = 0.01 * t, np.full_like(t, 0.01)
     beta, alpha = 700.0, 9e4
@@ -238,14 +243,14 @@ def test_bouc_wen_saturates_at_its_yield_deflection():
     np.testing.assert_allclose(force, expected, rtol=1e-8, atol=1e-8)
 
 
-def test_drift_starts_before_the_recording():
+def test_drift_starts_before_the_recording() -> None:
     d, v, _ = cycle()
     force = along(find_law("time_varying_stiffness"), (0.2, 16.0), d, v, sample_rate=RATE, element=SPRING)
     t = np.arange(len(d)) / RATE + CLOCK_LEAD
     np.testing.assert_allclose(force, SPRING.stiffness * 0.2 * (1 - np.exp(-t / 16.0)) * d, rtol=1e-9, atol=1e-6)
 
 
-def test_a_dip_has_its_depth_and_its_rate_is_the_slope():
+def test_a_dip_has_its_depth_and_its_rate_is_the_slope() -> None:
     law = find_law("wheel_flat")
     t = np.arange(20_000) / 20_000
     moved, rate = law.movement(t, (1e-3, 4.0, 0.2))
@@ -255,7 +260,7 @@ def test_a_dip_has_its_depth_and_its_rate_is_the_slope():
     np.testing.assert_allclose(both[1], law.movement(t, (1e-3, 4.0, 0.2), highest=13.0)[0], atol=1e-12)
 
 
-def test_phi_functions_are_accurate_where_series_and_recursion_meet():
+def test_phi_functions_are_accurate_where_series_and_recursion_meet() -> None:
     x = -np.logspace(-8, 3, 400)
     e, one, two, three = phi(x)
     np.testing.assert_allclose(x * one + 1, e, rtol=1e-12, atol=1e-14)
@@ -264,7 +269,7 @@ def test_phi_functions_are_accurate_where_series_and_recursion_meet():
     assert phi(np.array(-1e-9))[3] == pytest.approx(1 / 6, rel=1e-8)
 
 
-def test_valves_of_a_damper_that_is_harder_in_one_direction_keep_their_forces_ratio():
+def test_valves_of_a_damper_that_is_harder_in_one_direction_keep_their_forces_ratio() -> None:
     a, knee, ratio, v = 0.3, 0.05, 0.25, np.linspace(-0.2, 0.2, 4001)
     valves = find_law("damper_blowoff").force(Motion(0 * v, v), (knee, ratio), SPRING)
     harder = find_law("damper_asymmetry").wider.force(Motion(0 * v, v), (a, knee, ratio), SPRING)
@@ -272,7 +277,7 @@ def test_valves_of_a_damper_that_is_harder_in_one_direction_keep_their_forces_ra
     np.testing.assert_allclose(SPRING.damping * v + valves + harder, (1 + a * np.sign(v)) * one_way, atol=1e-9)
 
 
-def test_stops_of_either_side_have_gaps_and_stiffnesses_of_their_own():
+def test_stops_of_either_side_have_gaps_and_stiffnesses_of_their_own() -> None:
     d = np.array([-0.03, -0.02, -0.01, 0.0, 0.01, 0.02])
     force = find_law("bump_stop").wider.force(Motion(d, 0 * d), (0.015, 2e5, 0.02, 3e5), SPRING)
     np.testing.assert_allclose(force, [-3e3, 0.0, 0.0, 0.0, 0.0, 1e3], atol=1e-9)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sprung.model.laws import CATALOGUE, SpringDamper, load_laws, observe
+from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, load_laws, observe
 from sprung.model.laws.own import LawFileError
 from sprung.model.laws.trajectory import along
 from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement
@@ -22,14 +22,14 @@ def example() -> str:
 
 
 @pytest.fixture
-def law(tmp_path):
+def law(tmp_path: Path) -> ElementLaw:
     path = tmp_path / "my_laws.py"
     path.write_text(example(), encoding="utf-8")
     (found,) = load_laws(path, tuple(law.name for law in CATALOGUE))
     return found
 
 
-def test_the_documented_law_screens_like_any_other(law):
+def test_the_documented_law_screens_like_any_other(law: ElementLaw) -> None:
     rng = np.random.default_rng(0)
     d, v = 0.003 * rng.standard_normal(500), 0.05 * rng.standard_normal(500)
     seen = observe(d, v, 100.0, 4e5, 2e4)
@@ -41,7 +41,7 @@ def test_the_documented_law_screens_like_any_other(law):
     assert (forces * v >= 0).all()
 
 
-def test_the_documented_law_runs_in_the_simulation_and_takes_out_energy(law):
+def test_the_documented_law_runs_in_the_simulation_and_takes_out_energy(law: ElementLaw) -> None:
     mechanics = load_system().mechanics
     x0 = np.zeros(2 * mechanics.n)
     x0[0] = 0.01
@@ -52,7 +52,7 @@ def test_the_documented_law_runs_in_the_simulation_and_takes_out_energy(law):
     assert np.abs(damped.states[-50:, 0]).max() < 0.8 * np.abs(free.states[-50:, 0]).max()
 
 
-def test_the_table_names_every_law_and_parameter():
+def test_the_table_names_every_law_and_parameter() -> None:
     text = DOCUMENT.read_text(encoding="utf-8")
     for law in CATALOGUE:
         rows = [line for line in text.splitlines() if line.startswith(f"| `{law.name}`")]
@@ -60,7 +60,7 @@ def test_the_table_names_every_law_and_parameter():
         assert [] in missing, (law.name, missing)  # a law in two forms has two rows
 
 
-def test_a_file_without_laws_is_refused_in_one_line(tmp_path):
+def test_a_file_without_laws_is_refused_in_one_line(tmp_path: Path) -> None:
     path = tmp_path / "empty.py"
     path.write_text("x = 1\n", encoding="utf-8")
     with pytest.raises(LawFileError, match="no law is defined"):

@@ -16,7 +16,7 @@ V = np.gradient(D, TIME)
 SEEN = observe(D, V, 400.0, 4e5, 2e4)
 
 
-def test_every_shape_is_a_law_with_trials_along_a_motion():
+def test_every_shape_is_a_law_with_trials_along_a_motion() -> None:
     for form in forms():
         law = law_of((form,))
         trials = law.shapes(SEEN)
@@ -26,29 +26,29 @@ def test_every_shape_is_a_law_with_trials_along_a_motion():
             assert force.shape == D.shape and np.any(force)
 
 
-def test_units_make_the_product_a_force():
+def test_units_make_the_product_a_force() -> None:
     assert Shape(OF_DEFLECTION[0], OF_RATE[1]).unit == "N s/m^2"  # d |v|
     assert Shape(OF_DEFLECTION[3]).unit == "N/m^2"  # d^2
     assert Shape(Factor("sin(d / L)", inner="L")).unit == "N"
     assert Shape(OF_RATE[2]).unit == "N s^2/m^2"  # v |v|
 
 
-def test_spring_and_damper_are_no_formulas():
+def test_spring_and_damper_are_no_formulas() -> None:
     assert not {"d", "v"} & {form.text for form in forms()}
 
 
-def test_more_parts_cost_more():
+def test_more_parts_cost_more() -> None:
     assert formula_cost(1) < formula_cost(2) < formula_cost(4)
 
 
-def test_a_sum_names_its_values_apart():
+def test_a_sum_names_its_values_apart() -> None:
     one, other = Shape(Factor("sin(d / L)", inner="L")), Shape(Factor("max(d - L, 0)", 1, inner="L"))
     law = law_of((one, other))
     assert law.formula == "a * sin(d / L) + b * max(d - L2, 0)"
     assert law.names == ("a", "L", "b", "L2")
 
 
-def test_the_hidden_state_is_filtered_as_it_is_integrated():
+def test_the_hidden_state_is_filtered_as_it_is_integrated() -> None:
     law = law_of((Shape(Factor("z**2", 2), memory=True),))
     p = (3e7, 0.08)
     assert law.path is not None

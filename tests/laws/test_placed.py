@@ -6,7 +6,7 @@ import pytest
 
 from sprung.model.identification.estimator import bundled_estimator
 from sprung.model.schema import SystemFileError
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import System, load_system, parse_system
 
 TEXT = """
 name: quarter-car
@@ -26,7 +26,7 @@ sensors:
 """
 
 
-def system(strut: str = "", sensor: str = ""):
+def system(strut: str = "", sensor: str = "") -> System:
     return parse_system(TEXT % (strut, sensor))
 
 

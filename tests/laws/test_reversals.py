@@ -10,7 +10,7 @@ from sprung.model.laws.trajectory import along
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5, 2.0])
 @pytest.mark.parametrize("gamma", [0.5, -1.4, -1.0, 0.0, 1.5])
-def test_bouc_wen_from_reversal_to_reversal_agrees_with_integration(exponent, gamma):
+def test_bouc_wen_from_reversal_to_reversal_agrees_with_integration(exponent: float, gamma: float) -> None:
     time = np.arange(6000) / 1000
     d = 3e-3 * np.sin(2 * np.pi * 1.3 * time) + 1e-3 * np.sin(2 * np.pi * 4.1 * time + 1)
     v = np.gradient(d, time)

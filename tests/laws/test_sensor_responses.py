@@ -5,6 +5,7 @@ import pytest
 
 from sprung.model.laws import CATALOGUE, SensorLaw, find_law
 from sprung.model.laws.base import SensorResponse
+from sprung.model.signals import FloatArray
 
 LAWS = [
     pytest.param(form, id=f"{law.name} {variant}".strip())
@@ -15,12 +16,12 @@ LAWS = [
 VALUES = {"gain": 0.87, "time": 0.0075, "offset": 0.4, "delay": -0.002}
 
 
-def signal(time):
+def signal(time: FloatArray) -> FloatArray:
     return np.sin(2 * np.pi * 3.3 * time) + 0.4 * np.cos(2 * np.pi * 11 * time + 1) + 0.2 * time
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_a_sine_comes_out_as_the_response_says(law):
+def test_a_sine_comes_out_as_the_response_says(law: SensorLaw) -> None:
     time, frequency = np.arange(1000) / 200, 4.0
     p = tuple(VALUES[name] for name in law.names)
     r = law.response(p)
@@ -32,7 +33,7 @@ def test_a_sine_comes_out_as_the_response_says(law):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_every_form_is_undone(law):
+def test_every_form_is_undone(law: SensorLaw) -> None:
     time = np.arange(600) / 100
     p = tuple(VALUES[name] for name in law.names)
     restored = law.restore(law.distort(signal(time), p, 100.0), p, 100.0)
@@ -40,12 +41,12 @@ def test_every_form_is_undone(law):
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_none_of_the_fault_changes_nothing(law):
+def test_none_of_the_fault_changes_nothing(law: SensorLaw) -> None:
     assert law.response(law.absent) == SensorResponse()
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_two_faults_after_each_other_combine(law):
+def test_two_faults_after_each_other_combine(law: SensorLaw) -> None:
     first, second = VALUES[law.names[0]], 1.1 * VALUES[law.names[0]]
     rest = law.absent[1:]
     both = law.response((law.combined(first, second), *rest))
@@ -55,12 +56,12 @@ def test_two_faults_after_each_other_combine(law):
         assert getattr(both, quantity) == pytest.approx(getattr(one, quantity) + getattr(other, quantity))
 
 
-def test_sensor_lag_is_a_delay_and_its_first_order_forms_have_names():
+def test_sensor_lag_is_a_delay_and_its_first_order_forms_have_names() -> None:
     law = find_law("sensor_lag")
     assert law.response((0.01,)) == SensorResponse(delay=0.01)
     assert list(law.forms) == ["first order", "first order and delay"]
 
 
-def test_a_stuck_sensor_cannot_be_restored():
+def test_a_stuck_sensor_cannot_be_restored() -> None:
     with pytest.raises(ValueError, match="nothing is left"):
         find_law("sensor_stuck").restore(np.zeros(4), (), 100.0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from sprung.model.laws import ElementLaw, find_law
-from sprung.model.laws.spline import Axis, Surface, estimate_force
+from sprung.model.laws.spline import Axis, LatentForce, Surface, estimate_force
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.nonlinear import DiscreteSystem, NonlinearSimulator, Placement
+from sprung.model.simulate.nonlinear import DiscreteSystem, NonlinearRun, NonlinearSimulator, Placement
 from sprung.model.simulate.stepping import cubic_chain, exact_steps
 from sprung.model.system import parse_system
 
@@ -33,9 +34,10 @@ sensors:
   a_wheel: {kind: acceleration, body: wheel, noise: 0.05, csv: s2}
 """
 MECHANICS = parse_system(SYSTEM).mechanics
+Force = Callable[[FloatArray, FloatArray], FloatArray]  # of deflection, m, and rate, m/s; N
 
 
-def hidden(name: str, force) -> ElementLaw:
+def hidden(name: str, force: Force) -> ElementLaw:
     """A law that is not in the catalogue."""
     return replace(find_law("damper_asymmetry"), name=name, force=lambda m, p, e: force(m.deflection, m.rate))
 
@@ -56,7 +58,7 @@ def road(seed: int) -> FloatArray:
     return np.stack([(size * np.sin(angle)).sum(1), (size * 2 * np.pi * f * np.cos(angle)).sum(1)], axis=1)
 
 
-def respond_of(model: DiscreteSystem):
+def respond_of(model: DiscreteSystem) -> Callable[[FloatArray], FloatArray]:
     """Whitened answers of the sensors to forces (T, m) along the strut."""
     n = model.mechanics.n
     pull = np.concatenate([np.zeros(n), -model.mechanics.H[1] / model.mechanics.mass])[:, None]
@@ -74,7 +76,7 @@ def respond_of(model: DiscreteSystem):
     return respond
 
 
-def found(name: str, rounds: int = 4, seed: int = 0):
+def found(name: str, rounds: int = 4, seed: int = 0) -> tuple[LatentForce, NonlinearRun, NonlinearRun]:
     """Measure, then let the estimate of the surface and the fit of the strut's spring and damper take turns."""
     knots, rng = road(seed), np.random.default_rng(seed + 100)
     simulator = NonlinearSimulator(MECHANICS, RATE)
@@ -101,7 +103,7 @@ def found(name: str, rounds: int = 4, seed: int = 0):
     return truth, latent, run
 
 
-def without_linear(latent, d, v, force):
+def without_linear(latent: LatentForce, d: FloatArray, v: FloatArray, force: Force) -> FloatArray:
     """The force less what spring, damper and a static load explain along the estimated motion."""
     seen_d, seen_v = latent.surface.motion
     columns = np.stack([np.ones(len(seen_d)), seen_d, seen_v], axis=1)
@@ -109,7 +111,7 @@ def without_linear(latent, d, v, force):
     return force(d, v) - (weights[0] + weights[1] * d + weights[2] * v)
 
 
-def total(run) -> FloatArray:
+def total(run: NonlinearRun) -> FloatArray:
     """Force of the strut over time, less its mean, which no accelerometer sees."""
     m = run.model.mechanics
     force = m.stiffness[1] * run.deflection[:, 1] + m.damping[1] * run.rate[:, 1] + run.force[:, 0]
@@ -117,7 +119,7 @@ def total(run) -> FloatArray:
 
 
 @pytest.mark.parametrize("name", ["quadratic stiffness", "position-dependent damping"])
-def test_the_force_is_the_one_that_was_put_in(name):
+def test_the_force_is_the_one_that_was_put_in(name: str) -> None:
     truth, latent, run = found(name, rounds=2)
     d, v = truth.deflection[:, 1], truth.rate[:, 1]
     left = total(run) - total(truth)
@@ -126,7 +128,7 @@ def test_the_force_is_the_one_that_was_put_in(name):
     assert latent.log_evidence > 50
 
 
-def test_the_band_holds_the_truth_as_often_as_it_says():
+def test_the_band_holds_the_truth_as_often_as_it_says() -> None:
     run = NonlinearSimulator(MECHANICS, RATE).run(road(1), [])
     d, v = run.deflection[:, 1], run.rate[:, 1]
     surface, respond = Surface.over(d, v), respond_of(run.model)
@@ -145,7 +147,7 @@ def test_the_band_holds_the_truth_as_often_as_it_says():
     assert 0.88 < np.mean(inside) < 0.995
 
 
-def test_the_surface_as_a_law_explains_a_recording_that_it_never_saw():
+def test_the_surface_as_a_law_explains_a_recording_that_it_never_saw() -> None:
     name = "position-dependent damping"
     _, latent, fitted = found(name, rounds=2)
     fresh = road(7)
@@ -157,14 +159,14 @@ def test_the_surface_as_a_law_explains_a_recording_that_it_never_saw():
     assert (np.std(after, axis=0) < 0.3 * np.std(before, axis=0)).all()
 
 
-def test_nothing_is_found_where_nothing_is():
+def test_nothing_is_found_where_nothing_is() -> None:
     _, latent, _ = found("nothing", rounds=1)
     d, v = latent.surface.motion
     assert latent.log_evidence < 3
     assert np.abs(latent.force(d, v)).mean() < 2 * latent.std(d, v).mean()
 
 
-def test_the_surface_leaves_spring_and_damper_alone():
+def test_the_surface_leaves_spring_and_damper_alone() -> None:
     _, latent, _ = found("quadratic stiffness", rounds=1)
     d, v = latent.surface.motion
     force = latent.force(d, v)
@@ -173,14 +175,14 @@ def test_the_surface_leaves_spring_and_damper_alone():
         assert abs(share) < 1e-6
 
 
-def test_a_map_for_drawing():
+def test_a_map_for_drawing() -> None:
     _, latent, _ = found("quadratic stiffness", rounds=1)
     drawn = latent.map((21, 15))
     assert drawn.force.shape == drawn.std.shape == (15, 21)
     assert (drawn.std > 0).all()
 
 
-def test_splines_are_a_partition_of_one_and_reproduce_lines():
+def test_splines_are_a_partition_of_one_and_reproduce_lines() -> None:
     axis = Axis(2.0, 6)
     x = np.linspace(-2, 2, 101)
     basis = axis.basis(x)

@@ -1,10 +1,15 @@
 """CAN decoding in blocks gives what cantools gives frame by frame, and counts every frame."""
 
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
 import cantools
 import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
 from cantools.database.conversion import BaseConversion
+from numpy.typing import ArrayLike
 
 from sprung.model.signals import Channel
 from sprung.replay.account import Account, UnreadableRecording
@@ -14,11 +19,11 @@ from sprung.replay.frames import EXTENDED, FrameBlock, id_text, raw_bits
 START = 1_790_000_000_000_000_000
 
 
-def conversion(scale=1, offset=0, is_float=False, choices=None):
+def conversion(scale: float = 1, offset: float = 0, is_float: bool = False, choices: Any = None) -> BaseConversion:
     return BaseConversion.factory(scale=scale, offset=offset, is_float=is_float, choices=choices)
 
 
-def block(payloads, frame_id, width=8):
+def block(payloads: Sequence[bytes], frame_id: ArrayLike, width: int = 8) -> FrameBlock:
     """Frames 1 ms apart."""
     n = len(payloads)
     data = np.zeros((n, width), dtype=np.uint8)
@@ -29,11 +34,11 @@ def block(payloads, frame_id, width=8):
     return FrameBlock(START + np.arange(n) * 1_000_000, ids, length, data)
 
 
-def channels_of(*messages):
+def channels_of(*messages: Message) -> list[Channel]:
     return [Channel(f"{m.name}.{s.name}", "1", 1.0, can=f"{m.name}.{s.name}") for m in messages for s in m.signals]
 
 
-def random_signal(rng, name, size):
+def random_signal(rng: np.random.Generator, name: str, size: int) -> Signal:
     """A signal anywhere in `size` bytes: either byte order, signed, unsigned or float, scaled."""
     is_float = rng.random() < 0.2
     length = int(rng.choice([16, 32, 64])) if is_float else int(rng.integers(1, 65))
@@ -54,7 +59,7 @@ def random_signal(rng, name, size):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_random_layouts_decode_as_cantools_does(seed):
+def test_random_layouts_decode_as_cantools_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = int(rng.choice([8, 8, 3, 12, 24, 64]))
     extended = bool(rng.random() < 0.5)
@@ -83,13 +88,13 @@ def test_random_layouts_decode_as_cantools_does(seed):
                 assert values[row, column] == pytest.approx(truth, rel=1e-12, abs=1e-12), (name, payload)
 
 
-def last_bit(signal):
+def last_bit(signal: Signal) -> int:
     if signal.byte_order == "big_endian":
         return 8 * (signal.start // 8) + 7 - signal.start % 8 + signal.length - 1
     return signal.start + signal.length - 1
 
 
-def bits_of(signal):
+def bits_of(signal: Signal) -> set[tuple[int, int]]:
     """(byte, bit) of every bit of the signal."""
     if signal.byte_order == "big_endian":
         return {
@@ -98,7 +103,7 @@ def bits_of(signal):
     return {(place // 8, place % 8) for place in range(signal.start, signal.start + signal.length)}
 
 
-def test_every_single_bit_of_a_long_frame_is_found_in_both_byte_orders():
+def test_every_single_bit_of_a_long_frame_is_found_in_both_byte_orders() -> None:
     for bit in range(512):
         data = np.zeros((1, 64), dtype=np.uint8)
         data[0, bit // 8] = 1 << (bit % 8)
@@ -107,7 +112,7 @@ def test_every_single_bit_of_a_long_frame_is_found_in_both_byte_orders():
         assert raw_bits(data ^ 0xFF, bit, 1, big_endian=True)[0] == 0
 
 
-def multiplexed():
+def multiplexed() -> Message:
     """Two values that share their bits, chosen by `mode`, whose second case is itself multiplexed."""
     return Message(
         0x200,
@@ -122,7 +127,7 @@ def multiplexed():
     )
 
 
-def test_multiplexed_signals_are_taken_only_from_frames_that_select_them():
+def test_multiplexed_signals_are_taken_only_from_frames_that_select_them() -> None:
     message = multiplexed()
     channels = [Channel("a", "1", 1.0, can="Mux.a"), Channel("b", "1", 1.0, can="Mux.b")]
     payloads = [bytes([0, 7, 1, 0, 0, 0, 0, 0]), bytes([1, 3, 9, 0, 0, 0, 0, 0]), bytes([2, 4, 9, 0, 0, 0, 0, 0])]
@@ -134,7 +139,7 @@ def test_multiplexed_signals_are_taken_only_from_frames_that_select_them():
     assert account.tally.reasons["other multiplexer value"] == 1
 
 
-def test_other_ids_are_foreign_also_when_only_the_frame_format_differs():
+def test_other_ids_are_foreign_also_when_only_the_frame_format_differs() -> None:
     message = Message(0x123, "M", 8, [Signal("s", 0, 16, minimum=0, maximum=65535)])
     frames = block([bytes(8)] * 4, [0x123, 0x124, 0x123 | EXTENDED, 0x123])
     account = Account()
@@ -144,7 +149,7 @@ def test_other_ids_are_foreign_also_when_only_the_frame_format_differs():
     assert account.contents == {"0x123": 2, "0x124": 1, id_text(0x123 | EXTENDED): 1}
 
 
-def test_frames_too_short_for_their_signals_are_corrupt():
+def test_frames_too_short_for_their_signals_are_corrupt() -> None:
     message = Message(0x123, "M", 8, [Signal("s", 16, 16, minimum=0, maximum=65535)])
     account = Account()
     samples = CanDecoder(channels_of(message), Database([message])).decode(
@@ -173,7 +178,7 @@ def test_frames_too_short_for_their_signals_are_corrupt():
         (Signal("s", 0, 16, minimum=0, maximum=0), 0xFFFE, True),  # 0|0 is no range
     ],
 )
-def test_sentinels_and_values_out_of_range_are_missing(signal, raw, valid):
+def test_sentinels_and_values_out_of_range_are_missing(signal: Signal, raw: int, valid: bool) -> None:
     message = Message(0x123, "M", 8, [signal])
     account = Account()
     samples = CanDecoder(channels_of(message), Database([message])).decode(
@@ -184,7 +189,7 @@ def test_sentinels_and_values_out_of_range_are_missing(signal, raw, valid):
     assert sum(account.values.values()) == (0 if valid else 1)
 
 
-def test_samples_keep_the_order_of_the_frames():
+def test_samples_keep_the_order_of_the_frames() -> None:
     first = Message(
         0x10, "A", 8, [Signal("x", 0, 8, minimum=0, maximum=255), Signal("y", 8, 8, minimum=0, maximum=255)]
     )
@@ -195,7 +200,7 @@ def test_samples_keep_the_order_of_the_frames():
     assert np.all(np.diff(samples.time) >= 0)
 
 
-def test_wrong_names_and_databases_are_one_clear_line(tmp_path):
+def test_wrong_names_and_databases_are_one_clear_line(tmp_path: Path) -> None:
     message = Message(0x10, "CarAcceleration", 8, [Signal("FrontLeft", 0, 8)])
     database = Database([message])
     with pytest.raises(UnreadableRecording, match=r"no message 'CarAccel'; its nearest messages: CarAcceleration"):
@@ -213,7 +218,7 @@ def test_wrong_names_and_databases_are_one_clear_line(tmp_path):
     assert "\n" not in str(error.value)
 
 
-def test_a_database_file_gives_the_same_as_its_objects(tmp_path):
+def test_a_database_file_gives_the_same_as_its_objects(tmp_path: Path) -> None:
     message = Message(0x18FF1234, "Ext", 8, [Signal("s", 7, 16, "big_endian", is_signed=True)], is_extended_frame=True)
     path = tmp_path / "ext.dbc"
     path.write_text(Database([message]).as_dbc_string())

@@ -8,21 +8,33 @@ from mcap.writer import CompressionType
 
 from sprung.replay import UnreadableRecording, mf4
 from sprung.replay.account import Account
-from tests.replay_files import ROWS, START, STEP, TIMES, VALUES, database, read, write_can, write_csv, write_json
+from tests.replay_files import (
+    ROWS,
+    START,
+    STEP,
+    TIMES,
+    VALUES,
+    Samples,
+    database,
+    read,
+    write_can,
+    write_csv,
+    write_json,
+)
 
 TOLERANCE = 2_000  # ns; python-can writes float seconds
 MESSAGES = ROWS + ROWS // 10  # in the MCAP file
 
 
 @pytest.fixture(scope="module")
-def dbc(tmp_path_factory):
+def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     path = tmp_path_factory.mktemp("dbc") / "body.dbc"
     path.write_text(database().as_dbc_string())
     return path
 
 
-def wrong(samples, start=START):
+def wrong(samples: Samples, start: int = START) -> int:
     """Samples that the recording never held."""
     count = 0
     for index, (times, values) in samples.items():
@@ -36,7 +48,7 @@ def wrong(samples, start=START):
 
 
 @pytest.mark.parametrize("name", ["a.mcap", "a.blf", "a.asc", "a.log", "a.csv"])
-def test_a_file_cut_anywhere_is_read_up_to_the_cut(name, tmp_path, dbc):
+def test_a_file_cut_anywhere_is_read_up_to_the_cut(name: str, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / name
     {"a.mcap": write_json, "a.csv": write_csv}.get(name, write_can)(path)
     whole = path.read_bytes()
@@ -60,7 +72,7 @@ def test_a_file_cut_anywhere_is_read_up_to_the_cut(name, tmp_path, dbc):
 
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4])
-def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression, tmp_path):
+def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression: CompressionType, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_json(path, compression=compression, chunk=2048)
     whole = path.read_bytes()
@@ -85,7 +97,7 @@ def test_flipped_bits_in_an_mcap_file_never_give_a_wrong_number(compression, tmp
     assert uncounted <= 5  # a flip in the statistics or in an index may take the expected number with it
 
 
-def test_a_damaged_chunk_costs_its_messages_only_and_they_are_counted(tmp_path):
+def test_a_damaged_chunk_costs_its_messages_only_and_they_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_json(path, chunk=2048)
     damaged = bytearray(path.read_bytes())
@@ -101,7 +113,7 @@ def test_a_damaged_chunk_costs_its_messages_only_and_they_are_counted(tmp_path):
     assert any("CRC" in line or "damaged" in line for line in recording.problems)
 
 
-def test_an_mcap_file_whose_writer_died_is_read_to_its_last_whole_chunk(tmp_path):
+def test_an_mcap_file_whose_writer_died_is_read_to_its_last_whole_chunk(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_json(path, chunk=2048, close=False)
     recording, samples = read(path)
@@ -112,7 +124,7 @@ def test_an_mcap_file_whose_writer_died_is_read_to_its_last_whole_chunk(tmp_path
     assert f"{sum(recording.tally.as_dict().values())} messages recovered" in recording.problems[0]
 
 
-def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path, dbc):
+def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.blf"
     write_can(path)
     whole = path.read_bytes()
@@ -132,7 +144,7 @@ def test_flipped_bits_in_a_blf_file_are_found_and_counted(tmp_path, dbc):
 
 
 @pytest.mark.parametrize("name", ["a.asc", "a.log", "a.csv"])
-def test_damaged_text_is_counted_and_the_rest_is_read(name, tmp_path, dbc):
+def test_damaged_text_is_counted_and_the_rest_is_read(name: str, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / name
     (write_csv if name == "a.csv" else write_can)(path)
     whole = path.read_bytes()

@@ -1,10 +1,13 @@
 """`sprung inspect`: what a recording holds, and the skeleton of a system file for it."""
 
 import json
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sprung.model.signals import FloatArray
 from sprung.model.system import load_system
 from sprung.model.systemfile import read_system_file
 from sprung.replay import UnreadableRecording
@@ -16,13 +19,13 @@ from tests.replay_files import database, write_can, write_json, write_protobuf, 
 TIME = np.arange(6000) / 100.0
 
 
-def write_columns(path, columns, separator=","):
+def write_columns(path: Path, columns: dict[str, FloatArray], separator: str = ",") -> None:
     rows = zip(*columns.values(), strict=True)
     path.write_text(separator.join(columns) + "\n" + "\n".join(separator.join(f"{v:.9g}" for v in r) for r in rows))
 
 
 @pytest.fixture
-def ride(tmp_path):
+def ride(tmp_path: Path) -> Path:
     """Ten seconds of standstill, then motion at 3 Hz; a repeated and a reversed channel; gaps and equal stamps."""
     rng = np.random.default_rng(5)
     moving = np.where(TIME >= 10.0, np.sin(2 * np.pi * 3 * TIME), 0.0)
@@ -43,7 +46,7 @@ def ride(tmp_path):
     return tmp_path / "ride.csv"
 
 
-def test_every_signal_is_described(ride):
+def test_every_signal_is_described(ride: Path) -> None:
     found = inspect(ride)
     signals = {signal.name: signal for signal in found.signals}
     assert list(signals) == ["Accel [g]", "Copy [g]", "Turned [g]", "Weg mm", "off"]
@@ -65,7 +68,7 @@ def test_every_signal_is_described(ride):
     assert signals["Weg mm"].unit is None
 
 
-def test_noise_is_that_of_white_noise_beside_smooth_motion():
+def test_noise_is_that_of_white_noise_beside_smooth_motion() -> None:
     rng = np.random.default_rng(7)
     value = 3.0 * np.sin(2 * np.pi * 2 * TIME) + 0.05 * rng.standard_normal(len(TIME))
     signal = look("x", {"column": "x"}, None, np.rint(TIME * 1e9).astype(np.int64), value, 0)
@@ -75,13 +78,15 @@ def test_noise_is_that_of_white_noise_beside_smooth_motion():
 
 
 @pytest.mark.parametrize("write", [write_json, write_protobuf, write_ros2])
-def test_mcap_of_every_encoding_is_listed_by_topic_and_field(tmp_path, write):
+def test_mcap_of_every_encoding_is_listed_by_topic_and_field(tmp_path: Path, write: Callable[[Path], None]) -> None:
     write(tmp_path / "a.mcap")
     names = [signal.name for signal in inspect(tmp_path / "a.mcap").signals]
     assert names == ["/body/acceleration.left", "/body/acceleration.axes[0].right", "/body/acceleration.axes[1].right"]
 
 
-def test_can_signals_are_listed_by_the_database_and_identifiers_without(tmp_path, capfd):
+def test_can_signals_are_listed_by_the_database_and_identifiers_without(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     write_can(tmp_path / "a.blf")
     found = inspect(tmp_path / "a.blf", database())
     assert [signal.address for signal in found.signals] == [{"can": "Body.Left"}, {"can": "Body.Right"}]
@@ -91,7 +96,7 @@ def test_can_signals_are_listed_by_the_database_and_identifiers_without(tmp_path
     assert len(capfd.readouterr().err.splitlines()) == 1
 
 
-def test_a_table_without_times_is_looked_at_by_samples_and_likely_times_are_named(tmp_path):
+def test_a_table_without_times_is_looked_at_by_samples_and_likely_times_are_named(tmp_path: Path) -> None:
     write_columns(tmp_path / "a.csv", {"counter": TIME, "x": np.sin(TIME)})
     found = inspect(tmp_path / "a.csv")
     assert [signal.name for signal in found.signals] == ["counter", "x"]
@@ -108,14 +113,14 @@ def test_a_table_without_times_is_looked_at_by_samples_and_likely_times_are_name
         ("ts", "17953488{:012.9f}"),
     ],
 )
-def test_columns_of_times_are_known_by_name(tmp_path, name, stamp):
+def test_columns_of_times_are_known_by_name(tmp_path: Path, name: str, stamp: str) -> None:
     rows = [f"{stamp.format(x).replace(chr(46), '') if name == 'ts' else stamp.format(x)};{x:g}" for x in TIME[:500]]
     (tmp_path / "a.csv").write_text("\n".join([f"{name};d", *rows]))
     (signal,) = inspect(tmp_path / "a.csv").signals
     assert signal.name == "d" and signal.rate == pytest.approx(1 / (TIME[1] - TIME[0]), rel=1e-3)
 
 
-def test_what_holds_no_plain_numbers_is_named(tmp_path):
+def test_what_holds_no_plain_numbers_is_named(tmp_path: Path) -> None:
     rows = [f"{x:.2f};{x:.2f};1.{int(100 + x)},5".replace(".", ",", 2) for x in TIME[:200]]
     (tmp_path / "a.csv").write_text("\n".join(["time;d;F", *rows]))
     found = inspect(tmp_path / "a.csv")
@@ -123,7 +128,7 @@ def test_what_holds_no_plain_numbers_is_named(tmp_path):
     assert "left out, since they hold no plain numbers: F" in found.problems
 
 
-def test_the_command_prints_a_table_remarks_and_json(ride, capfd):
+def test_the_command_prints_a_table_remarks_and_json(ride: Path, capfd: pytest.CaptureFixture[str]) -> None:
     assert main(["inspect", str(ride)]) == 0
     out, err = capfd.readouterr()
     assert f"{ride}: 59.99 s, times count from 0" in out.splitlines()
@@ -138,7 +143,9 @@ def test_the_command_prints_a_table_remarks_and_json(ride, capfd):
     assert set(said["signals"][0]) >= {"rate", "unit", "gaps", "minimum", "maximum", "band", "peak", "noise", "same_as"}
 
 
-def test_a_skeleton_is_a_valid_system_file_that_reads_the_recording(ride, tmp_path, capfd):
+def test_a_skeleton_is_a_valid_system_file_that_reads_the_recording(
+    ride: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "rig.yaml"
     assert main(["inspect", str(ride), "--write-system", str(path)]) == 0
     system = load_system(path)
@@ -154,7 +161,7 @@ def test_a_skeleton_is_a_valid_system_file_that_reads_the_recording(ride, tmp_pa
     assert "exists already" in capfd.readouterr().err
 
 
-def test_motion_and_force_alone_make_a_component_test(tmp_path, capfd):
+def test_motion_and_force_alone_make_a_component_test(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_columns(
         tmp_path / "dyno.txt",
         {"T": 1000 * TIME, "Stroke, mm": np.sin(TIME), "Load, kN": np.cos(TIME)},
@@ -177,7 +184,9 @@ def test_motion_and_force_alone_make_a_component_test(tmp_path, capfd):
 @pytest.mark.parametrize(
     "name", ["a.csv", "a.mat", "a.json", "a.uff", "a.mcap", "a.parquet", "a.h5", "a.tdms", "a.xyz"]
 )
-def test_what_cannot_be_read_is_one_line_and_exit_status_2(tmp_path, name, capfd):
+def test_what_cannot_be_read_is_one_line_and_exit_status_2(
+    tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     for content in (b"", b"neither this\nnor that\n" * 30, bytes(range(256)) * 20):
         (tmp_path / name).write_bytes(content)
         for command in ("inspect", "replay", "diagnose"):
@@ -188,7 +197,7 @@ def test_what_cannot_be_read_is_one_line_and_exit_status_2(tmp_path, name, capfd
             assert "unexpected" not in err
 
 
-def test_wrong_options_are_one_line(ride, capfd):
+def test_wrong_options_are_one_line(ride: Path, capfd: pytest.CaptureFixture[str]) -> None:
     for options, words in (
         (["--time-unit", "fortnight"], "known are s, ms"),
         (["--rate", "-1"], "must be greater than 0"),

@@ -3,7 +3,10 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from itertools import count
+from pathlib import Path
+from typing import Self
 
 import can
 import numpy as np
@@ -22,51 +25,51 @@ NUMBERS = count()
 
 
 @pytest.fixture
-def dbc(tmp_path):
+def dbc(tmp_path: Path) -> Path:
     path = tmp_path / "train.dbc"
     path.write_text(DATABASE.as_dbc_string())
     return path
 
 
 @pytest.fixture
-def bus_name():
+def bus_name() -> str:
     """A virtual bus of its own for every test."""
     return f"sprung-test-{next(NUMBERS)}"
 
 
-def frame(value, frame_id=0x123):
+def frame(value: int, frame_id: int = 0x123) -> can.Message:
     return can.Message(arbitration_id=frame_id, is_extended_id=False, data=value.to_bytes(8, "little"))
 
 
 class CollectingListener:
     """Collects blocks in a thread, with the moment at which each came."""
 
-    def __init__(self, bus):
+    def __init__(self, bus: LiveBus) -> None:
         self.bus = bus
         self.blocks = []
         self.thread = threading.Thread(target=self._run)
         self.thread.start()
 
-    def _run(self):
+    def _run(self) -> None:
         for block in self.bus.blocks():
             self.blocks.append((time.monotonic(), block))
 
-    def values(self):
+    def values(self) -> list[float]:
         return [float(v) for _, block in self.blocks for v in block.value]
 
-    def wait(self, condition, seconds=5.0):
+    def wait(self, condition: Callable[[], bool], seconds: float = 5.0) -> bool:
         end = time.monotonic() + seconds
         while not condition() and time.monotonic() < end:
             time.sleep(0.01)
         return condition()
 
-    def stop(self):
+    def stop(self) -> None:
         self.bus.stop.set()
         self.thread.join(5.0)
         assert not self.thread.is_alive()
 
 
-def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc, bus_name):
+def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc: Path, bus_name: str) -> None:
     live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.05)
     listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)
@@ -86,7 +89,7 @@ def test_frames_come_out_as_samples_within_the_latency_and_are_counted(dbc, bus_
     assert abs(stamps[0] / 1e9 - time.time()) < 60.0
 
 
-def test_a_silent_bus_stops_at_once(dbc, bus_name):
+def test_a_silent_bus_stops_at_once(dbc: Path, bus_name: str) -> None:
     live = LiveBus("virtual", bus_name, [CHANNEL], dbc)
     listener = CollectingListener(live)
     assert listener.wait(lambda: live.connected)
@@ -95,22 +98,22 @@ def test_a_silent_bus_stops_at_once(dbc, bus_name):
     assert time.monotonic() - begun < 2.0
 
 
-def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
+def test_a_bus_that_is_lost_is_opened_again(dbc: Path, bus_name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first opening fails, the second bus breaks after three frames, the third stays."""
     monkeypatch.setattr("sprung.replay.live.FIRST_RETRY", 0.01)
     opened = count(1)
 
     class Breaking:
-        def __init__(self, number):
+        def __init__(self, number: int) -> None:
             self.number, self.sent = number, 0
 
-        def __enter__(self):
+        def __enter__(self) -> Self:
             return self
 
-        def __exit__(self, *_):
+        def __exit__(self, *_: object) -> None:
             return None
 
-        def recv(self, timeout):
+        def recv(self, timeout: float | can.Message) -> None:
             self.sent += 1
             if self.sent <= 3:
                 return frame(10 * self.number + self.sent)
@@ -119,7 +122,7 @@ def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
             time.sleep(timeout)
             return None
 
-    def open_bus(**_):
+    def open_bus(**_: object) -> Breaking:
         number = next(opened)
         if number == 1:
             raise OSError("No such device")
@@ -135,19 +138,19 @@ def test_a_bus_that_is_lost_is_opened_again(dbc, bus_name, monkeypatch):
     assert "Network is down" in live.account.problems[1]
 
 
-def test_an_unknown_interface_is_one_clear_line(dbc):
+def test_an_unknown_interface_is_one_clear_line(dbc: Path) -> None:
     with pytest.raises(UnreadableRecording, match=r"'sockercan' is not known; python-can has .*socketcan"):
         LiveBus("sockercan", "can0", [CHANNEL], dbc)
 
 
-def write_log(path, seconds=1.0):
+def write_log(path: Path, seconds: float = 1.0) -> int:
     rows = range(round(seconds * 100))
     lines = [f"({1_790_000_000 + i / 100:.6f}) can0 123#{i.to_bytes(8, 'little').hex()}" for i in rows]
     path.write_text("\n".join(lines) + "\n")
     return len(rows)
 
 
-def test_a_recording_is_played_in_real_time_and_comes_out_as_windows(dbc, bus_name, tmp_path):
+def test_a_recording_is_played_in_real_time_and_comes_out_as_windows(dbc: Path, bus_name: str, tmp_path: Path) -> None:
     frames = write_log(tmp_path / "run.log", 1.2)
     listener = CollectingListener(LiveBus("virtual", bus_name, [CHANNEL], dbc))
     assert listener.wait(lambda: listener.bus.connected)
@@ -163,7 +166,7 @@ def test_a_recording_is_played_in_real_time_and_comes_out_as_windows(dbc, bus_na
     assert np.array_equal(listener.values(), np.arange(frames))
 
 
-def test_playing_can_be_scaled_and_stopped(dbc, bus_name, tmp_path):
+def test_playing_can_be_scaled_and_stopped(dbc: Path, bus_name: str, tmp_path: Path) -> None:
     frames = write_log(tmp_path / "run.log", 2.0)
     begun = time.monotonic()
     assert send(tmp_path / "run.log", "virtual", bus_name, speed=20.0) == frames
@@ -177,7 +180,7 @@ def test_playing_can_be_scaled_and_stopped(dbc, bus_name, tmp_path):
         send(tmp_path / "run.log", "virtual", bus_name, speed=0.0)
 
 
-def test_udp_multicast_carries_frames_between_buses(dbc):
+def test_udp_multicast_carries_frames_between_buses(dbc: Path) -> None:
     group = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219}
     try:
         with can.Bus(**group) as probe, can.Bus(**group) as other:
@@ -198,11 +201,11 @@ def test_udp_multicast_carries_frames_between_buses(dbc):
     assert Counter(listener.values()) == Counter(float(value) for value in range(10))
 
 
-def test_a_frame_from_the_future_does_not_make_the_reader_deaf(dbc, bus_name):
+def test_a_frame_from_the_future_does_not_make_the_reader_deaf(dbc: Path, bus_name: str) -> None:
     bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
     now = time.time()
 
-    def stamped(ahead):
+    def stamped(ahead: float) -> list[can.Message]:
         message = frame(1)
         message.timestamp = now + ahead
         return [message]
@@ -216,7 +219,7 @@ def test_a_frame_from_the_future_does_not_make_the_reader_deaf(dbc, bus_name):
     assert bus._current(stamped(-3599.0))
 
 
-def test_a_frame_without_a_possible_time_costs_itself():
+def test_a_frame_without_a_possible_time_costs_itself() -> None:
     good, bad, worse = frame(1), frame(2), frame(3)
     good.timestamp, bad.timestamp, worse.timestamp = 1_790_000_000.0, float("nan"), 1e30
     account = Account()
@@ -225,12 +228,14 @@ def test_a_frame_without_a_possible_time_costs_itself():
     assert account.tally.corrupt == 2
 
 
-def test_a_reader_that_is_behind_gives_up_what_waits_until_it_has_caught_up(dbc, bus_name, monkeypatch):
+def test_a_reader_that_is_behind_gives_up_what_waits_until_it_has_caught_up(
+    dbc: Path, bus_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
     clock = [1_790_000_000.0]
     monkeypatch.setattr("sprung.replay.live.time.time", lambda: clock[0])
 
-    def read(waited):
+    def read(waited: float) -> bool:
         message = frame(1)
         message.timestamp = clock[0] - waited
         return bool(bus._current([message, message]))
@@ -243,7 +248,9 @@ def test_a_reader_that_is_behind_gives_up_what_waits_until_it_has_caught_up(dbc,
     assert (bus.tally.dropped, bus.account.incomplete) == (4, True)
 
 
-def test_frames_that_the_kernel_dropped_are_counted_once(dbc, bus_name, monkeypatch):
+def test_frames_that_the_kernel_dropped_are_counted_once(
+    dbc: Path, bus_name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
     counter = iter([7, 7, 12, 12])  # of the socket, which may have lost some before it was opened here
     monkeypatch.setattr("sprung.replay.live.lost_by_kernel", lambda *_: next(counter))

@@ -1,12 +1,14 @@
 """Nodes that sample at rates of their own, and a force gauge among them: from the file to the values."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 from mcap.writer import Writer
 
 import sprung
 from sprung.model.identification.excitation import simulate_runs
+from sprung.model.signals import FloatArray
 from sprung.model.system import parse_system
 
 FINE, SECONDS, START = 2000, 7, 1_790_000_000_000_000_000
@@ -39,7 +41,7 @@ NODES = {
 }
 
 
-def write(path, values):
+def write(path: Path, values: FloatArray) -> None:
     """One JSON channel per node, each with every so many of the fine samples (T, C)."""
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -57,7 +59,7 @@ def write(path, values):
         writer.finish()
 
 
-def test_nodes_of_200_to_2000_hz_and_a_force_gauge_in_volts_tell_the_true_values(tmp_path):
+def test_nodes_of_200_to_2000_hz_and_a_force_gauge_in_volts_tell_the_true_values(tmp_path: Path) -> None:
     fine = parse_system(SYSTEM.format(rate=FINE))
     values = simulate_runs(fine, TRUTH[None], FINE * SECONDS, np.random.default_rng(4)).values[0]
     values[:, 4] /= 200.0

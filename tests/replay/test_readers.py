@@ -1,5 +1,8 @@
 """One recording, written by other people's writers in every format, reads the same through every reader."""
 
+from collections.abc import Sequence
+from pathlib import Path
+
 import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
@@ -27,7 +30,7 @@ from tests.replay_files import (
 
 
 @pytest.fixture
-def dbc(tmp_path):
+def dbc(tmp_path: Path) -> Path:
     path = tmp_path / "body.dbc"
     path.write_text(database().as_dbc_string())
     return path
@@ -48,7 +51,7 @@ FOREIGN = {"json.mcap": 30, "can.blf": 90, "can.asc": 90, "can.log": 90, "can.mf
 
 @pytest.mark.parametrize("name", WRITERS)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_every_reader_gives_every_sample_and_counts_every_message(name, tmp_path, dbc):
+def test_every_reader_gives_every_sample_and_counts_every_message(name: str, tmp_path: Path, dbc: Path) -> None:
     if name.endswith("mf4"):
         pytest.importorskip("asammdf")
     path = tmp_path / name
@@ -76,7 +79,7 @@ def test_every_reader_gives_every_sample_and_counts_every_message(name, tmp_path
 
 @pytest.mark.parametrize("compression", [CompressionType.NONE, CompressionType.LZ4, CompressionType.ZSTD])
 @pytest.mark.parametrize("chunked", [True, False])
-def test_mcap_of_every_compression_reads_the_same(compression, chunked, tmp_path):
+def test_mcap_of_every_compression_reads_the_same(compression: CompressionType, chunked: bool, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_json(path, compression=compression, chunked=chunked)
     recording, samples = read(path)
@@ -84,7 +87,7 @@ def test_mcap_of_every_compression_reads_the_same(compression, chunked, tmp_path
     assert (recording.tally.used, recording.tally.foreign) == (ROWS, 30)
 
 
-def test_the_time_of_mcap_messages_can_be_chosen_by_channel(tmp_path):
+def test_the_time_of_mcap_messages_can_be_chosen_by_channel(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_ros2(path)
     assert np.array_equal(read(path)[1][0][0], TIMES)
@@ -99,13 +102,13 @@ def test_the_time_of_mcap_messages_can_be_chosen_by_channel(tmp_path):
         read(path, time_source="clock")
 
 
-def test_an_empty_header_stamp_gives_way_to_the_publish_time(tmp_path):
+def test_an_empty_header_stamp_gives_way_to_the_publish_time(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_ros2(path, stamped=False)
     assert np.array_equal(read(path)[1][0][0], TIMES)
 
 
-def test_json_values_that_are_no_numbers_are_missing(tmp_path):
+def test_json_values_that_are_no_numbers_are_missing(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     odd = [
         '{"left": null}',
@@ -130,7 +133,7 @@ def test_json_values_that_are_no_numbers_are_missing(tmp_path):
     assert recording.incomplete
 
 
-def test_csv_cells_that_are_empty_are_missing_and_rows_that_are_broken_are_corrupt(tmp_path):
+def test_csv_cells_that_are_empty_are_missing_and_rows_that_are_broken_are_corrupt(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("time;left;right\n0.00;1;\n0.01;;\n0.02;NaN;4\nx;1;2\n0.03;1\n0.04;5;6\n;7;8\n")
     recording, samples = read(path)
@@ -139,7 +142,7 @@ def test_csv_cells_that_are_empty_are_missing_and_rows_that_are_broken_are_corru
     assert recording.tally.as_dict() == {"used": 3, "repaired": 0, "dropped": 1, "corrupt": 3, "foreign": 0}
 
 
-def test_asc_in_decimal_with_relative_stamps_and_fd_frames(tmp_path):
+def test_asc_in_decimal_with_relative_stamps_and_fd_frames(tmp_path: Path) -> None:
     path = tmp_path / "a.asc"
     message = Message(784, "Body", 16, [Signal("Left", 64, 8, minimum=0, maximum=255)], is_fd=True)
     dbc = tmp_path / "fd.dbc"
@@ -160,7 +163,7 @@ def test_asc_in_decimal_with_relative_stamps_and_fd_frames(tmp_path):
     assert recording.tally.as_dict() == {"used": 2, "repaired": 0, "dropped": 0, "corrupt": 1, "foreign": 1}
 
 
-def test_candump_fd_and_extended_frames(tmp_path, dbc):
+def test_candump_fd_and_extended_frames(tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.log"
     path.write_text(
         "(1790000000.000001) vcan0 310#0100000200000000\n(1790000000.010001) vcan0 00000310#0100000200000000 R\n"
@@ -173,8 +176,8 @@ def test_candump_fd_and_extended_frames(tmp_path, dbc):
     assert recording.tally.as_dict() == {"used": 2, "repaired": 0, "dropped": 0, "corrupt": 0, "foreign": 3}
 
 
-def test_wrong_use_is_one_clear_line(tmp_path, dbc):
-    def complaint(path, database=None, channels=CHANNELS):
+def test_wrong_use_is_one_clear_line(tmp_path: Path, dbc: Path) -> None:
+    def complaint(path: Path, database: Path | None = None, channels: Sequence[Channel] = CHANNELS) -> str:
         with pytest.raises(UnreadableRecording) as error:
             read(path, database, channels)
         assert "\n" not in str(error.value)
@@ -199,7 +202,7 @@ def test_wrong_use_is_one_clear_line(tmp_path, dbc):
         assert "names no" in complaint(path, dbc, [Channel("x", "m", 1.0, mcap="/a.b")])
 
 
-def test_a_recording_without_any_of_the_channels_says_what_it_holds(tmp_path):
+def test_a_recording_without_any_of_the_channels_says_what_it_holds(tmp_path: Path) -> None:
     write_json(tmp_path / "a.mcap")
     with pytest.raises(UnreadableRecording, match=r"it holds /body/acceleration \(300\), /door/state \(30\)"):
         read(tmp_path / "a.mcap", channels=[Channel("x", "m", 1.0, mcap="/car/acceleration.left")])
@@ -210,7 +213,7 @@ def test_a_recording_without_any_of_the_channels_says_what_it_holds(tmp_path):
         read(tmp_path / "a.blf", other, [Channel("x", "m", 1.0, can="Other.s")])
 
 
-def test_channels_that_never_come_are_named(tmp_path):
+def test_channels_that_never_come_are_named(tmp_path: Path) -> None:
     write_json(tmp_path / "a.mcap")
     lacking = Channel("roof", "m", 1.0, mcap="/body/acceleration.leftt")
     recording, _ = read(tmp_path / "a.mcap", channels=[CHANNELS[0], lacking])
@@ -221,7 +224,7 @@ def test_channels_that_never_come_are_named(tmp_path):
 
 
 @pytest.mark.parametrize("chunk", [2048, 1 << 20])
-def test_an_mcap_file_written_topic_by_topic_is_put_in_time_order(chunk, tmp_path):
+def test_an_mcap_file_written_topic_by_topic_is_put_in_time_order(chunk: int, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=chunk)

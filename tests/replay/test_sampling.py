@@ -1,9 +1,13 @@
 """Recordings of any rate on the system's grid: reduced, interpolated or refused, and always said so."""
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
-from sprung.model.signals import Channel, SampleBlock
+from sprung.model.signals import Channel, FloatArray, SampleBlock
 from sprung.replay import UnreadableRecording
 from sprung.replay.account import Account
 from sprung.replay.record import load_record
@@ -16,7 +20,7 @@ CHANNELS = [Channel("fast", "m", 1e-6), Channel("slow", "m", 1e-6)]
 GRID = 100.0
 
 
-def stream(time, value, seconds=20.0, size=997):
+def stream(time: FloatArray, value: FloatArray, seconds: float = 20.0, size: int = 997) -> Iterator[SampleBlock]:
     """A fast channel beside one at the grid's rate, cut into blocks, in time order."""
     slow = np.arange(round(seconds * GRID)) / GRID
     times = np.r_[np.rint(time * 1e9), np.rint(slow * 1e9)].astype(np.int64)
@@ -27,7 +31,7 @@ def stream(time, value, seconds=20.0, size=997):
         yield SampleBlock(*(part[first : first + size] for part in whole))
 
 
-def reduced(time, value, **options):
+def reduced(time: FloatArray, value: FloatArray, **options: Any) -> tuple[FloatArray, FloatArray, FloatArray, Account]:
     """Times (s) and values of the fast channel, values of the slow one, the account."""
     account = Account()
     out = list(at_rate(stream(time, value, **options), CHANNELS, GRID, account, "ride.csv"))
@@ -38,12 +42,12 @@ def reduced(time, value, **options):
     return times[channel == 0] / 1e9, values[channel == 0], values[channel == 1], account
 
 
-def motion(t):
+def motion(t: FloatArray) -> FloatArray:
     return np.sin(2 * np.pi * 7 * t) + 0.2 * np.sin(2 * np.pi * 31 * t)
 
 
 @pytest.mark.parametrize("rate", [200.0, 250.0, 333.0, 1000.0, 2000.0, 10_000.0, 50_000.0])
-def test_fast_channels_keep_what_the_grid_can_hold_and_lose_what_would_alias(rate):
+def test_fast_channels_keep_what_the_grid_can_hold_and_lose_what_would_alias(rate: float) -> None:
     t = np.arange(round(10 * rate)) / rate
     above = sum(
         np.sin(2 * np.pi * f * t) for f in (51.0, 93.0, 0.49 * rate) if f < rate / 2
@@ -61,7 +65,7 @@ def test_fast_channels_keep_what_the_grid_can_hold_and_lose_what_would_alias(rat
     assert abs(time[-1] - slow[-1]) < 0.011
 
 
-def test_the_filter_is_as_flat_and_as_steep_as_it_says():
+def test_the_filter_is_as_flat_and_as_steep_as_it_says() -> None:
     taps = low_pass(1, 10, 10.0)
     frequency = np.fft.rfftfreq(1 << 16) * 10.0  # in grid rates
     gain = np.abs(np.fft.rfft(taps, 1 << 16))
@@ -70,14 +74,14 @@ def test_the_filter_is_as_flat_and_as_steep_as_it_says():
     assert np.array_equal(taps, taps[::-1])
 
 
-def test_the_result_does_not_depend_on_how_the_samples_are_cut_into_blocks():
+def test_the_result_does_not_depend_on_how_the_samples_are_cut_into_blocks() -> None:
     t = np.arange(20_000) / 1000.0
     one, two = (reduced(t, motion(t), size=size) for size in (100, 7001))
     assert np.array_equal(one[0], two[0])
     assert np.allclose(one[1], two[1], atol=1e-12)
 
 
-def test_jittered_and_rounded_stamps_are_counted_out():
+def test_jittered_and_rounded_stamps_are_counted_out() -> None:
     t = np.arange(40_000) / 2000.0
     jitter = np.random.default_rng(3).normal(0.0, 0.1 / 2000.0, len(t))
     for stamps in (t + jitter, np.round(t, 3)):
@@ -85,7 +89,7 @@ def test_jittered_and_rounded_stamps_are_counted_out():
         assert np.abs(value - motion(time)).max() < 4e-3
 
 
-def test_lost_samples_are_bridged_and_longer_gaps_are_gaps():
+def test_lost_samples_are_bridged_and_longer_gaps_are_gaps() -> None:
     t = np.arange(20_000) / 1000.0
     keep = np.ones(len(t), dtype=bool)
     keep[[5000, 5001, 7000]] = False
@@ -98,7 +102,7 @@ def test_lost_samples_are_bridged_and_longer_gaps_are_gaps():
     assert np.diff(time).max() < 1.2  # the gap and the reach of the filter on either side
 
 
-def test_values_that_are_missing_stay_missing():
+def test_values_that_are_missing_stay_missing() -> None:
     t = np.arange(20_000) / 1000.0
     value = motion(t)
     value[9000:9100] = np.nan
@@ -108,7 +112,7 @@ def test_values_that_are_missing_stay_missing():
     assert not np.isnan(got[(time < 8.99) | (time > 9.11)]).any()
 
 
-def test_the_pace_of_a_channel_does_not_mind_gaps():
+def test_the_pace_of_a_channel_does_not_mind_gaps() -> None:
     time = np.rint(np.r_[np.arange(500), 5000 + np.arange(800)] * 1e6).astype(np.int64)
     found = pace(time)
     assert found.period == pytest.approx(1e-3)
@@ -117,7 +121,7 @@ def test_the_pace_of_a_channel_does_not_mind_gaps():
     assert pace(uneven).jitter > 3
 
 
-def test_times_in_another_unit_than_assumed_are_refused_with_the_likely_one(tmp_path):
+def test_times_in_another_unit_than_assumed_are_refused_with_the_likely_one(tmp_path: Path) -> None:
     seconds = np.arange(500) / 100.0
     for factor, unit in ((1e3, "ms"), (1e6, "us")):
         write_table(tmp_path / "a.csv", seconds * factor, [np.sin(seconds), np.cos(seconds)])
@@ -125,7 +129,7 @@ def test_times_in_another_unit_than_assumed_are_refused_with_the_likely_one(tmp_
             load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
 
 
-def test_a_channel_that_is_too_slow_is_left_out_and_named():
+def test_a_channel_that_is_too_slow_is_left_out_and_named() -> None:
     fast, slow = np.arange(3000) / 100.0, np.arange(300) / 10.0
     time = np.r_[fast, slow]
     channel = np.r_[np.zeros(3000), np.ones(300)].astype(np.int32)
@@ -136,13 +140,13 @@ def test_a_channel_that_is_too_slow_is_left_out_and_named():
     assert account.problems == ["slower than half of 100 Hz, so left out: slow (10 Hz)"]
 
 
-def irregular(seconds=60.0, low=0.006, high=0.013, seed=1):
+def irregular(seconds: float = 60.0, low: float = 0.006, high: float = 0.013, seed: int = 1) -> FloatArray:
     """Stamps whose steps scatter: no even clock fits them."""
     time = np.cumsum(np.random.default_rng(seed).uniform(low, high, round(seconds / (low + high) * 2)))
     return np.round(time, 6)
 
 
-def test_irregular_stamps_of_a_table_are_interpolated_and_nothing_is_lost_in_silence(tmp_path):
+def test_irregular_stamps_of_a_table_are_interpolated_and_nothing_is_lost_in_silence(tmp_path: Path) -> None:
     time = irregular()
     write_table(tmp_path / "a.csv", time, [np.sin(2 * np.pi * 3 * time), np.cos(2 * np.pi * 5 * time)])
     record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
@@ -154,7 +158,7 @@ def test_irregular_stamps_of_a_table_are_interpolated_and_nothing_is_lost_in_sil
     assert sum("its time stamps fit no even clock (steps of 6" in line for line in record.problems) == 2
 
 
-def test_windows_of_irregular_stamps_are_repaired_for_tables_and_dropped_for_buses():
+def test_windows_of_irregular_stamps_are_repaired_for_tables_and_dropped_for_buses() -> None:
     time = irregular(20.0)
     block = SampleBlock(
         np.rint(time * 1e9).astype(np.int64), np.zeros(len(time), dtype=np.int32), np.sin(2 * np.pi * 3 * time)
@@ -173,7 +177,7 @@ def test_windows_of_irregular_stamps_are_repaired_for_tables_and_dropped_for_bus
                 assert window.outcome == "dropped"
 
 
-def test_what_is_missing_from_a_record_is_said_with_its_longest_gap(tmp_path):
+def test_what_is_missing_from_a_record_is_said_with_its_longest_gap(tmp_path: Path) -> None:
     time = np.arange(2000) / 100.0
     force = np.sin(time)
     force[500:900] = np.nan
@@ -185,7 +189,7 @@ def test_what_is_missing_from_a_record_is_said_with_its_longest_gap(tmp_path):
 
 
 @pytest.mark.parametrize("first", [0, 1])
-def test_a_slower_column_of_a_table_has_the_clock_of_its_rows(tmp_path, first):
+def test_a_slower_column_of_a_table_has_the_clock_of_its_rows(tmp_path: Path, first: int) -> None:
     time = np.arange(3000) / 100.0
     position = np.cos(2 * np.pi * 1.5 * time)
     position[1 - first :: 2] = np.nan
@@ -198,7 +202,7 @@ def test_a_slower_column_of_a_table_has_the_clock_of_its_rows(tmp_path, first):
     assert not np.isnan(record.values[:, 0]).any()
 
 
-def test_nodes_whose_rows_lie_between_each_others_each_have_their_clock(tmp_path):
+def test_nodes_whose_rows_lie_between_each_others_each_have_their_clock(tmp_path: Path) -> None:
     fast, slow = np.arange(3000) / 100.0, np.arange(2400) / 80.0 + 0.003
     time = np.r_[fast, slow]
     order = np.argsort(time, kind="stable")
@@ -211,7 +215,7 @@ def test_nodes_whose_rows_lie_between_each_others_each_have_their_clock(tmp_path
     assert np.abs(record.values[at, 1] - np.cos(6 * at / 100)).max() < 0.01
 
 
-def test_a_sensor_that_drops_out_at_random_or_dies_has_no_clock_of_its_own():
+def test_a_sensor_that_drops_out_at_random_or_dies_has_no_clock_of_its_own() -> None:
     time, random = np.arange(1000) * 10_000_000, np.random.default_rng(3)
     empty = np.zeros((1000, 3), dtype=bool)
     empty[:, 0] = random.uniform(size=1000) < 0.4
@@ -220,7 +224,7 @@ def test_a_sensor_that_drops_out_at_random_or_dies_has_no_clock_of_its_own():
     assert kept.all() and missing == empty.sum()
 
 
-def test_a_gap_of_many_minutes_in_a_channel_off_the_grid_is_a_gap(tmp_path):
+def test_a_gap_of_many_minutes_in_a_channel_off_the_grid_is_a_gap(tmp_path: Path) -> None:
     time = np.r_[np.arange(300), 3000 + np.arange(300)] / 100.0 + np.where(np.arange(600) % 2, 0.004, 0.0)
     write_table(tmp_path / "a.csv", time, [np.sin(time), np.cos(time)])
     record = load_record(tmp_path / "a.csv", CSV_CHANNELS, 100.0)
@@ -228,7 +232,7 @@ def test_a_gap_of_many_minutes_in_a_channel_off_the_grid_is_a_gap(tmp_path):
     assert not np.isnan(record.values[20:280]).any()
 
 
-def test_a_record_beyond_any_memory_is_refused(tmp_path):
+def test_a_record_beyond_any_memory_is_refused(tmp_path: Path) -> None:
     rows = "".join(f"{t},1,2\n" for t in (*range(20), *(4e8 + i for i in range(40))))
     (tmp_path / "a.csv").write_text("time,force,position\n" + rows)
     with pytest.raises(UnreadableRecording, match="more than can be analysed in one piece"):
@@ -236,13 +240,13 @@ def test_a_record_beyond_any_memory_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("scatter", [0.03, 0.2, 0.4])
-def test_uneven_stamps_are_believed_where_the_samples_were_taken_then(tmp_path, scatter):
+def test_uneven_stamps_are_believed_where_the_samples_were_taken_then(tmp_path: Path, scatter: float) -> None:
     """A table's stamps scatter: either the samples do too, or only the stamps; the signal tells which."""
     rng = np.random.default_rng(2)
     even = np.arange(2000) / 200.0
     stamps = even + scatter / 200.0 * rng.uniform(-1, 1, len(even))
 
-    def signal(at):
+    def signal(at: FloatArray) -> FloatArray:
         return np.sin(2 * np.pi * 1.3 * at) + 0.4 * np.sin(2 * np.pi * 4.1 * at + 1)
 
     for taken in (stamps, even):

@@ -2,12 +2,14 @@
 
 import json
 from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import scipy.io
 
-from sprung.model.signals import Channel, TimeColumn
+from sprung.model.signals import Channel, FloatArray, TimeColumn
 from sprung.replay import UnreadableRecording, open_recording, series
 from sprung.replay.extras import needed
 from sprung.replay.record import load_record
@@ -22,17 +24,17 @@ import pyarrow.parquet as pq  # noqa: E402
 COLUMNS = {"time": SECONDS, "x": VALUES[:, 0], "F": VALUES[:, 1]}
 
 
-def write_mat(path):
+def write_mat(path: Path) -> None:
     scipy.io.savemat(path, {**COLUMNS, "rate": 100.0, "title": "damper"})
 
 
-def write_hdf5(path):
+def write_hdf5(path: Path) -> None:
     with h5py.File(path, "w") as file:
         for name, values in COLUMNS.items():
             file[name] = values
 
 
-def write_mat73(path):
+def write_mat73(path: Path) -> None:
     """MATLAB writes version 7.3 as HDF5 behind a header of 512 bytes, its vectors as rows of one column."""
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, values in COLUMNS.items():
@@ -42,15 +44,15 @@ def write_mat73(path):
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
 
 
-def write_parquet(path):
+def write_parquet(path: Path) -> None:
     pq.write_table(pa.table(COLUMNS), path, row_group_size=128)
 
 
-def write_json(path):
+def write_json(path: Path) -> None:
     path.write_text(json.dumps({name: values.tolist() for name, values in COLUMNS.items()}))
 
 
-def test_a_number_beyond_all_floats_costs_itself(tmp_path):
+def test_a_number_beyond_all_floats_costs_itself(tmp_path: Path) -> None:
     text = json.dumps({name: values.tolist() for name, values in COLUMNS.items()})
     first = json.dumps(VALUES[0, 0])
     (tmp_path / "a.json").write_text(text.replace(f'"x": [{first}', f'"x": [{"9" * 400}', 1))
@@ -60,7 +62,7 @@ def test_a_number_beyond_all_floats_costs_itself(tmp_path):
     np.testing.assert_array_equal(values[1:, 0], VALUES[1:, 0])
 
 
-def test_a_series_that_is_there_twice_is_refused(tmp_path):
+def test_a_series_that_is_there_twice_is_refused(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"time": [0.0, 0.01], "x": [1.0, 2.0], "x": [9.0, 9.0]}')
     with pytest.raises(UnreadableRecording, match="'x' is there twice"):
         read(tmp_path / "a.json", (Channel("x", "m", 1.0, column="x"),))
@@ -77,7 +79,7 @@ WRITERS = {
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_every_format_of_series_gives_the_same_samples(tmp_path, name):
+def test_every_format_of_series_gives_the_same_samples(tmp_path: Path, name: str) -> None:
     WRITERS[name](tmp_path / name)
     assert check(tmp_path / name).relative
     record = load_record(tmp_path / name, (X, F), 100.0)
@@ -85,7 +87,7 @@ def test_every_format_of_series_gives_the_same_samples(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", WRITERS)
-def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_path, name):
+def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_path: Path, name: str) -> None:
     WRITERS[name](tmp_path / name)
     with pytest.raises(UnreadableRecording, match=r"columns not found: 'Fx'.*(its columns|did you mean)") as error:
         read(tmp_path / name, (Channel("F", "N", 1.0, column="Fx"),))
@@ -98,7 +100,7 @@ def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_pat
         assert "\n" not in str(error.value).strip()
 
 
-def test_parquet_with_real_time_stamps_and_units(tmp_path):
+def test_parquet_with_real_time_stamps_and_units(tmp_path: Path) -> None:
     stamps = (START + 10_000_000 * np.arange(500)).astype("datetime64[ns]")
     fields = [
         pa.field("when", pa.timestamp("ns")),
@@ -113,7 +115,7 @@ def test_parquet_with_real_time_stamps_and_units(tmp_path):
     assert not account.relative
 
 
-def test_structures_and_matrices_of_matlab_have_names_as_in_matlab(tmp_path):
+def test_structures_and_matrices_of_matlab_have_names_as_in_matlab(tmp_path: Path) -> None:
     rig = {"t": SECONDS, "signals": {"values": VALUES}}
     scipy.io.savemat(tmp_path / "a.mat", {"rig": rig, "label": np.array(["a", "b"]), "empty": np.zeros((0, 3))})
     x = Channel("x", "m", 1.0, column="rig.signals.values(:,1)")
@@ -122,7 +124,7 @@ def test_structures_and_matrices_of_matlab_have_names_as_in_matlab(tmp_path):
     check(tmp_path / "a.mat", (x, f), TimeColumn("rig.t"))
 
 
-def test_json_rows_and_matrices(tmp_path):
+def test_json_rows_and_matrices(tmp_path: Path) -> None:
     rows = [
         {"time": t, "x": x, "F": f, "note": "n"} for t, (x, f) in zip(SECONDS.tolist(), VALUES.tolist(), strict=True)
     ]
@@ -133,7 +135,7 @@ def test_json_rows_and_matrices(tmp_path):
     check(tmp_path / "b.json", numbered, TimeColumn("data(:,1)"))
 
 
-def test_nodes_of_different_rates_have_times_of_their_own_and_come_in_time_order(tmp_path):
+def test_nodes_of_different_rates_have_times_of_their_own_and_come_in_time_order(tmp_path: Path) -> None:
     fast, slow = np.arange(4000) / 400.0, np.arange(1000) / 100.0
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["node1/time"], file["node1/acc"] = fast, np.sin(fast)
@@ -150,8 +152,8 @@ def test_nodes_of_different_rates_have_times_of_their_own_and_come_in_time_order
         load_record(tmp_path / "a.h5", (one,), 100.0, time=TimeColumn("node2/time"))
 
 
-def test_tdms_waveforms_have_their_own_clock(tmp_path):
-    def channel(name, values, **extra):
+def test_tdms_waveforms_have_their_own_clock(tmp_path: Path) -> None:
+    def channel(name: str, values: FloatArray, **extra: object) -> Any:
         start = np.datetime64(datetime.fromtimestamp(START / 1e9, UTC).replace(tzinfo=None), "us")
         said = {"wf_start_time": start, "wf_increment": 0.01, "wf_start_offset": 0.0, "unit_string": "N", **extra}
         return nptdms.ChannelObject("Messung", name, values, properties=said)
@@ -174,7 +176,7 @@ UNITS_DATASET = b"    -1\n   164\n         1SI: m N s            2\n  1.0  1.0  
 
 @pytest.mark.parametrize("binary", [None, "<", ">"])
 @pytest.mark.parametrize("kind", [2, 4])
-def test_universal_files_in_text_and_binary(tmp_path, binary, kind):
+def test_universal_files_in_text_and_binary(tmp_path: Path, binary: str | None, kind: int) -> None:
     data = UNITS_DATASET
     data += uff58(12, 3, VALUES[:, 0], kind=kind, binary=binary) + uff58(7, -1, VALUES[:, 1], kind=kind, binary=binary)
     (tmp_path / "a.uff").write_bytes(data)
@@ -186,7 +188,7 @@ def test_universal_files_in_text_and_binary(tmp_path, binary, kind):
         assert [(c.name, c.unit) for c in columns] == [("12+Z", "N"), ("7-X", "N")]
 
 
-def test_universal_files_with_uneven_times_dates_and_other_functions(tmp_path):
+def test_universal_files_with_uneven_times_dates_and_other_functions(tmp_path: Path) -> None:
     times = SECONDS + np.where(np.arange(500) % 2, 0.002, 0.0)
     frf = uff58(3, 3, np.zeros(8), kind=4).replace(f"{1:5d}{0:10d}{0:5d}".encode(), f"{4:5d}{0:10d}{0:5d}".encode(), 1)
     data = frf + uff58(12, 3, VALUES[:, 0], even=False, times=times)
@@ -205,7 +207,7 @@ def test_universal_files_with_uneven_times_dates_and_other_functions(tmp_path):
         read(tmp_path / "d.uff", (x,))
 
 
-def test_a_missing_library_is_named_with_what_to_install(tmp_path):
+def test_a_missing_library_is_named_with_what_to_install(tmp_path: Path) -> None:
     with pytest.raises(
         UnreadableRecording, match=r"a.h5: reading .h5 files needs no_such; pip install 'sprung\[hdf5\]'"
     ):

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from sprung.model.signals import Channel
+from sprung.model.signals import Channel, Window
 from sprung.replay import open_recording
 from sprung.replay.record import load_record
+from sprung.replay.recording import Recording
 from sprung.replay.windowing import Windower
 
 SHARED = Path(__file__).parents[3] / "shared"
@@ -22,7 +23,7 @@ SYSTEM = Path(__file__).parents[2] / "model" / "systems" / "manchester.yaml"
 pytestmark = pytest.mark.skipif(not RECORDINGS.is_dir(), reason="no recordings beside the repository")
 
 
-def train_channels():
+def train_channels() -> list[Channel]:
     """16 inputs, then 12 sensors."""
     system = yaml.safe_load(SYSTEM.read_text())
     found = [
@@ -37,7 +38,7 @@ def train_channels():
 CHANNELS = train_channels()
 
 
-def windows_of(path):
+def windows_of(path: Path) -> tuple[Recording, Windower, list[Window]]:
     recording = open_recording(path, CHANNELS, dbc=DBC)
     windower = Windower(CHANNELS, 100.0, 100, 50, inputs=16)
     windows = [w for block in recording.blocks() for w in windower.push(block)] + windower.flush()
@@ -48,7 +49,7 @@ def windows_of(path):
     "pattern",
     ["case-00.mcap", "case-01.blf", "case-03.log", "case-05.asc", pytest.param("case-*", marks=pytest.mark.slow)],
 )
-def test_every_recording_is_read_whole(pattern):
+def test_every_recording_is_read_whole(pattern: str) -> None:
     names = sorted(path.name for path in RECORDINGS.glob(pattern))
     assert names
     for name in names:
@@ -61,7 +62,7 @@ def test_every_recording_is_read_whole(pattern):
         assert windower.lost == 0
 
 
-def test_the_ten_minutes_are_whole_and_on_the_cycle():
+def test_the_ten_minutes_are_whole_and_on_the_cycle() -> None:
     recording, windower, windows = windows_of(RECORDINGS / "drift-600s.blf")
     assert recording.tally.used == 420_000
     assert [w.start for w in windows] == [1_790_000_000_000_000_000 + i * 500_000_000 for i in range(1199)]
@@ -70,7 +71,7 @@ def test_the_ten_minutes_are_whole_and_on_the_cycle():
 
 
 @pytest.mark.parametrize("name", ["lossy-30s.mcap", "lossy-30s.blf"])
-def test_every_lost_message_of_the_lossy_recordings_is_counted(name):
+def test_every_lost_message_of_the_lossy_recordings_is_counted(name: str) -> None:
     recording, windower, windows = windows_of(RECORDINGS / name)
     came = recording.tally.used
     assert windower.expected == 3000 * 28
@@ -83,7 +84,7 @@ def test_every_lost_message_of_the_lossy_recordings_is_counted(name):
     assert repaired > 1.5 * windower.lost  # each lies in two windows, but for dropped ones
 
 
-def test_repaired_samples_are_close_to_the_lost_ones():
+def test_repaired_samples_are_close_to_the_lost_ones() -> None:
     """The lossy and the truncated recording are of one run in two formats: compare with the whole samples."""
     lossy = load_record(RECORDINGS / "lossy-30s.mcap", CHANNELS, 100.0)
     whole = load_record(RECORDINGS / "truncated-30s.mcap", CHANNELS, 100.0)
@@ -101,7 +102,7 @@ def test_repaired_samples_are_close_to_the_lost_ones():
         assert np.sqrt(np.nanmean(error[error > 0] ** 2)) < 0.2
 
 
-def test_a_truncated_recording_is_read_to_the_cut():
+def test_a_truncated_recording_is_read_to_the_cut() -> None:
     recording, _, windows = windows_of(RECORDINGS / "truncated-30s.mcap")
     assert recording.tally.used == 13451
     assert recording.incomplete
@@ -110,7 +111,7 @@ def test_a_truncated_recording_is_read_to_the_cut():
     assert {w.outcome for w in windows} == {"used"}
 
 
-def test_header_stamps_of_a_ros2_recording_are_even_where_its_log_times_are_not():
+def test_header_stamps_of_a_ros2_recording_are_even_where_its_log_times_are_not() -> None:
     path = SHARED / "benchmarks" / "mcap-real" / "tilt_laser.mcap"
     channels = [Channel(axis, "m/s^2", 0.1, mcap=f"/imu_data.linear_acceleration.{axis}") for axis in "xyz"]
     outcomes = {}
@@ -126,7 +127,7 @@ def test_header_stamps_of_a_ros2_recording_are_even_where_its_log_times_are_not(
     assert "used" not in outcomes["log"]
 
 
-def test_a_real_car_log_decodes_as_with_cantools():
+def test_a_real_car_log_decodes_as_with_cantools() -> None:
     folder = SHARED / "benchmarks" / "can-real"
     log, dbc = folder / "gt350-suspensionchange.log", folder / "ford_lincoln_base_pt.dbc"
     database = cantools.database.load_file(dbc, strict=False)

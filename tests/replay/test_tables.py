@@ -1,9 +1,13 @@
 """Own data without a conversion script: text tables of every kind, and the times in them."""
 
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
 import numpy as np
 import pytest
 
-from sprung.model.signals import ANY_TIME, Channel, TimeColumn
+from sprung.model.signals import ANY_TIME, Channel, FloatArray, IntArray, TimeColumn
 from sprung.replay import UnreadableRecording, open_recording
 from sprung.replay.account import Account
 from sprung.replay.csvlayout import is_unit, unit_in
@@ -17,7 +21,13 @@ VALUES = np.stack([np.sin(3 * SECONDS).round(6), (100 * np.cos(3 * SECONDS)).rou
 START = 1_790_000_000_000_000_000  # 2026-09-21T14:13:20Z
 
 
-def table(separator=",", comma=False, times=SECONDS, before="time,x,F\n", end="\n"):
+def table(
+    separator: str = ",",
+    comma: bool = False,
+    times: Iterable[str | float] = SECONDS,
+    before: str = "time,x,F\n",
+    end: str = "\n",
+) -> str:
     rows = [
         [t if isinstance(t, str) else f"{t:.9g}", f"{x:.6f}", f"{f:.4f}"]
         for t, (x, f) in zip(times, VALUES, strict=True)
@@ -27,7 +37,9 @@ def table(separator=",", comma=False, times=SECONDS, before="time,x,F\n", end="\
     return before + "".join(separator.join(row) + end for row in rows)
 
 
-def read(path, channels=(X, F), time=ANY_TIME, **options):
+def read(
+    path: Path, channels: Sequence[Channel] = (X, F), time: TimeColumn = ANY_TIME, **options: Any
+) -> tuple[IntArray, FloatArray, Account]:
     """Times (n,) and values (n, 2) of every row, and the account."""
     recording = open_recording(path, channels, time=time, **options)
     blocks = list(recording.blocks())
@@ -36,7 +48,9 @@ def read(path, channels=(X, F), time=ANY_TIME, **options):
     return times, values, recording.account
 
 
-def check(path, channels=(X, F), time=ANY_TIME, start=0, **options):
+def check(
+    path: Path, channels: Sequence[Channel] = (X, F), time: TimeColumn = ANY_TIME, start: int = 0, **options: Any
+) -> Account:
     times, values, account = read(path, channels, time, **options)
     assert np.array_equal(times, start + np.rint(SECONDS * 1e9).astype(np.int64))
     assert np.array_equal(values, VALUES)
@@ -74,13 +88,13 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("kind", TEXTS)
-def test_a_text_table_of_any_layout_is_read_exactly(tmp_path, kind):
+def test_a_text_table_of_any_layout_is_read_exactly(tmp_path: Path, kind: str) -> None:
     for name in ("a.csv", "a.txt"):
         (tmp_path / name).write_text(TEXTS[kind], encoding="utf-8")
         assert check(tmp_path / name).relative
 
 
-def test_encodings_that_spreadsheets_write(tmp_path):
+def test_encodings_that_spreadsheets_write(tmp_path: Path) -> None:
     text = table(before="time,Weg µm,Kraft\n")
     named = (Channel("x", "m", 1.0, column="Weg µm"), Channel("F", "N", 1.0, column="Kraft"))
     for encoding in ("utf-8", "utf-16", "cp1252"):
@@ -88,14 +102,14 @@ def test_encodings_that_spreadsheets_write(tmp_path):
         check(tmp_path / "a.csv", named)
 
 
-def test_a_table_without_header_is_addressed_by_numbers(tmp_path):
+def test_a_table_without_header_is_addressed_by_numbers(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before=""))
     numbered = (Channel("x", "m", 1.0, column="2"), Channel("F", "N", 1.0, csv="3"))
     assert "no header: the columns are numbered 1 to 3" in check(tmp_path / "a.csv", numbered).problems
     check(tmp_path / "a.csv", numbered, TimeColumn("1"))
 
 
-def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path):
+def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before="time,x,x\n"))
     with pytest.raises(
         UnreadableRecording, match=r"2 columns are called 'x'; say which by its number: `column: 2` or 3"
@@ -104,7 +118,7 @@ def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path):
     check(tmp_path / "a.csv", (Channel("x", "m", 1.0, column="2"), Channel("F", "N", 1.0, column="3")))
 
 
-def test_without_a_time_column_the_rate_must_be_said(tmp_path):
+def test_without_a_time_column_the_rate_must_be_said(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("x,F\n" + "".join(f"{x:.6f},{f:.4f}\n" for x, f in VALUES))
     with pytest.raises(
         UnreadableRecording, match=r"no column of times is recognised; say `time: \{column: NAME, unit: s"
@@ -125,7 +139,7 @@ def test_without_a_time_column_the_rate_must_be_said(tmp_path):
         (lambda i: f"14:13:{20 + i // 100:02d}.{i % 100:02d}", (14 * 3600 + 13 * 60 + 20) * 10**9),
     ],
 )
-def test_written_times_are_read_to_the_nanosecond(tmp_path, written, start):
+def test_written_times_are_read_to_the_nanosecond(tmp_path: Path, written: Callable[[int], str], start: int) -> None:
     (tmp_path / "a.csv").write_text(table(times=[written(i) for i in range(500)], before="Timestamp,x,F\n"))
     account = check(tmp_path / "a.csv", start=start)
     assert account.relative == (start < START)
@@ -142,7 +156,9 @@ def test_written_times_are_read_to_the_nanosecond(tmp_path, written, start):
         ([f"{START // 10**9}.{i:03d}" for i in range(0, 1000, 10)] * 5, TimeColumn("T"), None),
     ],
 )
-def test_time_of_any_unit_and_epoch(tmp_path, times, time, start):
+def test_time_of_any_unit_and_epoch(
+    tmp_path: Path, times: Iterable[str | float], time: TimeColumn, start: int | None
+) -> None:
     (tmp_path / "a.csv").write_text(table(times=times, before="T,x,F\n"))
     if start is None:  # a float of Unix seconds is good for a quarter of a microsecond
         read_times, _, account = read(tmp_path / "a.csv", time=time)
@@ -154,7 +170,7 @@ def test_time_of_any_unit_and_epoch(tmp_path, times, time, start):
     assert account.relative == (start == 0)
 
 
-def test_days_of_matlab_are_read_without_losing_their_fraction():
+def test_days_of_matlab_are_read_without_losing_their_fraction() -> None:
     account = Account()
     days = 719529.0 + 20_000.0
     stamps = Stamps(TimeColumn("t", 86400.0, -719529 * 86400 * 10**9), None, account)
@@ -163,7 +179,7 @@ def test_days_of_matlab_are_read_without_losing_their_fraction():
     assert ns[[0, 2]].tolist() == [20_000 * 86400 * 10**9, 20_000 * 86400 * 10**9 + 43200 * 10**9]
 
 
-def test_times_that_no_calendar_holds_are_refused_or_counted(tmp_path):
+def test_times_that_no_calendar_holds_are_refused_or_counted(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time,x,F\n1e300,1,2\n2e300,3,4\n")
     with pytest.raises(UnreadableRecording, match="lies beyond the year 2116"):
         read(tmp_path / "a.csv")
@@ -174,7 +190,7 @@ def test_times_that_no_calendar_holds_are_refused_or_counted(tmp_path):
     assert account.tally.reasons["row without a time"] == 1
 
 
-def test_a_misspelt_column_is_named_with_its_neighbours(tmp_path):
+def test_a_misspelt_column_is_named_with_its_neighbours(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before="time,x,force\n"))
     with pytest.raises(UnreadableRecording, match=r"'Force' \(did you mean 'force'\?\); its columns: time, x, force"):
         read(tmp_path / "a.csv", (X, Channel("F", "N", 1.0, csv="Force")))
@@ -182,7 +198,7 @@ def test_a_misspelt_column_is_named_with_its_neighbours(tmp_path):
         read(tmp_path / "a.csv", (X,), TimeColumn("tme"))
 
 
-def test_a_column_that_is_another_channels_is_no_misspelling(tmp_path):
+def test_a_column_that_is_another_channels_is_no_misspelling(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("time,acc_front_left,b\n0,1,2\n0.01,3,4\n")
     left, right = (Channel(side, "m/s^2", 1.0, csv=f"acc_front_{side}") for side in ("left", "right"))
     read(tmp_path / "a.csv", (left,))
@@ -191,7 +207,7 @@ def test_a_column_that_is_another_channels_is_no_misspelling(tmp_path):
     assert "no column 'acc_front_right' for right" in blocks.problems
 
 
-def test_damage_is_counted_row_by_row(tmp_path):
+def test_damage_is_counted_row_by_row(tmp_path: Path) -> None:
     rows = [
         "time,x,F",
         "0,1,2",
@@ -214,14 +230,14 @@ def test_damage_is_counted_row_by_row(tmp_path):
     assert account.tally.used == 52
 
 
-def test_a_line_without_end_is_one_corrupt_row_and_memory_stays_small(tmp_path):
+def test_a_line_without_end_is_one_corrupt_row_and_memory_stays_small(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table() + "5," * 1_500_000 + "\n" + "5.00,1,2\n")
     _times, values, account = read(tmp_path / "a.csv")
     assert len(values) == 501
     assert account.tally.reasons["line longer than a mebibyte"] == 1
 
 
-def test_too_many_columns_and_binary_files_are_refused(tmp_path):
+def test_too_many_columns_and_binary_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(",".join(["time", *map(str, range(20_000))]) + "\n" + "1," * 20_000 + "1\n")
     with pytest.raises(UnreadableRecording, match=r"20001 columns; at most 10000"):
         read(tmp_path / "a.csv", (Channel("x", "m", 1.0, column="5"),))
@@ -230,7 +246,7 @@ def test_too_many_columns_and_binary_files_are_refused(tmp_path):
         read(tmp_path / "a.csv")
 
 
-def test_units_are_found_in_names():
+def test_units_are_found_in_names() -> None:
     assert unit_in("Force [kN]") == ("Force", "kN")
     assert unit_in("Time (ms)") == ("Time", "ms")
     assert unit_in("Accel, g") == ("Accel", "g")
@@ -241,14 +257,14 @@ def test_units_are_found_in_names():
     assert not is_unit("left")
 
 
-def test_recorded_numbers_are_converted_when_they_are_read(tmp_path):
+def test_recorded_numbers_are_converted_when_they_are_read(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table())
     scaled = (Channel("x", "m", 1.0, column="x", gain=-0.001), Channel("F", "N", 1.0, column="F", gain=2.0, offset=5.0))
     _, values, _ = read(tmp_path / "a.csv", scaled)
     assert np.allclose(values, np.stack([-0.001 * VALUES[:, 0], 2 * VALUES[:, 1] + 5], axis=1), rtol=1e-15)
 
 
-def test_a_ride_whose_times_begin_at_0_gets_a_start(tmp_path):
+def test_a_ride_whose_times_begin_at_0_gets_a_start(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(times=SECONDS + 7.0))
     times, _, account = read(tmp_path / "a.csv", start=START)
     assert times[0] == START

@@ -2,13 +2,15 @@
 
 import time
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy.typing import ArrayLike
 
-from sprung.model.signals import Channel, SampleBlock
+from sprung.model.signals import Channel, SampleBlock, Window
 from sprung.replay import UnreadableRecording
 from sprung.replay.plausible import EARLIEST, LATEST
 from sprung.replay.record import load_record
@@ -20,7 +22,7 @@ START = 1_790_000_000_000_000_000
 HOUR, YEAR = 3600.0, 365.25 * 86_400.0
 
 
-def block(seconds, start=START):
+def block(seconds: ArrayLike, start: int = START) -> SampleBlock:
     """Both channels at these times."""
     times = start + np.rint(np.asarray(seconds) * 1e9).astype(np.int64)
     return SampleBlock(
@@ -30,7 +32,7 @@ def block(seconds, start=START):
     )
 
 
-def cut(*blocks, size=500):
+def cut(*blocks: SampleBlock, size: int = 500) -> tuple[list[Window], Windower]:
     """Windows of 1 s each half second, and the windower."""
     windower = Windower(CHANNELS, 100.0, 100, 50)
     windows = []
@@ -45,7 +47,7 @@ TEN = np.arange(1000) / 100
 
 
 @pytest.mark.parametrize("step", [-HOUR, -14 * YEAR, -30.0, 20.0, HOUR, 14 * YEAR])
-def test_a_clock_that_is_set_begins_a_new_segment(step):
+def test_a_clock_that_is_set_begins_a_new_segment(step: float) -> None:
     windows, windower = cut(block(np.r_[TEN, TEN + 10 + step]))
     first = [window.new_segment for window in windows]
     assert sum(first) == 1
@@ -61,7 +63,7 @@ def test_a_clock_that_is_set_begins_a_new_segment(step):
         assert told == []  # a pause
 
 
-def test_the_reason_why_no_window_can_be_made_is_told():
+def test_the_reason_why_no_window_can_be_made_is_told() -> None:
     short, windower = cut(block(TEN[:50]))
     assert "a window needs 1 s, their longest stretch is 0.49 s" in remarks(windower, len(short))[0]
     still, windower = cut(block(np.zeros(3000)))
@@ -72,7 +74,7 @@ def test_the_reason_why_no_window_can_be_made_is_told():
     assert remarks(windower, len(whole)) == []
 
 
-def test_a_stream_that_leaps_to_and_fro_is_read_in_time():
+def test_a_stream_that_leaps_to_and_fro_is_read_in_time() -> None:
     to_and_fro = np.arange(20_000) / 100 + np.where(np.arange(20_000) % 2, 32 * YEAR, 0.0)
     started = time.process_time()
     windows, _ = cut(block(to_and_fro), size=120_000)
@@ -80,7 +82,7 @@ def test_a_stream_that_leaps_to_and_fro_is_read_in_time():
     assert all(window.outcome == "repaired" for window in windows)  # of every other sample
 
 
-def test_a_stream_whose_time_stands_still_stays_small():
+def test_a_stream_whose_time_stands_still_stays_small() -> None:
     windower = Windower(CHANNELS, 100.0, 100, 50)
     still = block(np.zeros(100_000))
     tracemalloc.start()
@@ -92,7 +94,7 @@ def test_a_stream_whose_time_stands_still_stays_small():
     assert windower.reasons["too many samples for their time"] > 1_000_000
 
 
-def test_a_record_that_is_nearly_all_gaps_is_refused(tmp_path):
+def test_a_record_that_is_nearly_all_gaps_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.csv"
     path.write_text("time,a,b\n" + "".join(f"{START // 10**9 + 59 * i},{i % 7},{i % 5}\n" for i in range(3000)))
     with pytest.raises(UnreadableRecording, match=r"too few|come every"):
@@ -115,7 +117,7 @@ stamps = st.one_of(
     ),
     st.integers(1, 700),
 )
-def test_any_times_give_windows_in_time_and_memory(runs, size):
+def test_any_times_give_windows_in_time_and_memory(runs: list[tuple[int, int, int]], size: int) -> None:
     """Runs of samples that begin anywhere and go on with any period."""
     times = np.concatenate([begin + step * np.arange(n) for begin, n, step in runs] or [np.zeros(0, dtype=np.int64)])
     times = np.clip(times.astype(np.int64), EARLIEST, LATEST)

@@ -2,6 +2,8 @@
 
 import json
 import struct
+from collections.abc import Sequence
+from pathlib import Path
 
 import can
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
+from numpy.typing import ArrayLike
 
 from sprung.model.signals import Channel, SampleBlock
 from sprung.replay.account import KEPT_PROBLEMS, Account, UnreadableRecording
@@ -23,13 +26,13 @@ GOOD = np.arange(ROWS) != BAD_ROW
 
 
 @pytest.fixture(scope="module")
-def dbc(tmp_path_factory):
+def dbc(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("dbc") / "body.dbc"
     path.write_text(database().as_dbc_string())
     return path
 
 
-def write_mcap(path, bad, publish=None):
+def write_mcap(path: Path, bad: bytes, publish: int | None = None) -> None:
     """The usual recording with one message of its own in row BAD_ROW."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=4096)
@@ -47,7 +50,7 @@ NUMBERS = ["1e30", "1e300", "1e999", "-1e999", "Infinity", "NaN", "1" * 400, "1"
 
 
 @pytest.mark.parametrize("number", NUMBERS)
-def test_a_number_that_no_sensor_gives_is_missing(number, tmp_path):
+def test_a_number_that_no_sensor_gives_is_missing(number: str, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, f'{{"left": {number}, "axes": [{{}}, {{"right": 0.5}}]}}'.encode())
     recording, samples = read(path)
@@ -81,7 +84,7 @@ def test_a_number_that_no_sensor_gives_is_missing(number, tmp_path):
         b'{"left"\n:1,"left":2}',
     ],
 )
-def test_a_message_that_is_none_costs_itself(message, tmp_path):
+def test_a_message_that_is_none_costs_itself(message: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, message)
     recording, samples = read(path)
@@ -95,7 +98,7 @@ def test_a_message_that_is_none_costs_itself(message, tmp_path):
     assert not any("Error" in line for line in recording.problems)
 
 
-def test_a_message_of_another_era_is_left_out_and_told(tmp_path):
+def test_a_message_of_another_era_is_left_out_and_told(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     write_mcap(path, b'{"left": 0.5}', publish=(1 << 64) - 1)
     recording, samples = read(path)
@@ -125,7 +128,7 @@ LINES = [
 
 
 @pytest.mark.parametrize("line", LINES, ids=range(len(LINES)))
-def test_a_line_of_a_candump_log_costs_itself(line, tmp_path, dbc):
+def test_a_line_of_a_candump_log_costs_itself(line: str, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.log"
     write_can(path)
     lines = path.read_bytes().splitlines()
@@ -151,7 +154,7 @@ ASC = [
 
 
 @pytest.mark.parametrize("line", ASC, ids=range(len(ASC)))
-def test_a_line_of_an_asc_log_costs_itself(line, tmp_path, dbc):
+def test_a_line_of_an_asc_log_costs_itself(line: str, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.asc"
     write_can(path)
     lines = path.read_bytes().splitlines()
@@ -161,7 +164,7 @@ def test_a_line_of_an_asc_log_costs_itself(line, tmp_path, dbc):
     assert np.allclose(samples[0][1], VALUES[:, 0], atol=1e-9)
 
 
-def test_a_blf_file_of_remote_frames_only_holds_no_messages(tmp_path):
+def test_a_blf_file_of_remote_frames_only_holds_no_messages(tmp_path: Path) -> None:
     path = tmp_path / "a.blf"
     with can.BLFWriter(str(path)) as writer:
         for row in range(10):
@@ -172,7 +175,7 @@ def test_a_blf_file_of_remote_frames_only_holds_no_messages(tmp_path):
     assert account.tally.foreign == 10
 
 
-def test_blf_objects_that_are_too_short_or_beyond_time_are_counted_and_the_others_read(tmp_path):
+def test_blf_objects_that_are_too_short_or_beyond_time_are_counted_and_the_others_read(tmp_path: Path) -> None:
     path = tmp_path / "a.blf"
     with can.BLFWriter(str(path), compression_level=0) as writer:
         for row in range(40):
@@ -191,7 +194,9 @@ def test_blf_objects_that_are_too_short_or_beyond_time_are_counted_and_the_other
     assert account.incomplete
 
 
-def screened(channels, time, channel, value):
+def screened(
+    channels: Sequence[Channel], time: ArrayLike, channel: ArrayLike, value: ArrayLike
+) -> tuple[SampleBlock, Account]:
     account = Account()
     screen = Screen(channels, account, converter(channels))
     block = screen.check(SampleBlock(np.array(time), np.array(channel, dtype=np.int32), np.array(value)))
@@ -199,7 +204,7 @@ def screened(channels, time, channel, value):
     return block, account
 
 
-def test_a_channel_may_say_what_it_can_measure():
+def test_a_channel_may_say_what_it_can_measure() -> None:
     channels = [Channel("near", "m/s^2", 0.01, range=(-20.0, 20.0)), Channel("far", "m/s^2", 0.01)]
     block, account = screened(channels, [0, 0, 1, 1], [0, 1, 0, 1], [30.0, 30.0, -20.0, 6e3])
     assert np.array_equal(np.isnan(block.value), [True, False, False, True])
@@ -207,14 +212,14 @@ def test_a_channel_may_say_what_it_can_measure():
     assert "near: 1 of its values" in account.problems[0]
 
 
-def test_a_range_is_one_of_si_values_and_a_marker_one_of_recorded_numbers():
+def test_a_range_is_one_of_si_values_and_a_marker_one_of_recorded_numbers() -> None:
     channel = Channel("a", "m/s^2", 0.01, gain=1e-3, range=(-20.0, 20.0))
     ordinary = 1000.0 * np.sin(np.arange(100))
     block, _ = screened([channel], np.arange(102), np.zeros(102), [*ordinary, -9999.0, 25_000.0])
     assert np.isnan(block.value).sum() == 2
 
 
-def test_a_force_may_have_the_value_of_a_marker():
+def test_a_force_may_have_the_value_of_a_marker() -> None:
     rng = np.random.default_rng(3)
     values = np.rint(9_000 * rng.standard_normal(1000))
     values[500] = 9_999.0
@@ -228,7 +233,9 @@ def test_a_force_may_have_the_value_of_a_marker():
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(0, 1), st.floats()), max_size=30))
-def test_nothing_passes_the_screen_but_plausible_values_at_possible_times(samples):
+def test_nothing_passes_the_screen_but_plausible_values_at_possible_times(
+    samples: list[tuple[int, int, float]],
+) -> None:
     channels = [Channel("a", "m/s^2", 0.01), Channel("f", "N", 1.0, gain=-1e3, offset=2.0)]
     time, channel, value = zip(*samples, strict=True) if samples else ((), (), ())
     block, account = screened(channels, np.array(time, dtype=np.int64), channel, np.array(value, dtype=np.float64))
@@ -242,7 +249,7 @@ def test_nothing_passes_the_screen_but_plausible_values_at_possible_times(sample
 
 @settings(max_examples=150, deadline=None)
 @given(st.lists(st.floats(), max_size=20))
-def test_seconds_become_times_or_none(seconds):
+def test_seconds_become_times_or_none(seconds: list[float]) -> None:
     time, good = nanoseconds(np.array(seconds, dtype=np.float64))
     assert ((time >= EARLIEST) & (time <= LATEST)).all()
     for second, at, fine in zip(seconds, time, good, strict=True):
@@ -252,7 +259,7 @@ def test_seconds_become_times_or_none(seconds):
 
 @settings(max_examples=200, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.one_of(st.binary(max_size=25), st.from_regex(rb"\A-?[0-9]{1,14}(\.[0-9]{0,12})?\Z")))
-def test_text_is_a_time_or_refused(text):
+def test_text_is_a_time_or_refused(text: bytes) -> None:
     try:
         time = decimal_ns(text)
     except ValueError:
@@ -264,7 +271,7 @@ def test_text_is_a_time_or_refused(text):
 
 @settings(max_examples=150, deadline=None)
 @given(st.binary(max_size=12), st.sampled_from([10, 16]), st.booleans())
-def test_text_is_an_identifier_or_refused(text, base, extended):
+def test_text_is_an_identifier_or_refused(text: bytes, base: int, extended: bool) -> None:
     try:
         number = frame_id(text, base, extended=extended)
     except ValueError:
@@ -273,7 +280,7 @@ def test_text_is_an_identifier_or_refused(text, base, extended):
     assert number >> 31 == extended
 
 
-def test_countless_problems_are_a_hundred_lines():
+def test_countless_problems_are_a_hundred_lines() -> None:
     account = Account()
     for number in range(100_000):
         account.problem(f"chunk {number} is damaged")
@@ -281,7 +288,7 @@ def test_countless_problems_are_a_hundred_lines():
     assert account.problems[-1] == f"and {100_000 - KEPT_PROBLEMS} more like these"
 
 
-def test_names_in_a_file_can_do_nothing_to_a_terminal(tmp_path):
+def test_names_in_a_file_can_do_nothing_to_a_terminal(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file)

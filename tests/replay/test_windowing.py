@@ -1,13 +1,15 @@
 """Windows from streams: what lies on the grid is untouched, what does not is resampled, and nothing is uncounted."""
 
 import time
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
 
-from sprung.model.signals import Channel, SampleBlock
+from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
 from sprung.replay.windowing import Windower
 
 RATE = 100.0
@@ -16,12 +18,16 @@ NAMES = ("road", "roof", "axle")
 CHANNELS = [Channel(name, "m", 1e-3) for name in NAMES]
 
 
-def truth(seconds, channel):
+def truth(seconds: FloatArray, channel: int | IntArray) -> FloatArray:
     """A smooth signal with content at 1.3 Hz and 11 Hz, different in every channel."""
     return np.sin(2 * np.pi * 1.3 * seconds + channel) + 0.3 * np.sin(2 * np.pi * 11.0 * seconds + 2.0 * channel)
 
 
-def stream(seconds_by_channel, values=None, order=None):
+def stream(
+    seconds_by_channel: Sequence[FloatArray],
+    values: Sequence[FloatArray] | None = None,
+    order: Sequence[FloatArray] | None = None,
+) -> SampleBlock:
     """One block in time order (or in `order`, seconds of arrival by channel)."""
     time_s = np.concatenate(seconds_by_channel)
     channel = np.repeat(np.arange(len(seconds_by_channel)), [len(s) for s in seconds_by_channel]).astype(np.int32)
@@ -31,22 +37,22 @@ def stream(seconds_by_channel, values=None, order=None):
     return SampleBlock(stamps[arrival], channel[arrival], value[arrival])
 
 
-def even(seconds=4.0, rate=RATE, channels=3):
+def even(seconds: float = 4.0, rate: float = RATE, channels: int = 3) -> list[FloatArray]:
     return [np.arange(0.0, seconds - 1e-9, 1.0 / rate) for _ in range(channels)]
 
 
-def windows_of(block, **options):
+def windows_of(block: SampleBlock, **options: Any) -> tuple[Windower, list[Window]]:
     windower = Windower(CHANNELS, RATE, 100, 50, inputs=1, **options)
     return windower, windower.push(block) + windower.flush()
 
 
-def expected(window, channels=3):
+def expected(window: Window, channels: int = 3) -> FloatArray:
     """The truth on the window's own grid, in seconds since START."""
     seconds = (window.start - START) / 1e9 + np.arange(100) / RATE
     return np.stack([truth(seconds, channel) for channel in range(channels)], axis=1)
 
 
-def same(a, b):
+def same(a: Window, b: Window) -> bool:
     return (
         a.start == b.start
         and (a.outcome, a.reason, a.repaired_samples) == (b.outcome, b.reason, b.repaired_samples)
@@ -54,16 +60,16 @@ def same(a, b):
     )
 
 
-def cut(block, ends):
+def cut(block: SampleBlock, ends: Iterable[int]) -> list[SampleBlock]:
     edges = [0, *ends, len(block.time)]
     return [SampleBlock(block.time[a:b], block.channel[a:b], block.value[a:b]) for a, b in pairwise(edges)]
 
 
-def without(block, mask):
+def without(block: SampleBlock, mask: BoolArray) -> SampleBlock:
     return SampleBlock(block.time[~mask], block.channel[~mask], block.value[~mask])
 
 
-def test_samples_on_the_grid_pass_unchanged():
+def test_samples_on_the_grid_pass_unchanged() -> None:
     windower, windows = windows_of(stream(even()))
     assert [w.start for w in windows] == [START + i * 500_000_000 for i in range(7)]
     for window in windows:
@@ -73,7 +79,7 @@ def test_samples_on_the_grid_pass_unchanged():
     assert (windower.expected, windower.lost) == (1200, 0)
 
 
-def test_jitter_and_bus_order_within_a_quarter_period_do_not_smear():
+def test_jitter_and_bus_order_within_a_quarter_period_do_not_smear() -> None:
     rng = np.random.default_rng(1)
     seconds = even()
     block = stream(seconds)
@@ -85,7 +91,7 @@ def test_jitter_and_bus_order_within_a_quarter_period_do_not_smear():
         assert np.abs(window.values[:, 1] - truth(seconds, 1)).max() < 1e-12
 
 
-def test_windows_do_not_depend_on_how_samples_are_cut_into_blocks():
+def test_windows_do_not_depend_on_how_samples_are_cut_into_blocks() -> None:
     rng = np.random.default_rng(2)
     seconds = even(6.0)
     seconds[1] = np.arange(0.0, 6.0, 1.0 / 730.0)  # faster, another rate
@@ -103,7 +109,7 @@ def test_windows_do_not_depend_on_how_samples_are_cut_into_blocks():
         assert all(same(a, b) for a, b in zip(parts, whole, strict=True))
 
 
-def test_a_faster_channel_is_resampled_without_aliases():
+def test_a_faster_channel_is_resampled_without_aliases() -> None:
     """Content at 80 Hz would fold to 20 Hz at 100 Hz; the filter must remove it and leave 11 Hz alone."""
     seconds = even()
     seconds[1] = np.arange(0.0, 4.0 - 1e-9, 1e-3)
@@ -115,7 +121,7 @@ def test_a_faster_channel_is_resampled_without_aliases():
 
 
 @pytest.mark.parametrize("phase", [0.003, 0.005, -0.0045])
-def test_a_channel_sampled_between_the_grid_points_is_delayed_by_the_fraction(phase):
+def test_a_channel_sampled_between_the_grid_points_is_delayed_by_the_fraction(phase: float) -> None:
     seconds = even()
     seconds[2] = seconds[2][1:] + phase
     _, windows = windows_of(stream(seconds))
@@ -125,7 +131,7 @@ def test_a_channel_sampled_between_the_grid_points_is_delayed_by_the_fraction(ph
         assert np.abs(window.values - expected(window)).max() < 1e-3
 
 
-def test_jitter_of_even_samples_is_removed_before_resampling():
+def test_jitter_of_even_samples_is_removed_before_resampling() -> None:
     """Arrival scatters by more than a quarter of a period around an even clock: the samples, not the scatter, count."""
     rng = np.random.default_rng(3)
     seconds = even()
@@ -138,7 +144,7 @@ def test_jitter_of_even_samples_is_removed_before_resampling():
         assert error < 0.04  # the phase of 100 stamps is known to 0.2 ms; taken at their word they err by 0.09
 
 
-def test_a_slower_channel_is_interpolated_and_marked_down_to_half_the_rate():
+def test_a_slower_channel_is_interpolated_and_marked_down_to_half_the_rate() -> None:
     seconds = even(channels=3)
     seconds[1] = np.arange(0.0, 4.0 - 1e-9, 1.0 / 62.5)
     _, windows = windows_of(stream(seconds))
@@ -147,7 +153,7 @@ def test_a_slower_channel_is_interpolated_and_marked_down_to_half_the_rate():
         assert np.abs(window.values[:, 1] - expected(window)[:, 1]).max() < 2e-3
 
 
-def test_a_sensor_slower_than_half_the_rate_is_absent_and_an_input_drops_the_window():
+def test_a_sensor_slower_than_half_the_rate_is_absent_and_an_input_drops_the_window() -> None:
     seconds = even()
     seconds[1] = np.arange(0.0, 4.0 - 1e-9, 1.0 / 20.0)
     _, windows = windows_of(stream(seconds))
@@ -159,7 +165,7 @@ def test_a_sensor_slower_than_half_the_rate_is_absent_and_an_input_drops_the_win
     assert {(w.outcome, w.reason) for w in windows} == {("dropped", "road too slow (20 Hz)")}
 
 
-def test_bursts_without_an_even_clock_are_refused():
+def test_bursts_without_an_even_clock_are_refused() -> None:
     seconds = even()
     seconds[1] = np.sort(np.random.default_rng(4).uniform(0.0, 4.0, 400))
     _, windows = windows_of(stream(seconds))
@@ -167,7 +173,7 @@ def test_bursts_without_an_even_clock_are_refused():
     assert np.isnan(windows[2].values[:, 1]).all()
 
 
-def test_isolated_lost_samples_are_interpolated_marked_and_counted():
+def test_isolated_lost_samples_are_interpolated_marked_and_counted() -> None:
     block = stream(even())
     row = np.rint((block.time - START) / 1e7).astype(int)
     lost = ((block.channel == 1) & np.isin(row, [130, 131, 170])) | ((block.channel == 2) & (row == 180))
@@ -178,7 +184,7 @@ def test_isolated_lost_samples_are_interpolated_marked_and_counted():
     assert (windower.expected, windower.lost) == (1200, 4)
 
 
-def test_invalid_values_are_missing_samples():
+def test_invalid_values_are_missing_samples() -> None:
     block = stream(even())
     invalid = (block.channel == 1) & (np.rint((block.time - START) / 1e7) == 130)
     windower, windows = windows_of(replace(block, value=np.where(invalid, np.nan, block.value)))
@@ -187,7 +193,7 @@ def test_invalid_values_are_missing_samples():
 
 
 @pytest.mark.parametrize("phase", [0.002, 0.0045, 0.005])
-def test_every_lost_sample_counts_once_whatever_the_phase_of_its_channel(phase):
+def test_every_lost_sample_counts_once_whatever_the_phase_of_its_channel(phase: float) -> None:
     """Half a period off the grid, too, where a sample is as near to the row before it as to the one after."""
     seconds = even()
     seconds[1] = np.delete(seconds[1] + phase, [50, 150, 151, 152, 153])
@@ -195,7 +201,7 @@ def test_every_lost_sample_counts_once_whatever_the_phase_of_its_channel(phase):
     assert windower.lost == 5
 
 
-def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other():
+def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other() -> None:
     block = stream(even())
     row = np.rint((block.time - START) / 1e7).astype(int)
     windower, windows = windows_of(without(block, (block.channel == 2) & (row >= 120) & (row < 123)))
@@ -204,7 +210,7 @@ def test_a_longer_gap_drops_the_windows_that_hold_it_and_no_other():
     assert windower.reasons["gap in axle"] == 2
 
 
-def test_too_many_lost_samples_drop_a_window():
+def test_too_many_lost_samples_drop_a_window() -> None:
     block = stream(even())
     row = np.rint((block.time - START) / 1e7).astype(int)
     _, windows = windows_of(without(block, (row < 100) & (row % 9 == 4)))
@@ -213,7 +219,7 @@ def test_too_many_lost_samples_drop_a_window():
     assert windows[-1].outcome == "used"
 
 
-def test_an_absent_sensor_is_a_nan_column_and_an_absent_input_drops_the_window():
+def test_an_absent_sensor_is_a_nan_column_and_an_absent_input_drops_the_window() -> None:
     block = stream(even())
     _, windows = windows_of(without(block, block.channel == 2))
     assert {w.outcome for w in windows} == {"used"}
@@ -223,7 +229,7 @@ def test_an_absent_sensor_is_a_nan_column_and_an_absent_input_drops_the_window()
     assert windower.reasons["missing input road"] == len(windows)
 
 
-def test_duplicates_and_samples_out_of_order_within_the_delay_change_nothing():
+def test_duplicates_and_samples_out_of_order_within_the_delay_change_nothing() -> None:
     rng = np.random.default_rng(5)
     block = stream(even())
     _, reference = windows_of(block)
@@ -237,7 +243,7 @@ def test_duplicates_and_samples_out_of_order_within_the_delay_change_nothing():
     assert not windower.reasons
 
 
-def test_late_samples_are_dropped_and_counted():
+def test_late_samples_are_dropped_and_counted() -> None:
     seconds = even()
     arrival = [s.copy() for s in seconds]
     arrival[1][150] += 1.0
@@ -247,7 +253,7 @@ def test_late_samples_are_dropped_and_counted():
 
 
 @pytest.mark.parametrize("jump", [3600.0, -3600.0, -2.0])
-def test_a_clock_jump_restarts_the_grid(jump):
+def test_a_clock_jump_restarts_the_grid(jump: float) -> None:
     block = stream(even(6.0))
     later = block.time >= START + 3_000_000_000
     moved = replace(block, time=block.time + np.where(later, int(jump * 1e9), 0))
@@ -258,7 +264,7 @@ def test_a_clock_jump_restarts_the_grid(jump):
     assert sum(count for reason, count in windower.reasons.items() if "clock jump" in reason) == 1
 
 
-def test_a_small_step_back_of_the_clock_is_not_taken_for_duplicates():
+def test_a_small_step_back_of_the_clock_is_not_taken_for_duplicates() -> None:
     block = stream(even(6.0))
     later = block.time >= START + 3_000_000_000
     _, windows = windows_of(replace(block, time=block.time - np.where(later, 300_000_000, 0)))
@@ -267,7 +273,7 @@ def test_a_small_step_back_of_the_clock_is_not_taken_for_duplicates():
     assert len(used) >= 8
 
 
-def test_a_stray_time_stamp_does_not_stop_the_stream():
+def test_a_stray_time_stamp_does_not_stop_the_stream() -> None:
     block = stream(even())
     stamps = block.time.copy()
     stamps[500] = 4 * START
@@ -278,7 +284,7 @@ def test_a_stray_time_stamp_does_not_stop_the_stream():
     assert len(windows) == 7
 
 
-def test_the_grid_follows_a_clock_that_drifts():
+def test_the_grid_follows_a_clock_that_drifts() -> None:
     """300 ppm for ten minutes are 18 samples: windows stay whole and their samples unsmeared."""
     seconds = even(600.0)
     block = stream([s * (1 + 3e-4) for s in seconds], [truth(s, c) for c, s in enumerate(seconds)])
@@ -290,7 +296,7 @@ def test_the_grid_follows_a_clock_that_drifts():
         assert np.array_equal(windows[k].values[:, 1], truth(seconds[1][row : row + 100], 1))
 
 
-def test_a_pause_shorter_than_the_limit_keeps_the_grid():
+def test_a_pause_shorter_than_the_limit_keeps_the_grid() -> None:
     block = stream(even(8.0))
     silent = (block.time >= START + 2_000_000_000) & (block.time < START + 5_000_000_000)
     _, windows = windows_of(without(block, silent))
@@ -299,7 +305,7 @@ def test_a_pause_shorter_than_the_limit_keeps_the_grid():
     assert windows[-1].outcome == "used"
 
 
-def test_a_long_recording_takes_little_time_and_memory_stays_bounded():
+def test_a_long_recording_takes_little_time_and_memory_stays_bounded() -> None:
     channels = [Channel(f"c{i}", "m", 1e-3) for i in range(28)]
     rows = np.arange(60_000)
     block = SampleBlock(
@@ -318,7 +324,7 @@ def test_a_long_recording_takes_little_time_and_memory_stays_bounded():
     assert time.process_time() - begun < 3.0  # 0.6 s measured; the margin is for a busy machine
 
 
-def arriving_late(seconds, rng, stalls):
+def arriving_late(seconds: FloatArray, rng: np.random.Generator, stalls: Iterable[tuple[float, float]]) -> FloatArray:
     """Arrival times: in order, each some milliseconds late, and nothing at all during the stalls."""
     arrival = seconds + rng.uniform(0.0, 0.002, len(seconds))
     for begin, length in stalls:
@@ -326,7 +332,7 @@ def arriving_late(seconds, rng, stalls):
     return np.maximum.accumulate(arrival + np.arange(len(arrival)) * 1e-6)
 
 
-def test_bursty_arrival_of_an_even_source_is_counted_out_and_marked():
+def test_bursty_arrival_of_an_even_source_is_counted_out_and_marked() -> None:
     rng = np.random.default_rng(6)
     seconds = even(6.0)
     stalls = [(t, 0.12) for t in np.arange(0.33, 5.0, 0.25)]
@@ -340,7 +346,7 @@ def test_bursty_arrival_of_an_even_source_is_counted_out_and_marked():
         assert np.abs(window.values - np.stack(values, axis=1)[row : row + 100]).max() < 0.03  # the phase: 0.4 ms
 
 
-def test_bursty_arrival_with_a_lost_sample_is_not_counted_out():
+def test_bursty_arrival_with_a_lost_sample_is_not_counted_out() -> None:
     rng = np.random.default_rng(7)
     seconds = even(6.0)
     stalls = [(t, 0.12) for t in np.arange(0.33, 5.0, 0.25)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 
 import numpy as np
@@ -141,7 +141,9 @@ def test_a_vehicle_that_cannot_be_tracked_costs_only_itself(
 ) -> None:
     real = running.pipeline.fold_all
 
-    def failing(connection, asked, recording_id=None):
+    def failing(
+        connection: Connection, asked: Sequence[AskedWindow], recording_id: str | None = None
+    ) -> list[AnsweredWindow]:
         if any(one.vehicle == "sick" for one in asked):
             raise FloatingPointError("no posterior")
         return real(connection, asked, recording_id)

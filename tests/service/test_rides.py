@@ -9,6 +9,7 @@ import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.comfort import W_K
+from sprung.model.signals import Window
 from sprung.model.system import System
 from sprung.service.core import Core
 from sprung.service.places import Places
@@ -17,7 +18,7 @@ from tests.service_fakes import make_window
 FREQUENCY = 5.0  # Hz, a whole number of periods in a window
 
 
-def shaken(system: System, number: int, amplitude: float):
+def shaken(system: System, number: int, amplitude: float) -> Window:
     """Window `number` of a car that moves by a sine at every accelerometer."""
     window = make_window(system, number)
     time = window.start * 1e-9 % 1000 + np.arange(system.window) / system.sample_rate

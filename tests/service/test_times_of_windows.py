@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sprung.model.signals import Window
 from sprung.model.system import System
 from sprung.model.tracking.state import TrackerState
 from sprung.service.compute import Compute
@@ -26,7 +27,7 @@ def piped(engine: Engine, store: Store, compute: Compute) -> Pipeline:
     return Pipeline(engine, store, compute, clock=lambda: NOW)
 
 
-def stream(system: System, count: int, shift: int, first: int = 0):
+def stream(system: System, count: int, shift: int, first: int = 0) -> list[Window]:
     made = [make_window(system, first + i, level=0.05) for i in range(count)]
     return [replace(w, start=w.start + shift, new_segment=i == 0 and shift != 0) for i, w in enumerate(made)]
 

@@ -7,7 +7,7 @@ from sprung.model.simulate.fusion import motion, motion_noise
 NOISE = {0: 1e-5, 1: 5e-4}
 
 
-def test_smooth_motion_passes_unchanged():
+def test_smooth_motion_passes_unchanged() -> None:
     t = np.arange(400) / 100
     for frequency in (0.5, 5, 15):
         w = 2 * np.pi * frequency
@@ -16,7 +16,7 @@ def test_smooth_motion_passes_unchanged():
         assert np.abs(v - w * np.cos(w * t))[20:-20].max() < 1e-3 * w
 
 
-def test_remaining_noise_has_the_stated_spectrum():
+def test_remaining_noise_has_the_stated_spectrum() -> None:
     rng = np.random.default_rng(0)
     d, _ = motion({order: std * rng.standard_normal((400, 256)) for order, std in NOISE.items()}, 0.01, NOISE)
     power = (np.abs(np.fft.rfft(d[:, 28:-28] * np.hanning(200), axis=1)) ** 2).mean(axis=0) / (
@@ -29,7 +29,7 @@ def test_remaining_noise_has_the_stated_spectrum():
     assert abs((power[band] / stated[band]).mean() - 1) < 0.03
 
 
-def test_long_and_short_records_are_smoothed_alike():
+def test_long_and_short_records_are_smoothed_alike() -> None:
     rng = np.random.default_rng(1)
     d, v = rng.standard_normal(700), 100 * rng.standard_normal(700)
     long, _ = motion({0: d, 1: v}, 0.01, {0: 1.0, 1: 100.0})

@@ -10,9 +10,10 @@ from sprung.model.identification.deviations import CARGO, OWN, deviations
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.refine import Refiner
-from sprung.model.simulate.linear import LinearSimulator
+from sprung.model.signals import FloatArray
+from sprung.model.simulate.linear import ElementValues, LinearSimulator
 from sprung.model.simulate.loading import by_inertia, load_terms
-from sprung.model.system import MANCHESTER, load_system, parse_system
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from tests.test_system import QUARTER_CAR
 
 CAR = slice(0, 3)  # z, roll, pitch
@@ -20,7 +21,7 @@ MASS, ROLL, PITCH = 32000.0, 56800.0, 1.97e6
 CARRIED, AT, ASIDE, OWN_ROLL, OWN_PITCH = 6400.0, 1.5, 0.3, 4000.0, 150e3  # kg, m, m, kg m^2 about its own centre
 
 
-def described():
+def described() -> FloatArray:
     """Load, roll, pitch, centre and side of goods of `CARRIED` kg at `AT` m, `ASIDE` m from the middle."""
     mass, roll = MASS + CARRIED, ROLL + OWN_ROLL + CARRIED * ASIDE**2
     pitch = PITCH + OWN_PITCH + CARRIED * AT**2
@@ -30,21 +31,21 @@ def described():
 
 
 @pytest.fixture(scope="module")
-def system():
+def system() -> System:
     return load_system()
 
 
 @pytest.fixture(scope="module")
-def simulator(system):
+def simulator(system: System) -> LinearSimulator:
     return LinearSimulator(system)
 
 
-def values_at(simulator, terms):
+def values_at(simulator: LinearSimulator, terms: FloatArray) -> ElementValues:
     x = np.concatenate([np.zeros(24), terms])
     return simulator.element_values(torch.as_tensor(x)[None])
 
 
-def test_the_mass_matrix_is_that_of_the_body_and_what_it_carries(simulator):
+def test_the_mass_matrix_is_that_of_the_body_and_what_it_carries(simulator: LinearSimulator) -> None:
     inertia = values_at(simulator, described()).inertia[0].numpy()
     expected = np.diag([MASS + CARRIED, ROLL + OWN_ROLL + CARRIED * ASIDE**2, PITCH + OWN_PITCH + CARRIED * AT**2])
     expected[0, 2] = expected[2, 0] = CARRIED * AT
@@ -53,7 +54,7 @@ def test_the_mass_matrix_is_that_of_the_body_and_what_it_carries(simulator):
     assert np.count_nonzero(inertia[CAR, 3:]) == 0
 
 
-def test_forces_accelerate_by_the_inverse_of_the_mass_matrix(simulator):
+def test_forces_accelerate_by_the_inverse_of_the_mass_matrix(simulator: LinearSimulator) -> None:
     forces = torch.as_tensor(np.random.default_rng(1).normal(size=(1, 9, 2)))
     for terms in (np.zeros(5), described()):
         values = values_at(simulator, terms)
@@ -61,7 +62,7 @@ def test_forces_accelerate_by_the_inverse_of_the_mass_matrix(simulator):
         np.testing.assert_allclose(values.accelerated(forces), expected, rtol=1e-10)
 
 
-def test_slopes_of_the_inertia_forces_agree_with_finite_differences(simulator):
+def test_slopes_of_the_inertia_forces_agree_with_finite_differences(simulator: LinearSimulator) -> None:
     rng, at, step = np.random.default_rng(2), described(), 1e-6
     acceleration = torch.as_tensor(rng.normal(size=(1, 3, 9)) + 1j * rng.normal(size=(1, 3, 9)))
     here, loading = values_at(simulator, at), simulator.loading
@@ -72,11 +73,11 @@ def test_slopes_of_the_inertia_forces_agree_with_finite_differences(simulator):
         np.testing.assert_allclose(slopes[..., i], expected, rtol=1e-6, atol=1e-3)
 
 
-def test_a_body_without_axes_has_a_mass_alone():
+def test_a_body_without_axes_has_a_mass_alone() -> None:
     assert [term.kind for term in load_terms(parse_system(QUARTER_CAR))] == ["load"]
 
 
-def test_windows_tell_where_goods_lie_and_blame_no_spring(system):
+def test_windows_tell_where_goods_lie_and_blame_no_spring(system: System) -> None:
     x = np.tile(np.concatenate([np.zeros(24), described()]), (24, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(3))
     alone = Refiner(system).refine(runs.values)
@@ -90,7 +91,7 @@ def test_windows_tell_where_goods_lie_and_blame_no_spring(system):
     assert np.median(alone.chi_square) > 1.1 * np.median(found.chi_square)
 
 
-def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
+def test_what_windows_say_of_a_load_does_not_hold_their_prior(system: System) -> None:
     """Summed over many windows, information and score lead to the truth, not to the middle of what is likely."""
     x = np.tile(np.concatenate([np.zeros(24), described()]), (48, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(4))
@@ -106,7 +107,7 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system):
     assert std[3] < 0.01 and std[4] < 0.01
 
 
-def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
+def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body() -> None:
     """Air springs: at 20 % more weight they are 20 % stiffer, and nothing has changed."""
     text = MANCHESTER.read_text()
     aired = re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 1, ", text)
@@ -122,7 +123,7 @@ def test_stiffness_that_follows_the_load_is_told_as_that_of_the_empty_body():
     assert np.median(taken.log_ratio[:, secondary]) == pytest.approx(np.log(1.2), abs=0.03)
 
 
-def test_slopes_along_loads_of_air_springs_and_along_how_bogies_are_built_agree_with_finite_differences():
+def test_slopes_along_loads_of_air_springs_and_along_how_bogies_are_built_agree_with_finite_differences() -> None:
     system = parse_system(re.sub(r"(secondary_\d[lr]: \{)", r"\1by_load: 0.8, ", MANCHESTER.read_text()))
     x = np.tile(np.concatenate([np.zeros(24), described(), np.full(8, 0.02)]), (2, 1))
     runs = simulate_runs(system, x, system.window, np.random.default_rng(6))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.special import ellipk
 from sprung.model.laws import CATALOGUE, ElementLaw, Motion, SpringDamper, find_law
 from sprung.model.laws.bodies import with_element
 from sprung.model.mechanics import Mechanics
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement, band_limited
 from sprung.model.system import load_system, parse_system
 
@@ -69,7 +71,7 @@ def toy() -> Mechanics:
     return parse_system(TOY).mechanics
 
 
-def drives(mechanics: Mechanics, samples: int, seed: int = 0):
+def drives(mechanics: Mechanics, samples: int, seed: int = 0) -> FloatArray:
     """Knots of smooth random drives: displacements in mm, forces in tens of N."""
     rng = np.random.default_rng(seed)
     t = np.arange(samples) / RATE
@@ -84,7 +86,9 @@ def drives(mechanics: Mechanics, samples: int, seed: int = 0):
     return np.stack(columns, axis=1)
 
 
-def reference(mechanics: Mechanics, knots, placements, tolerance=1e-11):
+def reference(
+    mechanics: Mechanics, knots: FloatArray, placements: Sequence[Placement], tolerance: float = 1e-11
+) -> FloatArray:
     """States (T, N) by DOP853 from sample to sample; every placement at one element, the laws' clock from 5 s."""
     m, n = mechanics, mechanics.n
     A, B, _, _ = m.matrices()
@@ -93,7 +97,7 @@ def reference(mechanics: Mechanics, knots, placements, tolerance=1e-11):
     slope = [spline.derivative() for spline in drive]
     order = sorted([(at, True) for at in m.support_drive] + [(at, False) for at in m.force_drive])
 
-    def inputs(time):
+    def inputs(time: float) -> FloatArray:
         u = np.empty(m.drives)
         for i, (at, support) in enumerate(order):
             u[at] = drive[i](time)
@@ -101,12 +105,12 @@ def reference(mechanics: Mechanics, knots, placements, tolerance=1e-11):
                 u[at + 1] = slope[i](time)
         return u
 
-    def motion(time, x, e, u, memory):
+    def motion(time: float, x: FloatArray, e: int, u: FloatArray, memory: FloatArray) -> Motion:
         d = m.H[e] @ x[:n] + m.G[e] @ u[m.support_drive]
         v = m.H[e] @ x[n : 2 * n] + m.G[e] @ u[m.support_drive + 1]
         return Motion(d, v, time + 5.0, memory)
 
-    def rhs(time, x):
+    def rhs(time: float, x: FloatArray) -> FloatArray:
         u = inputs(time)
         dx = A @ x[: 2 * n] + B @ u
         memories, at = [], 2 * n
@@ -133,12 +137,12 @@ def reference(mechanics: Mechanics, knots, placements, tolerance=1e-11):
     return np.array(path)[:, : 2 * n]
 
 
-def error(states, truth):
+def error(states: FloatArray, truth: FloatArray) -> float:
     return float(np.max(np.abs(states - truth).max(axis=0) / np.abs(truth).max(axis=0)))
 
 
 @pytest.mark.parametrize("name", TRIALS)
-def test_every_law_agrees_with_dop853(name):
+def test_every_law_agrees_with_dop853(name: str) -> None:
     mechanics, law = toy(), find_law(name)
     knots = drives(mechanics, 80)
     placements = [Placement(law, (1,), TRIALS[name])]
@@ -151,7 +155,7 @@ def test_every_law_agrees_with_dop853(name):
     assert error(coarse.states, truth) < 2e-3
 
 
-def test_two_laws_at_once_on_the_whole_vehicle_agree_with_dop853():
+def test_two_laws_at_once_on_the_whole_vehicle_agree_with_dop853() -> None:
     mechanics = load_system().mechanics
     knots = drives(mechanics, 40)
     placements = [
@@ -163,7 +167,7 @@ def test_two_laws_at_once_on_the_whole_vehicle_agree_with_dop853():
     assert error(run.states, truth) < 1e-5
 
 
-def test_the_error_falls_with_the_fourth_power_of_the_step():
+def test_the_error_falls_with_the_fourth_power_of_the_step() -> None:
     mechanics = toy()
     knots = drives(mechanics, 120)
     placements = [Placement(find_law("cubic_stiffness"), (1,), (5e7,))]
@@ -176,7 +180,7 @@ def test_the_error_falls_with_the_fourth_power_of_the_step():
     assert (orders > 3.5).all(), orders
 
 
-def test_segments_in_parallel_give_what_one_after_the_other_gives(monkeypatch):
+def test_segments_in_parallel_give_what_one_after_the_other_gives(monkeypatch: pytest.MonkeyPatch) -> None:
     mechanics = toy()
     knots = drives(mechanics, 700)
     placements = [
@@ -192,7 +196,7 @@ def test_segments_in_parallel_give_what_one_after_the_other_gives(monkeypatch):
     assert error(together.states, alone.states) < 1e-5
 
 
-def test_a_start_near_the_answer_needs_fewer_sweeps():
+def test_a_start_near_the_answer_needs_fewer_sweeps() -> None:
     mechanics = toy()
     knots = drives(mechanics, 700)
     simulator = NonlinearSimulator(mechanics, RATE)
@@ -202,7 +206,7 @@ def test_a_start_near_the_answer_needs_fewer_sweeps():
     assert second.solution.sweeps < first.solution.sweeps
 
 
-def test_without_laws_it_is_the_linear_system():
+def test_without_laws_it_is_the_linear_system() -> None:
     mechanics = toy()
     knots = drives(mechanics, 150)
     run = NonlinearSimulator(mechanics, RATE).run(knots, [])
@@ -210,7 +214,7 @@ def test_without_laws_it_is_the_linear_system():
     np.testing.assert_allclose(run.deflection[:, 1], run.states[:, 0] - run.states[:, 1], rtol=1e-12, atol=1e-15)
 
 
-def test_a_law_that_only_adds_stiffness_is_a_stiffer_element():
+def test_a_law_that_only_adds_stiffness_is_a_stiffer_element() -> None:
     mechanics = toy()
     knots = drives(mechanics, 300)
     bar = find_law("anti_roll_bar")  # stiffness times the difference of two deflections
@@ -223,7 +227,7 @@ def test_a_law_that_only_adds_stiffness_is_a_stiffer_element():
     np.testing.assert_allclose(added.outputs[inner, :3], truth.outputs[inner, :3], atol=2e-3)
 
 
-def test_sensors_of_force_and_acceleration_include_the_law():
+def test_sensors_of_force_and_acceleration_include_the_law() -> None:
     mechanics = toy()
     knots = drives(mechanics, 300)
     run = NonlinearSimulator(mechanics, RATE).run(knots, [Placement(find_law("cubic_stiffness"), (1,), (5e6,))])
@@ -235,7 +239,7 @@ def test_sensors_of_force_and_acceleration_include_the_law():
     )
 
 
-def test_the_anti_alias_filter_passes_what_can_be_sampled_and_stops_what_would_fold():
+def test_the_anti_alias_filter_passes_what_can_be_sampled_and_stops_what_would_fold() -> None:
     parts, rate = 8, 100.0
     t = np.arange(2000 * parts + 1) / (rate * parts)
     low, high = np.sin(2 * np.pi * 40 * t), np.sin(2 * np.pi * 61 * t)
@@ -247,7 +251,7 @@ def test_the_anti_alias_filter_passes_what_can_be_sampled_and_stops_what_would_f
     np.testing.assert_allclose(band_limited(np.ones((81, 1)), parts), 1.0, atol=1e-6)
 
 
-def test_friction_takes_out_the_energy_that_leaves_the_free_system():
+def test_friction_takes_out_the_energy_that_leaves_the_free_system() -> None:
     mechanics = toy()
     n = mechanics.n
     conservative = replace(mechanics, damping=np.zeros(2))
@@ -264,7 +268,7 @@ def test_friction_takes_out_the_energy_that_leaves_the_free_system():
     assert (np.diff(energy) <= 1e-12).all()
 
 
-def test_free_vibration_of_a_duffing_oscillator_has_the_elliptic_period():
+def test_free_vibration_of_a_duffing_oscillator_has_the_elliptic_period() -> None:
     mechanics = replace(toy(), damping=np.zeros(2))
     mechanics.H[1] = [1.0, 0.0]  # the strut now holds the body to the ground
     k, k3, m, a = 2e4, 5e7, 400.0, 0.01
@@ -279,6 +283,6 @@ def test_free_vibration_of_a_duffing_oscillator_has_the_elliptic_period():
     assert np.diff(crossings[::2]).mean() == pytest.approx(period, rel=1e-6)
 
 
-def test_every_element_law_is_covered_here():
+def test_every_element_law_is_covered_here() -> None:
     missing = {law.name for law in CATALOGUE if isinstance(law, ElementLaw)} - set(TRIALS)
     assert missing <= {"anti_roll_bar"}

@@ -5,33 +5,35 @@ import pytest
 import scipy.linalg
 import torch
 from test_system import OSCILLATOR, QUARTER_CAR
+from torch import Tensor
 
 from sprung.model.identification.excitation import simulate_runs
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import LinearSimulator, phi_functions
 from sprung.model.simulate.ode import LinearRate, solve
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import System, load_system, parse_system
 
 
-def oscillator(stiffness=800.0, damping=4.0, rate=200):
+def oscillator(stiffness: float = 800.0, damping: float = 4.0, rate: float = 200) -> System:
     text = OSCILLATOR.replace("800.0", str(stiffness)).replace("sample_rate: 200", f"sample_rate: {rate}")
     damped = f"damping: {damping}" if damping else "damping: {value: 0.0, fixed: true}"
     return parse_system(text.replace("damping: 4.0", damped))
 
 
-def free_motion(system, samples, x0=(0.01, 0.0)):
+def free_motion(system: System, samples: int, x0: tuple[float, float] = (0.01, 0.0)) -> FloatArray:
     simulator = LinearSimulator(system)
     w = torch.zeros(1, samples, simulator.W, dtype=torch.float64)
     log_ratio = torch.zeros(1, len(system.parameters), dtype=torch.float64)
     return simulator.simulate(log_ratio, w, torch.tensor([x0], dtype=torch.float64))[1][0].numpy()
 
 
-def test_undamped_energy_is_conserved():
+def test_undamped_energy_is_conserved() -> None:
     x = free_motion(oscillator(damping=0.0), 20000)
     energy = 0.5 * 800 * x[:, 0] ** 2 + 0.5 * 2 * x[:, 1] ** 2
     assert np.ptp(energy) / energy[0] < 1e-9
 
 
-def test_damped_motion_is_the_closed_form():
+def test_damped_motion_is_the_closed_form() -> None:
     x = free_motion(oscillator(), 1000)[:, 0]
     t = np.arange(1000) / 200
     decay, omega = 4 / (2 * 2), np.sqrt(800 / 2 - 1)
@@ -39,7 +41,7 @@ def test_damped_motion_is_the_closed_form():
     assert np.abs(x - exact).max() < 1e-14
 
 
-def test_phi_functions_match_the_augmented_exponential_at_any_norm():
+def test_phi_functions_match_the_augmented_exponential_at_any_norm() -> None:
     rng = np.random.default_rng(0)
     for size in (1e-3, 1.0, 40.0):
         z = rng.standard_normal((5, 5))
@@ -55,7 +57,7 @@ def test_phi_functions_match_the_augmented_exponential_at_any_norm():
 
 
 @pytest.mark.parametrize("text", [OSCILLATOR, QUARTER_CAR])
-def test_the_exact_step_agrees_with_torchdiffeq(text):
+def test_the_exact_step_agrees_with_torchdiffeq(text: str) -> None:
     system = parse_system(text)
     simulator = LinearSimulator(system)
     rng = torch.Generator().manual_seed(3)
@@ -72,7 +74,7 @@ def test_the_exact_step_agrees_with_torchdiffeq(text):
     assert float((numeric.transpose(0, 1) - exact).abs().max() / exact.abs().max()) < 2e-7
 
 
-def test_rk4_converges_to_the_exact_solution_at_fourth_order():
+def test_rk4_converges_to_the_exact_solution_at_fourth_order() -> None:
     system = parse_system(QUARTER_CAR)
     simulator = LinearSimulator(system)
     w = torch.zeros(1, 20, 2, dtype=torch.float64)
@@ -90,7 +92,7 @@ def test_rk4_converges_to_the_exact_solution_at_fourth_order():
     assert np.all(np.abs(orders - 4) < 0.3)
 
 
-def test_hermite_inputs_converge_at_fourth_order():
+def test_hermite_inputs_converge_at_fourth_order() -> None:
     errors = []
     for rate in (100, 200, 400):
         system = oscillator(rate=rate)
@@ -107,7 +109,7 @@ def test_hermite_inputs_converge_at_fourth_order():
     assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 3.7)
 
 
-def test_gradients_match_finite_differences():
+def test_gradients_match_finite_differences() -> None:
     system = parse_system(QUARTER_CAR)
     simulator = LinearSimulator(system)
     generator = torch.Generator().manual_seed(1)
@@ -117,14 +119,14 @@ def test_gradients_match_finite_differences():
 
     scale = simulator.simulate(log_ratio, w, x0)[0].detach().abs().amax(dim=1, keepdim=True)
 
-    def scaled(parameters, state):
+    def scaled(parameters: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         y, x = simulator.simulate(parameters, w, state)
         return y / scale, x
 
     assert torch.autograd.gradcheck(scaled, (log_ratio, x0), eps=1e-6, atol=1e-5, rtol=1e-5)
 
 
-def test_adjoint_gradients_agree_with_the_exact_ones():
+def test_adjoint_gradients_agree_with_the_exact_ones() -> None:
     system = parse_system(OSCILLATOR)
     simulator = LinearSimulator(system)
     w = torch.randn(1, 8, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
@@ -137,7 +139,7 @@ def test_adjoint_gradients_agree_with_the_exact_ones():
     assert torch.allclose(rate.log_ratio.grad, log_ratio.grad, rtol=1e-4)
 
 
-def test_the_free_response_by_doubling_is_the_stepped_one():
+def test_the_free_response_by_doubling_is_the_stepped_one() -> None:
     system = load_system()
     simulator = LinearSimulator(system)
     discrete = simulator.discretise(simulator.element_values(torch.zeros(1, 24, dtype=torch.float64)))
@@ -149,7 +151,7 @@ def test_the_free_response_by_doubling_is_the_stepped_one():
 
 
 @pytest.mark.parametrize("text", [QUARTER_CAR, None])
-def test_steady_running_computed_over_frequency_is_a_solution_in_time(text):
+def test_steady_running_computed_over_frequency_is_a_solution_in_time(text: str | None) -> None:
     system = load_system() if text is None else parse_system(text)
     rng = np.random.default_rng(2)
     truth = rng.uniform(-0.4, 0.4, (2, len(system.parameters)))

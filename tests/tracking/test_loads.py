@@ -1,5 +1,7 @@
 """Loads of a running vehicle: steps at stops and on the way, limits, air-spring pressure, curves."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -7,7 +9,7 @@ from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import Conditions, Deviating
 from sprung.model.system import parse_system
 from sprung.model.tracking.alarms import LoadLimit
-from sprung.model.tracking.tracker import Tracker, TrackerSettings
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
 
 SECOND = 1_000_000_000
@@ -17,13 +19,22 @@ SEEN = 0.01  # standard deviation of the load that one window gives
 EMPTY = 32000.0
 
 
-def follow(most=None, least=None):
+def follow(most: float | None = None, least: float | None = None) -> Tracker:
     parameters = [TrackedParameter(f"element_{i}.{q}") for q in ("stiffness", "damping") for i in range(12)]
     limits = {"car": LoadLimit(EMPTY, least, most)}
     return Tracker(parameters, TrackerSettings(), [Deviation("car", "load", 0.15, -1)], limits=limits)
 
 
-def ride(rng, tracker, state, seconds, load, first=0, conditions=lambda k: None, **changes):
+def ride(
+    rng: np.random.Generator,
+    tracker: Tracker,
+    state: TrackerState,
+    seconds: int,
+    load: Callable[[int], float],
+    first: int = 0,
+    conditions: Callable[[int], Conditions | None] = lambda k: None,
+    **changes: object,
+) -> TrackerState:
     """Windows of a second, one after the other; `load`: logarithm of the loaded mass, by second."""
     covariance = correlated(rng, STD)
     root = np.linalg.cholesky(covariance)
@@ -39,14 +50,14 @@ def ride(rng, tracker, state, seconds, load, first=0, conditions=lambda k: None,
     return state
 
 
-def worst(tracker, state):
+def worst(tracker: Tracker, state: TrackerState) -> float:
     mean, std = tracker.posterior(state)
     return float(np.abs(mean / std).max())
 
 
 @pytest.mark.parametrize("step", [-0.3, 0.3])
 @pytest.mark.parametrize("stop", [0, 40])
-def test_a_step_of_the_load_raises_nothing_and_is_known_within_half_a_minute(step, stop):
+def test_a_step_of_the_load_raises_nothing_and_is_known_within_half_a_minute(step: float, stop: int) -> None:
     rng = np.random.default_rng(1)
     tracker, new = follow(), np.log1p(step)
     state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
@@ -62,7 +73,7 @@ def test_a_step_of_the_load_raises_nothing_and_is_known_within_half_a_minute(ste
     assert tracker.health(state) == "ok"
 
 
-def test_more_than_the_car_may_carry_is_an_alarm_until_it_is_let_down():
+def test_more_than_the_car_may_carry_is_an_alarm_until_it_is_let_down() -> None:
     rng = np.random.default_rng(2)
     tracker = follow(most=6000.0)
     state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: np.log1p(0.1))
@@ -76,7 +87,7 @@ def test_more_than_the_car_may_carry_is_an_alarm_until_it_is_let_down():
     assert state.active == ()
 
 
-def test_less_than_the_least_is_an_alarm_too():
+def test_less_than_the_least_is_an_alarm_too() -> None:
     rng = np.random.default_rng(3)
     tracker = follow(least=1000.0)
     state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
@@ -84,12 +95,12 @@ def test_less_than_the_least_is_an_alarm_too():
     assert state.active[0].change < 0
 
 
-def test_pressure_tells_the_load_at_once_when_its_constant_is_known():
+def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     rng = np.random.default_rng(4)
     tracker, state, at = follow(), None, 0
     state = tracker.initial_state()
 
-    def pressure(load):
+    def pressure(load: float) -> Callable[[int], Conditions]:
         return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
 
     for load in (0.0, 0.2, -0.1, 0.1):
@@ -103,7 +114,7 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known():
     assert state.cargo.prior_variance[0] < 0.02**2
 
 
-def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over():
+def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over() -> None:
     rng = np.random.default_rng(5)
     tracker = follow()
     state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
@@ -130,7 +141,7 @@ sensors: {a: {kind: acceleration, body: car, csv: a}}
 """
 
 
-def test_a_system_file_says_where_conditions_are_measured():
+def test_a_system_file_says_where_conditions_are_measured() -> None:
     system = parse_system(FILE)
     assert [c.name for c in system.auxiliary] == ["speed", "temperature", "yaw_rate", "car.pressure"]
     gains = np.array([[c.gain, c.offset] for c in system.auxiliary])
@@ -145,7 +156,7 @@ def test_a_system_file_says_where_conditions_are_measured():
     assert not parse_system(plain).conditions(None).curving
 
 
-def test_windows_without_what_they_say_of_loads_are_not_moved_by_the_load_again():
+def test_windows_without_what_they_say_of_loads_are_not_moved_by_the_load_again() -> None:
     """As a vehicle sends them: loads are refined with every window; every second one says what it knows of them."""
     rng = np.random.default_rng(6)
     tracker, load = follow(), np.log(1.2)

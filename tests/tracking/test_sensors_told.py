@@ -1,6 +1,7 @@
 """Which deviations of measurements are told, how sure they are, and that alarms of springs wait for them."""
 
 import copy
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import Deviating
+from sprung.model.signals import Deviating, Estimate, FloatArray
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
@@ -19,11 +20,11 @@ LOADED = [*DELAYS, Deviation("car", "load", 0.15, -1), Deviation("car", "roll_in
 STD = np.full(6, 0.01)
 
 
-def make(deviations=DELAYS):
+def make(deviations: Sequence[Deviation] = DELAYS) -> Tracker:
     return Tracker([TrackedParameter(f"element_{i}.damping") for i in range(6)], None, deviations)
 
 
-def told(rng, size, truth, information=(1e-4) ** -2):
+def told(rng: np.random.Generator, size: int, truth: FloatArray, information: float = (1e-4) ** -2) -> Estimate:
     """A window that is weighed: delays `truth` (H,), relative to their mean only, move no parameter."""
     apart = np.eye(size) - np.pad(np.ones((4, 4)) / 4, (0, size - 4))
     M = information * apart
@@ -34,7 +35,7 @@ def told(rng, size, truth, information=(1e-4) ** -2):
     return estimate(value, covariance, deviating=found)
 
 
-def test_a_channel_is_known_among_others_although_their_common_clock_is_open():
+def test_a_channel_is_known_among_others_although_their_common_clock_is_open() -> None:
     rng, tracker = np.random.default_rng(1), make()
     truth = np.array([1e-3, 0.0, 0.0, 0.0])
     state = tracker.initial_state()
@@ -50,7 +51,7 @@ def test_a_channel_is_known_among_others_although_their_common_clock_is_open():
     assert abs(fault.value - 1e-3) < 4 * fault.std + 2.6e-4  # a quarter of it is in the mean of four
 
 
-def test_relative_deviations_are_those_of_the_closed_form():
+def test_relative_deviations_are_those_of_the_closed_form() -> None:
     rng, model = np.random.default_rng(2), dev.model_of(LOADED)
     factor = rng.normal(size=(6, 6))
     covariance = factor @ factor.T
@@ -60,7 +61,7 @@ def test_relative_deviations_are_those_of_the_closed_form():
     np.testing.assert_allclose(model.relative_std(covariance), apart.std(axis=0), rtol=0.03)
 
 
-def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor():
+def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> None:
     rng, tracker = np.random.default_rng(3), make()
     state = tracker.initial_state()
     for k in range(40):
@@ -70,7 +71,7 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor():
     changed = replace(state.changes, active=np.array([1, 0, 0, 0, 0, 0], dtype=np.int8), up_since=since)
     recent = np.full(3, EPOCH + 37 * SECOND)
 
-    def opened(slope, at=now):
+    def opened(slope: FloatArray, at: int = now) -> list[str]:
         calibration = replace(state.calibration, slope=slope, curvature=np.ones_like(slope), recent=recent)
         asked = replace(state, changes=changed, calibration=calibration)
         drift = tracker._fusion.drift(asked)
@@ -84,7 +85,7 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor():
     assert opened(rising, now + 30 * SECOND) == ["change"]  # not for ever
 
 
-def test_a_state_that_did_not_know_how_loads_are_spread_goes_on():
+def test_a_state_that_did_not_know_how_loads_are_spread_goes_on() -> None:
     rng, old = np.random.default_rng(4), make(LOADED[:5])
     state = old.initial_state()
     for k in range(40):
@@ -101,14 +102,14 @@ def test_a_state_that_did_not_know_how_loads_are_spread_goes_on():
     assert TrackerState.from_dict(after.to_dict()).to_dict() == after.to_dict()
 
 
-def test_a_jump_is_looked_for_along_all_clocks_of_a_node_together():
+def test_a_jump_is_looked_for_along_all_clocks_of_a_node_together() -> None:
     model = dev.model_of([Deviation(f"c{i}", "delay", 5e-3, i // 2, i // 4) for i in range(6)])
     directions = {tuple(np.flatnonzero(row)) for row in model.directions}
     assert {(0, 1), (2, 3), (4, 5), (0, 1, 2, 3)} <= directions
     assert len(model.directions) == 6 + 3 + 1  # the second node has one clock, which is there already
 
 
-def test_evidence_of_a_state_that_knew_fewer_directions_begins_anew():
+def test_evidence_of_a_state_that_knew_fewer_directions_begins_anew() -> None:
     rng, old = np.random.default_rng(5), make()
     state = old.initial_state()
     for k in range(40):
@@ -122,7 +123,7 @@ def test_evidence_of_a_state_that_knew_fewer_directions_begins_anew():
 GAINS = [Deviation(f"c{i}", "gain", 0.015, i) for i in range(6)]
 
 
-def gained(rng, gains, information=0.01**-2):
+def gained(rng: np.random.Generator, gains: FloatArray, information: float = 0.01**-2) -> Estimate:
     """A weighed window: gains (6,), relative to their mean only; the first moves the first parameter."""
     apart = np.eye(6) - np.ones((6, 6)) / 6
     M = information * apart
@@ -135,7 +136,7 @@ def gained(rng, gains, information=0.01**-2):
 
 
 @cache
-def learned(windows):
+def learned(windows: int) -> tuple[Tracker, TrackerState, np.random.Generator]:
     """A tracker that has seen so many windows of right gains, its state, and the numbers that are drawn after them."""
     rng, tracker = np.random.default_rng(6), make(GAINS)
     state = tracker.initial_state()
@@ -154,7 +155,7 @@ def learned(windows):
         pytest.param(0.01, 60, marks=pytest.mark.slow),
     ],
 )
-def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begins, to):
+def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begins: int, to: float) -> None:
     tracker, state, rng = copy.deepcopy(learned(begins))
     for k in range(begins, begins + 900):
         drift = to * np.clip((k - begins) / 400, 0, 1)
@@ -168,7 +169,7 @@ def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begi
     assert all(f.channel == "c0" and abs(f.value - 1 - to) < 3 * f.std for f in tracker.sensors(state))
 
 
-def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm():
+def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm() -> None:
     rng, tracker = np.random.default_rng(7), make(GAINS)
     state = tracker.initial_state()
     for k in range(200):
@@ -177,7 +178,7 @@ def test_gains_and_clocks_that_were_always_off_are_told_and_no_alarm():
     assert [f.channel for f in tracker.sensors(state)] == ["c1"]
 
 
-def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended():
+def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended() -> None:
     rng, tracker = np.random.default_rng(8), make(GAINS)
     state = tracker.initial_state()
     for k in range(1500):
@@ -187,7 +188,7 @@ def test_an_alarm_of_a_drift_closes_when_the_sensor_is_mended():
     assert state.active == ()
 
 
-def test_a_jump_of_two_deviations_of_a_window_is_named():
+def test_a_jump_of_two_deviations_of_a_window_is_named() -> None:
     rng, tracker = np.random.default_rng(9), make(GAINS)
     state = tracker.initial_state()
     for k in range(140):
@@ -199,7 +200,7 @@ def test_a_jump_of_two_deviations_of_a_window_is_named():
     assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "c3.gain")]
 
 
-def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jump():
+def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jump() -> None:
     rng, tracker = np.random.default_rng(11), make(GAINS)
     state = tracker.initial_state()
     for k in range(40):
@@ -213,7 +214,7 @@ def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jum
     np.testing.assert_allclose(turned.slope, -3e4)  # begins anew
 
 
-def test_chance_names_no_sensor():
+def test_chance_names_no_sensor() -> None:
     rng, tracker = np.random.default_rng(10), make(GAINS)
     state = tracker.initial_state()
     named = 0

@@ -5,7 +5,8 @@ import pytest
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
-from sprung.model.system import load_system
+from sprung.model.signals import FloatArray
+from sprung.model.system import System, load_system
 from sprung.model.tracking import inflation
 from sprung.model.tracking.misfit import FLOOR_WINDOWS
 from sprung.model.tracking.tracker import Tracker, TrackerState
@@ -15,22 +16,24 @@ SECOND = 1_000_000_000
 
 
 @pytest.fixture(scope="module")
-def system():
+def system() -> System:
     return load_system()
 
 
-def standing(system, seconds, level, rng):
+def standing(system: System, seconds: int, level: float, rng: np.random.Generator) -> FloatArray:
     """Windows of nothing but noise, `level` times what the system file says."""
     noise = level * np.array([channel.noise for channel in system.channels])
     return noise * rng.standard_normal((seconds, system.window, len(noise)))
 
 
-def running(system, seconds, rng, speed=(40.0, 50.0)):
+def running(
+    system: System, seconds: int, rng: np.random.Generator, speed: tuple[float, float] = (40.0, 50.0)
+) -> FloatArray:
     return simulate_runs(system, np.zeros((seconds, len(system.parameters))), system.window, rng, speed=speed).values
 
 
 @pytest.mark.parametrize("level", [0.3, 0.7, 1.0, 1.5])
-def test_a_stop_at_a_station_raises_nothing_and_tells_nothing(system, level):
+def test_a_stop_at_a_station_raises_nothing_and_tells_nothing(system: System, level: float) -> None:
     rng = np.random.default_rng(int(10 * level))
     parts = [running(system, 40, rng), standing(system, 40, level, rng), running(system, 15, rng)]
     estimates = Identifier(system).identify(np.concatenate(parts))
@@ -48,7 +51,7 @@ def test_a_stop_at_a_station_raises_nothing_and_tells_nothing(system, level):
 
 
 @pytest.mark.parametrize("speed", [0.5, 1.0, 2.0, 3.0, 5.0])
-def test_a_crawling_train_does_not_ask_for_a_check(system, speed):
+def test_a_crawling_train_does_not_ask_for_a_check(system: System, speed: float) -> None:
     rng = np.random.default_rng(3)
     estimates = Identifier(system).identify(running(system, 30, rng, (speed, 1.0001 * speed)))
     tracker = Tracker(system.parameters)
@@ -61,7 +64,7 @@ def test_a_crawling_train_does_not_ask_for_a_check(system, speed):
     assert state.rejected <= 1
 
 
-def test_doors_and_passengers_of_a_standing_train_are_not_a_misfit(system):
+def test_doors_and_passengers_of_a_standing_train_are_not_a_misfit(system: System) -> None:
     rng = np.random.default_rng(5)
     windows = standing(system, 10, 1.0, rng)
     pushed = 0.05 * np.sin(2 * np.pi * 1.1 * np.arange(system.window) / system.sample_rate)
@@ -69,7 +72,7 @@ def test_doors_and_passengers_of_a_standing_train_are_not_a_misfit(system):
     assert not any(e.informative for e in Identifier(system).identify(windows))
 
 
-def test_a_moving_train_whose_sensor_is_wrong_is_still_a_misfit(system):
+def test_a_moving_train_whose_sensor_is_wrong_is_still_a_misfit(system: System) -> None:
     rng = np.random.default_rng(6)
     windows = running(system, 5, rng)
     windows[:, :, 20] *= -1
@@ -78,7 +81,7 @@ def test_a_moving_train_whose_sensor_is_wrong_is_still_a_misfit(system):
         assert not e.adequate
 
 
-def test_the_noise_floor_is_fixed_although_one_parameter_is_never_identified():
+def test_the_noise_floor_is_fixed_although_one_parameter_is_never_identified() -> None:
     rng = np.random.default_rng(7)
     tracker = make_tracker()
     state = tracker.initial_state()
@@ -93,7 +96,7 @@ def test_the_noise_floor_is_fixed_although_one_parameter_is_never_identified():
     assert [alarm.kind for alarm in state.alarms] == ["misfit"]
 
 
-def test_relearning_one_parameter_leaves_the_noise_floor_as_it_is():
+def test_relearning_one_parameter_leaves_the_noise_floor_as_it_is() -> None:
     rng = np.random.default_rng(8)
     tracker = make_tracker()
     stream = windows(rng, constant(np.zeros(24)), 80, correlated(rng))
@@ -103,7 +106,7 @@ def test_relearning_one_parameter_leaves_the_noise_floor_as_it_is():
     assert (state.fit.windows, state.fit.mean) == floor
 
 
-def test_a_parameter_seen_every_other_minute_is_not_compared_across_it():
+def test_a_parameter_seen_every_other_minute_is_not_compared_across_it() -> None:
     running = inflation.start((2,))
     everything, one = np.ones(2, dtype=bool), np.array([True, False])
     variance = np.full(2, 1e-4)
@@ -116,7 +119,7 @@ def test_a_parameter_seen_every_other_minute_is_not_compared_across_it():
     assert running.square[1] == 1.0  # two minutes apart: a drift, for all one knows
 
 
-def test_a_state_of_the_first_format_is_taken_over():
+def test_a_state_of_the_first_format_is_taken_over() -> None:
     rng = np.random.default_rng(9)
     tracker = make_tracker(3)
     state = tracker.update_many(

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sprung.model.identification.deviations import Deviation
-from sprung.model.signals import Deviating
+from sprung.model.signals import Deviating, FloatArray
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking.tracker import Tracker
 from tests.tracker_windows import EPOCH, TrackedParameter, estimate
@@ -11,7 +11,7 @@ from tests.tracker_windows import EPOCH, TrackedParameter, estimate
 SECOND = 1_000_000_000
 
 
-def test_weak_windows_of_a_damper_do_not_make_it_seem_larger():
+def test_weak_windows_of_a_damper_do_not_make_it_seem_larger() -> None:
     rng = np.random.default_rng(1)
     tracker = Tracker([TrackedParameter("element.damping")])
     scores = []
@@ -27,7 +27,7 @@ def test_weak_windows_of_a_damper_do_not_make_it_seem_larger():
     assert np.mean(scores) < 1.2  # weighed as they state it, all three are 2 to 4 deviations too large
 
 
-def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it():
+def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it() -> None:
     """A window that tells much is moved less by a gain than one that tells little; their mean is that of neither."""
     rng = np.random.default_rng(2)
     gains = [Deviation(f"c{i}", "gain", 0.015, i) for i in range(3)]
@@ -52,7 +52,7 @@ def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it():
     assert fault.channel == "c0"
 
 
-def test_a_window_that_was_not_weighed_tells_no_load_that_a_wrong_gain_has_moved():
+def test_a_window_that_was_not_weighed_tells_no_load_that_a_wrong_gain_has_moved() -> None:
     rng = np.random.default_rng(4)
     known = [*(Deviation(f"c{i}", "gain", 0.015, i) for i in range(3)), Deviation("car", "load", 0.15, -1)]
     tracker = Tracker([TrackedParameter("element.stiffness")], None, known)
@@ -74,7 +74,7 @@ def test_a_window_that_was_not_weighed_tells_no_load_that_a_wrong_gain_has_moved
     assert abs(mean[0]) < 3 * deviation[0]
 
 
-def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated():
+def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated() -> None:
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(5, 5))
     covariance, cross, noise = factor @ factor.T + np.eye(5), np.array([[1.0], [-0.5]]), np.diag([0.5, 0.8])
@@ -84,7 +84,7 @@ def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated():
     everything = np.ones(2, dtype=bool)
     silent = np.ones(1, dtype=bool)
 
-    def corrected(value):
+    def corrected(value: FloatArray) -> FloatArray:
         return kalman.correct(belief, value, noise, everything, share=1.0, bound=1e9, cross=cross, silent=silent)[0]
 
     after = corrected(values[0])

@@ -1,11 +1,12 @@
 """Weather, load and speed: what they do to healthy parameters is learned, and hides no change beside it."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from sprung.model.signals import Conditions, SampleBlock, Window
+from sprung.model.signals import Conditions, FloatArray, SampleBlock, Window
 from sprung.model.tracking import weather
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from sprung.replay.beside import Beside
@@ -31,7 +32,15 @@ def tracker() -> Tracker:
     return Tracker(parameters, TrackerSettings(window=60.0, hop=60.0, learning=600.0))
 
 
-def day(rng, state, minutes, truth, conditions, first=0, every=1):
+def day(
+    rng: np.random.Generator,
+    state: TrackerState,
+    minutes: int,
+    truth: Callable[[int], FloatArray],
+    conditions: Callable[[int], Conditions],
+    first: int = 0,
+    every: int = 1,
+) -> TrackerState:
     """Windows of a minute, each the mean of many."""
     follow, covariance = tracker(), correlated(rng, STD / 6)
     root = np.linalg.cholesky(covariance)
@@ -41,7 +50,7 @@ def day(rng, state, minutes, truth, conditions, first=0, every=1):
     return state
 
 
-def warm(k, slope=-0.002):
+def warm(k: int, slope: float = -0.002) -> tuple[float, FloatArray]:
     """Degrees, and what they do to dampers: a day's swing of 24 K."""
     degrees = 10.0 + 12.0 * np.sin(2 * np.pi * k / 1440)
     effect = np.zeros(24)
@@ -49,7 +58,7 @@ def warm(k, slope=-0.002):
     return degrees, effect
 
 
-def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned():
+def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned() -> None:
     rng = np.random.default_rng(1)
     slope, follow = -0.0027, tracker()
     state = day(rng, follow.initial_state(), 4320, lambda k: warm(k, slope)[1],
@@ -62,14 +71,14 @@ def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned():
     assert np.all(np.abs(middle / weather.KELVIN - slope) < 3 * std / weather.KELVIN)
 
 
-def test_weather_that_nobody_measures_raises_nothing():
+def test_weather_that_nobody_measures_raises_nothing() -> None:
     rng = np.random.default_rng(2)
     state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k)[1], lambda k: None, every=5)
     assert state.alarms == ()
 
 
 @pytest.mark.parametrize("measured", [True, False])
-def test_a_true_change_beside_the_weather_is_found_and_is_the_only_one(measured):
+def test_a_true_change_beside_the_weather_is_found_and_is_the_only_one(measured: bool) -> None:
     rng = np.random.default_rng(3)
     row, fault = 12 + 9, np.zeros(24)
     fault[row] = np.log(0.85)
@@ -82,7 +91,7 @@ def test_a_true_change_beside_the_weather_is_found_and_is_the_only_one(measured)
     assert state.alarms[0].onset >= EPOCH + 1490 * MINUTE
 
 
-def test_oil_that_leaves_all_dampers_at_once_is_one_message():
+def test_oil_that_leaves_all_dampers_at_once_is_one_message() -> None:
     rng = np.random.default_rng(4)
     lost = np.zeros(24)
     lost[DAMPERS] = np.log(0.88)
@@ -91,7 +100,7 @@ def test_oil_that_leaves_all_dampers_at_once_is_one_message():
     assert state.active[0].change == pytest.approx(-0.12, abs=0.02)
 
 
-def test_a_damper_that_stays_worn_does_not_keep_the_alarm_of_all_open():
+def test_a_damper_that_stays_worn_does_not_keep_the_alarm_of_all_open() -> None:
     rng = np.random.default_rng(14)
     lost, worn = np.zeros(24), np.zeros(24)
     lost[DAMPERS], worn[13] = np.log(0.88), np.log(0.75)
@@ -101,7 +110,7 @@ def test_a_damper_that_stays_worn_does_not_keep_the_alarm_of_all_open():
     assert [alarm.parameter for alarm in state.active] == [NAMES[13]]
 
 
-def test_a_kind_alone_is_named_by_what_its_names_share():
+def test_a_kind_alone_is_named_by_what_its_names_share() -> None:
     rng = np.random.default_rng(5)
     lost = np.zeros(24)
     lost[12:20] = np.log(0.88)
@@ -109,7 +118,7 @@ def test_a_kind_alone_is_named_by_what_its_names_share():
     assert [alarm.parameter for alarm in state.active] == ["primary_*.damping"]
 
 
-def test_what_was_learned_survives_a_restart_bit_for_bit():
+def test_what_was_learned_survives_a_restart_bit_for_bit() -> None:
     rng = np.random.default_rng(6)
     state = day(rng, tracker().initial_state(), 300, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
     again = TrackerState.from_dict(state.to_dict())
@@ -120,7 +129,7 @@ def test_what_was_learned_survives_a_restart_bit_for_bit():
     assert one.to_dict() == other.to_dict()
 
 
-def test_a_state_without_weather_goes_on_and_begins_to_learn_it():
+def test_a_state_without_weather_goes_on_and_begins_to_learn_it() -> None:
     rng = np.random.default_rng(8)
     old = day(rng, tracker().initial_state(), 100, lambda k: np.zeros(24), lambda k: None).to_dict()
     for key in ("weather", "cargo"):
@@ -131,7 +140,7 @@ def test_a_state_without_weather_goes_on_and_begins_to_learn_it():
     assert state.alarms == ()
 
 
-def test_the_fleet_teaches_a_new_vehicle_its_slopes():
+def test_the_fleet_teaches_a_new_vehicle_its_slopes() -> None:
     rng = np.random.default_rng(9)
     slope, others = -0.003, []
     for _ in range(3):
@@ -146,7 +155,7 @@ def test_the_fleet_teaches_a_new_vehicle_its_slopes():
     assert np.array_equal(prior.kind_mean[:, 2:], tracker().weather.kind_mean[:, 2:])  # of load and speed nothing
 
 
-def test_a_repaired_damper_keeps_its_slope_and_learns_its_level():
+def test_a_repaired_damper_keeps_its_slope_and_learns_its_level() -> None:
     rng = np.random.default_rng(10)
     follow = tracker()
     state = day(rng, follow.initial_state(), 400, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
@@ -155,7 +164,7 @@ def test_a_repaired_damper_keeps_its_slope_and_learns_its_level():
     assert new.weather.mean[15, 0] == 0.0
 
 
-def test_slow_signals_are_taken_beside_the_windows():
+def test_slow_signals_are_taken_beside_the_windows() -> None:
     beside = Beside(2, 1)
     second = 1_000_000_000
     block = SampleBlock(

@@ -3,22 +3,23 @@
 import numpy as np
 import pytest
 
-from sprung.benchmarks.generator.ride import draw_ride, record
+from sprung.benchmarks.generator.ride import DrawnRide, draw_ride, record
 from sprung.model.diagnosis.api import RecordedPart, diagnose
 from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.signals import FloatArray
 from sprung.model.system import BUNDLED, parse_system
 
 SYSTEM = parse_system((BUNDLED / "accelerometers.yaml").read_text() + "\nspeed: {csv: v, noise: 0.1}\n")
 
 
-def ride(seconds):
+def ride(seconds: float) -> tuple[DrawnRide, FloatArray]:
     rng = np.random.default_rng(12)
     drawn = draw_ride(rng, speed=(42.0, 42.0))
     values = record(rng, drawn, seconds)
     return drawn, np.column_stack([drawn.speed + 0.1 * rng.normal(size=len(values)), values])
 
 
-def test_sensors_and_speed_of_a_vehicle_on_a_track_are_told_apart():
+def test_sensors_and_speed_of_a_vehicle_on_a_track_are_told_apart() -> None:
     rng = np.random.default_rng(3)
     values = np.column_stack([np.full(1000, 42.0), rng.normal(size=(1000, len(SYSTEM.sensors)))])
     signals = prepare(SYSTEM, values, 100.0).signals
@@ -29,7 +30,7 @@ def test_sensors_and_speed_of_a_vehicle_on_a_track_are_told_apart():
 
 
 @pytest.mark.slow
-def test_a_healthy_vehicle_on_an_unmeasured_track_is_consistent_and_its_values_are_told():
+def test_a_healthy_vehicle_on_an_unmeasured_track_is_consistent_and_its_values_are_told() -> None:
     drawn, values = ride(180.0)
     report = diagnose(SYSTEM, RecordedPart(100.0, values, 0))
     assert report.verdict == "consistent" and not report.findings

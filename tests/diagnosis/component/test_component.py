@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from sprung.model.diagnosis.api import Options, Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches, white_noise
 from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
 from sprung.model.laws.reversals import bouc_wen_memory
+from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system, parse_system
 from sprung.service.improved import write_improved
 
@@ -154,7 +156,9 @@ def test_friction_with_backlash_is_named_with_slip_gap_and_stiffness() -> None:
         ("clearance", lambda d, v: K * (d - np.clip(d, -0.003, 0.003)) + C * v),
     ],
 )
-def test_springs_and_dampers_that_are_not_linear_are_named(effect: str, force) -> None:
+def test_springs_and_dampers_that_are_not_linear_are_named(
+    effect: str, force: Callable[[FloatArray, FloatArray], FloatArray]
+) -> None:
     _, d, v = sweep(8.0)
     found = report(force(d, v), d)
     assert found.verdict == "missing_physics"
@@ -234,7 +238,7 @@ def test_paths_of_memories_follow_their_differential_equations() -> None:
     d = 0.01 * np.sin(2 * np.pi * t) * (1 + 0.3 * np.sin(2.7 * t))
     rate = np.gradient(d, t)
 
-    def solved(slope) -> np.ndarray:
+    def solved(slope: Callable[[float, FloatArray], object]) -> np.ndarray:
         return solve_ivp(lambda x, z: slope(np.interp(x, t, rate), z), (0, 3), [0.0], t_eval=t, max_step=5e-4).y[0]
 
     reach = 0.004

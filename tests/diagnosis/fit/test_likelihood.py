@@ -11,7 +11,7 @@ from sprung.model.laws import find_law
 from tests.diagnosis_cases import problem_of, simulate, true_log_ratios
 
 
-def test_parameters_come_back_within_their_uncertainty():
+def test_parameters_come_back_within_their_uncertainty() -> None:
     problem = problem_of(simulate(seed=1))
     fit = optimise(problem, Point(np.zeros(4), (), np.zeros(4)))
     z = (fit.point.theta - true_log_ratios(problem.system)) / np.sqrt(np.diag(fit.covariance))
@@ -20,7 +20,7 @@ def test_parameters_come_back_within_their_uncertainty():
     assert 0.9 < fit.reduced < 1.1
 
 
-def test_sensitivities_agree_with_finite_differences():
+def test_sensitivities_agree_with_finite_differences() -> None:
     problem = problem_of(simulate(lambda d, v: 4e9 * d**3, seed=2, seconds=12))
     law = find_law("cubic_stiffness")
     term = Term(law, "secondary", (4e9,), scales=(4e9,))
@@ -41,7 +41,7 @@ def test_sensitivities_agree_with_finite_differences():
         assert np.linalg.norm(error) < 0.03 * np.linalg.norm(expected)
 
 
-def test_law_with_true_values_explains_a_recording_that_the_linear_model_cannot():
+def test_law_with_true_values_explains_a_recording_that_the_linear_model_cannot() -> None:
     problem = problem_of(simulate(lambda d, v: 4e9 * d**3, seed=3))
     plain = optimise(problem, Point(np.zeros(4), (), np.zeros(4)))
     term = Term(find_law("cubic_stiffness"), "secondary", (3e9,), scales=(3e9,))

@@ -69,7 +69,9 @@ def fitted() -> tuple[System, Problem, Fit]:
     return system, *refreshed(problem, fit)
 
 
-def test_friction_and_offset_come_back_within_their_uncertainty_in_closed_loop(fitted):
+def test_friction_and_offset_come_back_within_their_uncertainty_in_closed_loop(
+    fitted: tuple[System, Problem, Fit],
+) -> None:
     system, _, fit = fitted
     truth = [DAMPING, MASS, FRICTION, OFFSET]
     values = [
@@ -83,19 +85,19 @@ def test_friction_and_offset_come_back_within_their_uncertainty_in_closed_loop(f
     assert np.abs((np.array(values) - truth) / deviations).max() < 4
 
 
-def test_noise_of_a_force_is_told_by_the_residual(fitted):
+def test_noise_of_a_force_is_told_by_the_residual(fitted: tuple[System, Problem, Fit]) -> None:
     _, problem, fit = fitted
     assert FORCE_NOISE / 2 < problem.noise.force[0] < 2 * FORCE_NOISE
     assert fit.reduced == pytest.approx(1.0, abs=0.4)
 
 
-def test_position_that_no_stiffness_holds_is_compared_by_its_rate():
+def test_position_that_no_stiffness_holds_is_compared_by_its_rate() -> None:
     slide, vehicle = parse_system(SLIDE), load_system()
     assert drifting(slide, np.array([0])).tolist() == [True]
     assert not drifting(vehicle, np.arange(len(vehicle.sensors))).any()
 
 
-def test_rate_of_a_course_whose_ends_do_not_meet():
+def test_rate_of_a_course_whose_ends_do_not_meet() -> None:
     grid = Grid(2000, 0.01)
     position = np.stack([0.3 * grid.time + np.sin(3 * grid.time), grid.time**2], axis=1)
     expected = np.stack([0.3 + 3 * np.cos(3 * grid.time), 2 * grid.time], axis=1)

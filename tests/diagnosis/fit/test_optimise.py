@@ -1,13 +1,15 @@
 """The optimiser: never uphill, and breakage told from divergence."""
 
 from dataclasses import replace
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
 
 from sprung.model.diagnosis.fit import optimise as module
 from sprung.model.diagnosis.fit.baseline import baseline
-from sprung.model.diagnosis.fit.optimise import optimise, try_optimise
+from sprung.model.diagnosis.fit.optimise import Fit, optimise, try_optimise
+from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.record.channels import DiagnosisError, prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.response.point import Point
@@ -17,19 +19,21 @@ from tests.diagnosis_cases import quarter_car, simulate
 
 
 @pytest.fixture(scope="module")
-def clean():
+def clean() -> tuple[Problem, Fit]:
     system = quarter_car()
     signals = prepare(system, simulate(seconds=12, seed=2).values, 100.0).signals
     return baseline(system, signals, declared_noise(system, signals), 700)
 
 
 @pytest.mark.parametrize("factor", [1.05, 1.5, 4.0])
-def test_a_fit_is_never_worse_than_any_point_that_it_saw(clean, factor, monkeypatch):
+def test_a_fit_is_never_worse_than_any_point_that_it_saw(
+    clean: tuple[Problem, Fit], factor: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     problem, fit = clean
     seen = []
     whole = module._state
 
-    def recorded(*args):
+    def recorded(*args: Any) -> Fit:
         seen.append(whole(*args))
         return seen[-1]
 
@@ -42,22 +46,22 @@ def test_a_fit_is_never_worse_than_any_point_that_it_saw(clean, factor, monkeypa
     assert again.chi_square == pytest.approx(fit.chi_square, abs=0.5)
 
 
-def test_a_fit_from_its_own_solution_stays_there(clean):
+def test_a_fit_from_its_own_solution_stays_there(clean: tuple[Problem, Fit]) -> None:
     problem, fit = clean
     again = optimise(problem, fit.point, whitener=fit.whitener)
     assert again.converged
     assert np.abs((again.point.theta - fit.point.theta) / np.sqrt(np.diag(fit.covariance))).max() < 0.1
 
 
-def test_errors_of_the_program_are_no_divergence(clean):
+def test_errors_of_the_program_are_no_divergence(clean: tuple[Problem, Fit]) -> None:
     problem, fit = clean
     broken = Term(find_law("cubic_stiffness"), "secondary", (1e9, 2.0), scales=(1e9, 1.0))  # one parameter too many
     with pytest.raises(ValueError):
         try_optimise(problem, Point(fit.point.theta, (broken,), fit.point.state), 3)
 
 
-def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch):
-    def singular(*args, **kwargs):
+def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    def singular(*args: object, **kwargs: object) -> NoReturn:
         raise np.linalg.LinAlgError("Matrix is not positive definite")
 
     monkeypatch.setattr("sprung.model.diagnosis.fit.baseline.optimise", singular)
@@ -67,7 +71,7 @@ def test_numbers_that_diverge_from_the_start_are_told_in_one_line(monkeypatch):
         baseline(system, signals, declared_noise(system, signals), 700)
 
 
-def test_a_long_step_of_a_law_keeps_its_direction():
+def test_a_long_step_of_a_law_keeps_its_direction() -> None:
     """A loop's exponent and the logarithm of its beta move along a valley: one of them cut short leaves it."""
     loop = Term(find_law("bouc_wen"), "secondary", (5e5, 3e4, 2.0), scales=(1e5, 1e4, 1.0))
     short, long = (loop.advanced(np.array([1e3, -2.6, -0.46]) * share) for share in (0.1, 1.0))

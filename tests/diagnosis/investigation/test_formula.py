@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
-from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.api import Options, Report, diagnose
 from sprung.model.diagnosis.investigation import diagnose as course
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
@@ -25,13 +27,13 @@ from sprung.service.report.forces import force_figure
 
 
 @pytest.fixture(scope="module")
-def told():
+def told() -> Report:
     """A spring that stiffens with the rate."""
     record = simulate(lambda d, v: 3e6 * d * abs(v), seconds=15.0, seed=3)
     return diagnose(quarter_car(), record, Options())
 
 
-def test_an_unlisted_force_is_a_formula_with_its_value(told):
+def test_an_unlisted_force_is_a_formula_with_its_value(told: Report) -> None:
     (finding,) = told.findings
     assert told.verdict == "unknown_physics"
     assert (finding.location, finding.effect, finding.formula) == ("secondary", "formula", "a * d * abs(v)")
@@ -41,7 +43,7 @@ def test_an_unlisted_force_is_a_formula_with_its_value(told):
     assert finding.to_dict()["formula"] == "a * d * abs(v)"
 
 
-def test_a_formula_is_written_into_the_system_file_and_read_again(told):
+def test_a_formula_is_written_into_the_system_file_and_read_again(told: Report) -> None:
     system = quarter_car()
     again = parse_system(improved_text(SYSTEM, system, told))
     (placed,) = again.laws
@@ -49,7 +51,7 @@ def test_a_formula_is_written_into_the_system_file_and_read_again(told):
 
 
 @pytest.mark.slow
-def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop():
+def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop() -> None:
     record = simulate(lambda d, v: -1.5e6 * max(-d - 0.002, 0.0), seconds=30.0, seed=3)
     (finding,) = diagnose(quarter_car(), record, Options()).findings
     assert finding.formula == "a * max(-d - L, 0)"
@@ -57,7 +59,7 @@ def test_a_stop_of_one_side_is_a_formula_and_no_bump_stop():
 
 
 @pytest.mark.slow
-def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop():
+def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop() -> None:
     """A stop leaves no more than noise may leave, and yet far more than the formula does."""
     record = simulate(lambda d, v: -6.44e4 * d / (1 + (d / 3.7e-3) ** 2), seconds=40.0, seed=3)
     (finding,) = diagnose(quarter_car(), record, Options()).findings
@@ -69,12 +71,12 @@ def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop(
     [(1000.0, 0.0, None), (1020.0, 0.0, None), (1100.0, 0.0, "force"), (1020.0, 0.08, "stop")],
 )
 def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_follows_the_motion(
-    monkeypatch, gain, left, expected
-):
+    monkeypatch: pytest.MonkeyPatch, gain: float, left: float, expected: str | None
+) -> None:
     monkeypatch.setattr(course, "missing", lambda problem, fit: left)
     fit = SimpleNamespace(reduced=0.9, count=10_000)
 
-    def trial(law, gain, freedom):
+    def trial(law: Any, gain: float, freedom: int) -> Trial:
         term = Term(law, "secondary", tuple(1.0 for _ in law.parameters))
         point = SimpleNamespace(terms=(term,))
         return Trial(None, SimpleNamespace(point=point, **vars(fit)), gain, gain, gain, freedom)
@@ -91,13 +93,13 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     assert course._led_by(state, [leader, unnamed]) is {"force": unnamed, "stop": leader, None: None}[expected]
 
 
-def test_a_law_of_the_catalogue_stays_one():
+def test_a_law_of_the_catalogue_stays_one() -> None:
     record = simulate(lambda d, v: 2e4 * v * abs(v), seconds=15.0, seed=4)
     assert {f.effect for f in diagnose(quarter_car(), record, Options()).findings} <= {"quadratic_damping"}
 
 
 @pytest.mark.slow
-def test_what_a_later_formula_explains_is_no_finding_of_its_own():
+def test_what_a_later_formula_explains_is_no_finding_of_its_own() -> None:
     """A hidden state that swings is first taken for a hanging mass; beside its formula that is idle, and goes."""
     law = OpenLaw("", lambda d, v, z: -65.0 * (z / 2.5e-3) ** 3, 0.12)
     values = {"stiffness": np.array([2.4e6, 4.3e5]), "damping": np.array([1.0e4, 2.0e4])}
@@ -108,7 +110,7 @@ def test_what_a_later_formula_explains_is_no_finding_of_its_own():
     assert [(f.location, f.effect, f.formula) for f in report.findings] == [("secondary", "formula", "a * z**3")]
 
 
-def test_a_formula_of_deflection_and_rate_is_drawn_as_a_map(told):
+def test_a_formula_of_deflection_and_rate_is_drawn_as_a_map(told: Report) -> None:
     d, v = np.meshgrid(told.evidence["finding.0.map_d"], told.evidence["finding.0.map_v"])
     force, std = told.evidence["finding.0.map_force"], told.evidence["finding.0.map_std"]
     (a,) = told.findings[0].parameters
@@ -118,7 +120,7 @@ def test_a_formula_of_deflection_and_rate_is_drawn_as_a_map(told):
     assert figure is not None and "a * d * abs(v)" in figure.axes[0].get_title(loc="left")
 
 
-def test_a_formula_becomes_a_law_of_ones_own(told, tmp_path):
+def test_a_formula_becomes_a_law_of_ones_own(told: Report, tmp_path: Path) -> None:
     path = tmp_path / "my_laws.py"
     assert write_laws(path, told) == 1
     (law,) = load_laws(path, tuple(one.name for one in CATALOGUE))
@@ -132,7 +134,7 @@ def test_a_formula_becomes_a_law_of_ones_own(told, tmp_path):
     assert finding.parameters[0].value == pytest.approx(2e6, abs=5 * finding.parameters[0].std)
 
 
-def test_a_formula_goes_into_every_export(told, tmp_path):
+def test_a_formula_goes_into_every_export(told: Report, tmp_path: Path) -> None:
     system = parse_system(improved_text(SYSTEM, quarter_car(), told))
     for name in ("vehicle.mo", "vehicle.fmu", "tables"):
         export(system, tmp_path / name)

@@ -7,7 +7,7 @@ import pytest
 from diagnosis_cases import DAMPING, STIFFNESS, quarter_car, simulate
 
 from sprung.model.diagnosis.fit.optimise import try_optimise
-from sprung.model.diagnosis.investigation.course import Options
+from sprung.model.diagnosis.investigation.course import Investigation, Options
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.formula import formula_of
 from sprung.model.diagnosis.investigation.formula_doubt import doubt_of, missing, own_size, uncertainty, whole_force
@@ -16,7 +16,7 @@ from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.screening.score import Candidate
-from sprung.model.diagnosis.selection.compete import compete
+from sprung.model.diagnosis.selection.compete import Trial, compete
 from sprung.model.diagnosis.selection.starts import start_of
 from sprung.model.laws.grammar import Factor, Shape, law_of
 
@@ -24,7 +24,7 @@ RATE, STOP, GAP = 2e6, -4e5, 0.002
 
 
 @pytest.fixture(scope="module")
-def unnamed():
+def unnamed() -> tuple[Investigation, Trial]:
     """An investigation that has begun, and its best unnamed force: a spring that stiffens with the rate, and a stop."""
     record = simulate(lambda d, v: RATE * d * abs(v) + STOP * max(-d - GAP, 0.0), seconds=12.0, seed=3)
     state = begun(quarter_car(), record, Options(), lambda share, text: None)
@@ -32,7 +32,7 @@ def unnamed():
     return state, compete(state.problem, state.fit, hits)[0]
 
 
-def test_the_residual_without_a_force_is_that_force_and_noise(unnamed):
+def test_the_residual_without_a_force_is_that_force_and_noise(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
     bare = taken_out(state.problem, trial.fit)
     assert bare.chi_square > 5 * trial.fit.chi_square
@@ -40,7 +40,7 @@ def test_the_residual_without_a_force_is_that_force_and_noise(unnamed):
     assert len(bare.point.terms) == len(trial.fit.point.terms) - 1
 
 
-def test_no_pair_at_random_scores_more_than_the_pairs_that_are_found(unnamed):
+def test_no_pair_at_random_scores_more_than_the_pairs_that_are_found(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
     search = FormulaSearch.along(state.problem, trial.fit)
     singles, pairs = search.best()
@@ -52,7 +52,7 @@ def test_no_pair_at_random_scores_more_than_the_pairs_that_are_found(unnamed):
         assert score < 1.001 * best or one[0].memory or other[0].memory
 
 
-def test_a_fit_of_a_formula_begins_where_everything_has_moved_along(unnamed):
+def test_a_fit_of_a_formula_begins_where_everything_has_moved_along(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
     hit = FormulaSearch.along(state.problem, trial.fit).best()[1][0]
     assert hit.start is not None and hit.start.terms[-1].parameters == pytest.approx(hit.term.parameters)
@@ -62,7 +62,7 @@ def test_a_fit_of_a_formula_begins_where_everything_has_moved_along(unnamed):
 
 
 @pytest.mark.slow
-def test_a_sum_is_told_with_its_force_and_its_half_is_doubted(unnamed):
+def test_a_sum_is_told_with_its_force_and_its_half_is_doubted(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
     told, reason = formula_of(state.problem, state.fit, trial, state.held)
     assert told is not None and reason == ""

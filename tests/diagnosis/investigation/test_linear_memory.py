@@ -30,7 +30,7 @@ def ride(of: Callable[[np.ndarray], np.ndarray], seconds: float = 30.0, seed: in
     return MadeRecord(shown + rng.standard_normal(shown.shape) * np.array([1e-5, 5e-4, 4e-3, 4e-3, 3e-2, 3e-2]))
 
 
-def test_the_branches_follow_the_power_beside_a_spring_and_a_damper():
+def test_the_branches_follow_the_power_beside_a_spring_and_a_damper() -> None:
     """Over the band of a suspension, what a spring and a damper take up apart."""
     law, time = find_law("fractional_stiffness"), np.arange(0, 80, 0.002)
     frequency = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
@@ -51,7 +51,7 @@ def _slope(frequency: np.ndarray, error: list[complex]) -> float:
     return float(frequency @ np.imag(error) / (frequency @ frequency))
 
 
-def test_a_stiffness_that_grows_with_the_frequency_is_named_with_its_power():
+def test_a_stiffness_that_grows_with_the_frequency_is_named_with_its_power() -> None:
     report = diagnose(quarter_car(), ride(lambda s: K + C * s + SIZE * (s / (2 * np.pi)) ** ORDER), Options())
     assert report.verdict == "missing_physics"
     (finding,) = report.findings
@@ -62,7 +62,7 @@ def test_a_stiffness_that_grows_with_the_frequency_is_named_with_its_power():
 
 
 @pytest.mark.slow
-def test_a_damper_that_gives_way_much_is_no_late_node():
+def test_a_damper_that_gives_way_much_is_no_late_node() -> None:
     report = diagnose(quarter_car(), ride(lambda s: K + C * s / (1 + C * s / 1.5e6), seed=5), Options())
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("secondary", "series_stiffness")

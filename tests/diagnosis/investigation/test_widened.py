@@ -1,5 +1,6 @@
 """Laws in their wider forms: where two of one damper act on each other, and not where they are a mere sum."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -21,10 +22,10 @@ from tests.diagnosis_cases import DAMPING, quarter_car, simulate
 A, KNEE, RATIO = 0.3, 0.04, 0.3
 
 
-def _damped(together: bool):
+def _damped(together: bool) -> Callable[[float, float], float]:
     """A damper with valves that is harder in extension, less its nominal force: one thing, or a sum of two forces."""
 
-    def force(d, v):
+    def force(d: float, v: float) -> float:
         valves = np.clip(v, -KNEE, KNEE) + RATIO * (v - np.clip(v, -KNEE, KNEE))
         return DAMPING["secondary"] * (valves - v + A * np.abs(valves if together else v))
 
@@ -32,7 +33,7 @@ def _damped(together: bool):
 
 
 @pytest.mark.parametrize("together", [True, False])
-def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together):
+def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> None:
     state = begun(quarter_car(), simulate(_damped(together), seconds=8, seed=3), Options(), lambda share, text: None)
     fit = state.fit
     for name, values in (("damper_blowoff", (KNEE, RATIO)), ("damper_asymmetry", (A,))):
@@ -52,7 +53,7 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together):
         assert np.all(np.abs(np.array(term.parameters) - (A, KNEE, RATIO)) < 4 * sigma)
 
 
-def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch):
+def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch: pytest.MonkeyPatch) -> None:
     fit: Any = SimpleNamespace(covariance=np.zeros((2, 2)), point=_point([0.1], (0.2,), 0.0))
     wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0)))
     monkeypatch.setattr(widened, "act_together", lambda state: True)
@@ -64,6 +65,6 @@ def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch):
     assert np.all(left_open(state) < 1e-12)
 
 
-def _point(theta, parameters, prior_cost):
+def _point(theta: Sequence[float], parameters: Sequence[float], prior_cost: float) -> Any:
     terms = (SimpleNamespace(parameters=parameters, law=SimpleNamespace(prior_cost=prior_cost)),)
     return SimpleNamespace(theta=np.array(theta), terms=terms)

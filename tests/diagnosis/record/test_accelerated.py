@@ -6,8 +6,8 @@ import pytest
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.record.channels import TooLittleError, prepare
 from sprung.model.diagnosis.record.signals import declared_noise
-from sprung.model.identification.excitation import simulate_runs
-from sprung.model.system import parse_system
+from sprung.model.identification.excitation import Runs, simulate_runs
+from sprung.model.system import System, parse_system
 from tests.test_system import QUARTER_CAR
 
 D, V, A = (
@@ -24,12 +24,12 @@ ABSOLUTE = (
 TRUTH = np.array([0.1, -0.08, 0.15, -0.1])
 
 
-def ride(motions, samples=2000, change=("", "")):
+def ride(motions: str, samples: int = 2000, change: tuple[str, str] = ("", "")) -> tuple[System, Runs]:
     system = parse_system(QUARTER_CAR.replace(f"{D}, {V}", motions).replace(*change))
     return system, simulate_runs(system, TRUTH[None], samples, np.random.default_rng(0))
 
 
-def test_an_acceleration_alone_is_enough_where_one_support_carries_everything():
+def test_an_acceleration_alone_is_enough_where_one_support_carries_everything() -> None:
     system, runs = ride(A)
     values = runs.values[0].copy()
     values[:, 0] += 0.3  # the offsets of two accelerometers
@@ -43,7 +43,7 @@ def test_an_acceleration_alone_is_enough_where_one_support_carries_everything():
     assert np.std(curvature - (values[1:-1, 0] - values[:, 0].mean())) < 0.05 * np.std(values[:, 0])
 
 
-def test_accelerations_alone_tell_the_values_of_a_whole_recording_in_which_not_everything_wanders_alike():
+def test_accelerations_alone_tell_the_values_of_a_whole_recording_in_which_not_everything_wanders_alike() -> None:
     system, runs = ride(A, 12_000, ABSOLUTE)
     signals = prepare(system, runs.values[0], 200.0).signals
     assert np.std(signals.displacement) < 2 * np.std(runs.clean[0, :, 0])  # the integral does not wander
@@ -53,7 +53,7 @@ def test_accelerations_alone_tell_the_values_of_a_whole_recording_in_which_not_e
     assert std.max() < 0.05
 
 
-def test_what_the_filter_takes_of_accelerations_alone_is_said_and_a_recording_that_leaves_nothing_is_refused():
+def test_what_the_filter_takes_of_accelerations_alone_is_said_and_a_recording_that_leaves_nothing_is_refused() -> None:
     system, runs = ride(A, 12_000, ABSOLUTE)
     assert any("measured by accelerations alone" in note for note in prepare(system, runs.values[0], 200.0).notes)
     with pytest.raises(TooLittleError, match=r"too short .* accelerations that must be integrated$"):
@@ -61,7 +61,7 @@ def test_what_the_filter_takes_of_accelerations_alone_is_said_and_a_recording_th
 
 
 @pytest.mark.parametrize("beside", [D, V, f"{D}, {V}"])
-def test_an_acceleration_beside_other_motions_is_fused_with_them(beside):
+def test_an_acceleration_beside_other_motions_is_fused_with_them(beside: str) -> None:
     system, runs = ride(f"{beside}, {A}")
     plain, _ = ride(beside)
     signals = prepare(system, runs.values[0], 200.0).signals
@@ -84,7 +84,7 @@ sensors: {a: {kind: acceleration, body: mass, csv: a, noise: 0.01}}
 
 
 @pytest.mark.parametrize(("stiffness", "kept"), [("2.0e+4", False), ("1.0e-3", True)])
-def test_an_offset_of_an_accelerometer_is_no_motion_of_what_springs_hold(stiffness: str, kept: bool):
+def test_an_offset_of_an_accelerometer_is_no_motion_of_what_springs_hold(stiffness: str, kept: bool) -> None:
     system = parse_system(SHAKEN.replace("STIFFNESS", stiffness))
     values = np.random.default_rng(2).standard_normal((4000, 2))
     offset = prepare(system, values + np.array([0.0, 0.7]), 100.0).signals.sensors

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.record.channels import prepare
+from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.record.split import cut
 from tests.diagnosis_cases import quarter_car, simulate
 
@@ -17,12 +18,12 @@ def prime_factors(number: int) -> set[int]:
 
 
 @pytest.fixture(scope="module")
-def signals():
+def signals() -> Signals:
     record = simulate(seconds=20.0, seed=40)
     return prepare(quarter_car(), record.values, record.sample_rate).signals
 
 
-def test_parts_transform_quickly_and_keep_the_time_of_the_recording(signals):
+def test_parts_transform_quickly_and_keep_the_time_of_the_recording(signals: Signals) -> None:
     cut_off, split = cut(signals, 0.7)
     first = round(cut_off.start * 100)
     assert all(max(prime_factors(length)) <= 11 for length in (split, cut_off.samples))
@@ -32,7 +33,7 @@ def test_parts_transform_quickly_and_keep_the_time_of_the_recording(signals):
     assert cut_off.part(split, cut_off.samples).start == pytest.approx((first + split) / 100)
 
 
-def test_blows_at_the_ends_and_at_the_split_are_cut_off(signals):
+def test_blows_at_the_ends_and_at_the_split_are_cut_off(signals: Signals) -> None:
     _, split = cut(signals, 0.7)
     sensors = signals.sensors.copy()
     for at in (0, split - 1, split, signals.samples - 1):
@@ -43,6 +44,6 @@ def test_blows_at_the_ends_and_at_the_split_are_cut_off(signals):
     assert abs(first + moved - split) > 2
 
 
-def test_a_short_recording_is_only_shortened(signals):
+def test_a_short_recording_is_only_shortened(signals: Signals) -> None:
     cut_off, split = cut(signals.part(0, 50), 0.7)
     assert cut_off.samples == 50 and cut_off.start == 0.0 and split == 35

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.response.harmonic_balance import warm_start_of
+from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_start_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.laws import find_law
@@ -16,7 +16,7 @@ from tests.diagnosis_cases import problem_of, simulate
 PROBLEM = problem_of(simulate(seconds=8.0))
 
 
-def solved(k3: float, warm: bool = False):
+def solved(k3: float, warm: bool = False) -> LawForces:
     term = Term(find_law("cubic_stiffness"), "secondary", (k3,), scales=(1e9,))
     point = Point(np.zeros(len(PROBLEM.system.parameters)), (term,), np.zeros(0))
     point = replace(point, state=np.zeros(PROBLEM.forward(point).plant.structure.states))

@@ -12,7 +12,7 @@ from sprung.model.system import load_system
 from tests.diagnosis_cases import quarter_car
 
 
-def test_plant_agrees_with_the_state_equations():
+def test_plant_agrees_with_the_state_equations() -> None:
     system = load_system()
     grid = Grid(400, 0.01)
     plant = Plant(Structure.nominal(system.mechanics, np.arange(12)), grid)
@@ -25,7 +25,7 @@ def test_plant_agrees_with_the_state_equations():
 
 
 @pytest.mark.parametrize("branch", [Branch(10, 1.2e6, 0.03, 36000.0), Branch(2, 3e5, 0.2, 0.0)])
-def test_branches_act_alike_in_frequency_and_in_free_motion(branch):
+def test_branches_act_alike_in_frequency_and_in_free_motion(branch: Branch) -> None:
     """Maxwell branch in place of a damper, and beside one (air spring): receptance against the state equations."""
     system = load_system()
     grid = Grid(400, 0.01)
@@ -42,7 +42,7 @@ def test_branches_act_alike_in_frequency_and_in_free_motion(branch):
         np.testing.assert_allclose(states[2 * n, 0], force[0, 0], rtol=1e-8)
 
 
-def test_polynomial_response_solves_the_equations_of_motion():
+def test_polynomial_response_solves_the_equations_of_motion() -> None:
     system = quarter_car()
     grid = Grid(500, 0.01)
     plant = Plant(Structure.nominal(system.mechanics, np.arange(4)), grid)

@@ -15,7 +15,9 @@ from tests.diagnosis_cases import problem_of, quarter_car, simulate, true_log_ra
 @pytest.mark.parametrize(
     ("law", "values", "settles"), [("coulomb_friction", (300.0, 0.01), True), ("bump_stop", (5e-3, 3e6), False)]
 )
-def test_forces_marched_in_time_are_those_of_the_whole_trajectory(law, values, settles):
+def test_forces_marched_in_time_are_those_of_the_whole_trajectory(
+    law: str, values: tuple[float, ...], settles: bool
+) -> None:
     """Steps in time lead to the forces of the iteration, also where that does not settle from its own start."""
     problem = problem_of(simulate(seed=6))
     point = Point(true_log_ratios(quarter_car()), (Term(find_law(law), "secondary", values),), np.zeros(4))

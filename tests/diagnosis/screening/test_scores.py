@@ -10,7 +10,7 @@ from sprung.model.laws import find_law
 from tests.diagnosis_cases import problem_of, simulate
 
 
-def test_scores_on_a_clean_recording_are_chi_square():
+def test_scores_on_a_clean_recording_are_chi_square() -> None:
     laws = (find_law("cubic_stiffness"), find_law("quadratic_damping"), find_law("damper_asymmetry"))
     scores = []
     for seed in range(6):

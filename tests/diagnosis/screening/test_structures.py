@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from sprung.benchmarks.structure import HALF_CAR, drawn, made
+from sprung.benchmarks.structure import HALF_CAR, ConcealedPart, MadeSamples, drawn, made
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.optimise import optimise
@@ -22,14 +22,14 @@ FILE = yaml.safe_load(HALF_CAR.read_text(encoding="utf-8"))
 SYSTEM = load_system(HALF_CAR)
 
 
-def _recording(kind: str, seed: int, seconds: float = 25.0):
+def _recording(kind: str, seed: int, seconds: float = 25.0) -> tuple[ConcealedPart, MadeSamples]:
     random = np.random.default_rng(seed)
     part = drawn(FILE, kind, random)
     return part, made(part, FILE, SYSTEM, random, seconds)[0]
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("missing_connection", 3), ("suspended_mass", 4), ("wrong_position", 5)])
-def test_a_part_that_the_file_lacks_is_named_with_its_values(kind, seed):
+def test_a_part_that_the_file_lacks_is_named_with_its_values(kind: str, seed: int) -> None:
     part, record = _recording(kind, seed)
     report = diagnose(SYSTEM, record, Options())
     assert [(f.location, f.effect) for f in report.findings] == [(part.location, kind)]
@@ -37,14 +37,14 @@ def test_a_part_that_the_file_lacks_is_named_with_its_values(kind, seed):
         assert parameter.value == pytest.approx(part.parameters[parameter.name], abs=5 * parameter.std)
 
 
-def test_a_clean_recording_lacks_nothing():
+def test_a_clean_recording_lacks_nothing() -> None:
     _, record = _recording("clean", 6)
     report = diagnose(SYSTEM, record, Options())
     assert report.verdict == "consistent" and not report.findings
 
 
 @pytest.mark.parametrize(("kind", "share"), [("missing_connection", 0.02), ("suspended_mass", 0.15)])
-def test_scores_in_closed_form_promise_what_a_fit_gains(kind, share):
+def test_scores_in_closed_form_promise_what_a_fit_gains(kind: str, share: float) -> None:
     """Of a faint part, where the first order is all there is."""
     random = np.random.default_rng(3)
     part = drawn(FILE, kind, random)
@@ -62,7 +62,7 @@ def test_scores_in_closed_form_promise_what_a_fit_gains(kind, share):
     assert fit.chi_square - again.chi_square == pytest.approx(best.score, rel=0.2)
 
 
-def test_connections_are_sought_where_no_element_is():
+def test_connections_are_sought_where_no_element_is() -> None:
     pairs = set(unconnected(SYSTEM))
     assert ("front", "rear") in pairs and ("frame", "road_front") in pairs
     assert ("front", "road_front") not in pairs

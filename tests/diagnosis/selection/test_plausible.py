@@ -76,7 +76,9 @@ def test_a_resonance_above_what_is_compared_is_no_resonance(law: str) -> None:
         ("mass_change", (2.7,), False),
     ],
 )
-def test_gains_and_masses_that_stand_for_something_else_are_not_believed(law, values, believed) -> None:
+def test_gains_and_masses_that_stand_for_something_else_are_not_believed(
+    law: str, values: tuple[float, ...], believed: bool
+) -> None:
     reason = out_of_range(Term(find_law(law), "x", values))
     assert (reason is None) == believed
 
@@ -91,7 +93,9 @@ def test_gains_and_masses_that_stand_for_something_else_are_not_believed(law, va
         ("coulomb_friction", (20.0, 0.01), 30.0, False),  # several values at once: what they explain tells
     ],
 )
-def test_what_is_as_if_it_were_not_there_is_no_finding(law, values, deviation, hardly) -> None:
+def test_what_is_as_if_it_were_not_there_is_no_finding(
+    law: str, values: tuple[float, ...], deviation: float, hardly: bool
+) -> None:
     fit = SimpleNamespace(covariance=np.diag([1.0, deviation**2]))
     assert hardly_there(fit, Term(find_law(law), "x", values)) == hardly
 

@@ -17,7 +17,7 @@ SCORES = {
 
 
 @pytest.mark.parametrize("gross", [True, False])
-def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gross):
+def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gross: bool) -> None:
     hits = [Candidate(Term(law := find_law(name), at, law.absent), s, ELEMENT) for (at, name), s in SCORES.items()]
     chosen = shortlist(Screening(tuple(hits), {ELEMENT: 100}), alpha=1e-3, gross=gross)
     plain = [("storey", "cubic_stiffness"), ("storey", "air_spring")]

@@ -3,7 +3,7 @@
 from sprung.service.cli.replay import measurement_lines
 
 
-def test_wrong_sensors_and_loads_are_told_below_the_table():
+def test_wrong_sensors_and_loads_are_told_below_the_table() -> None:
     found = {
         "sensors": [
             {"channel": "bogie1_1l", "kind": "gain", "value": 1.0507, "std": 0.0034},

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sprung.model.signals import FloatArray
 from sprung.model.system import parse_system
 from sprung.replay.record import load_record
 from sprung.service.cli import main
@@ -39,7 +40,7 @@ sensors:
 """
 
 
-def quarter_car(seed=1):
+def quarter_car(seed: int = 1) -> FloatArray:
     """Inputs and sensors in SI at 1 kHz: the steady response to a periodic random road, exact in frequency."""
     system = parse_system(QUARTER_CAR)
     A, B, C, D = system.mechanics.matrices(
@@ -58,7 +59,7 @@ def quarter_car(seed=1):
     return out + rng.standard_normal(out.shape) * [1e-5, 1e-3, 0.01, 0.05, 1e-5, 1.0]
 
 
-def write_own(path):
+def write_own(path: Path) -> None:
     """As an amplifier writes it: milliseconds, millimetres, inches, g, volts, kN, semicolons and decimal commas."""
     z, vz, body, wheel, travel, load = quarter_car().T
     columns = {
@@ -74,7 +75,9 @@ def write_own(path):
     path.write_text("# Messfahrt 7\n" + ";".join(columns) + "\n" + "\n".join(rows) + "\n", encoding="utf-8")
 
 
-def test_a_ride_in_other_units_at_another_rate_gives_the_true_values(tmp_path, capfd):
+def test_a_ride_in_other_units_at_another_rate_gives_the_true_values(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     write_own(tmp_path / "ride.csv")
     (tmp_path / "own.yaml").write_text(OWN)
     options = ["--system", str(tmp_path / "own.yaml"), "--start", "2026-09-21T14:00:00Z", "--json"]
@@ -97,7 +100,7 @@ def test_a_ride_in_other_units_at_another_rate_gives_the_true_values(tmp_path, c
         assert said in err
 
 
-def test_a_second_ride_that_begins_at_0_is_tracked_on(tmp_path, capfd):
+def test_a_second_ride_that_begins_at_0_is_tracked_on(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     write_own(tmp_path / "ride.csv")
     (tmp_path / "own.yaml").write_text(OWN)
     options = ["--system", str(tmp_path / "own.yaml"), "--store", str(tmp_path / "a.db"), "--vehicle", "car", "--json"]
@@ -113,7 +116,7 @@ def test_a_second_ride_that_begins_at_0_is_tracked_on(tmp_path, capfd):
     assert "give one FILE with it" in capfd.readouterr().err
 
 
-def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path, capfd):
+def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     time = np.arange(3000) * 10
     rows = "\n".join(f"{t},{np.sin(t / 100):.6f},0,0,0,0,0" for t in time)
     (tmp_path / "ride.csv").write_text("time,z,vz,a1,a2,travel,load\n" + rows + "\n")
@@ -125,7 +128,7 @@ def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path, capfd):
         assert len(err.splitlines()) == 1
 
 
-def test_the_example_of_the_documents_works(tmp_path):
+def test_the_example_of_the_documents_works(tmp_path: Path) -> None:
     text = (DOCS / "own-data.md").read_text(encoding="utf-8")
     head = re.search(r"```\n(# Versuch.*?)\.\.\.\n```", text, re.DOTALL)[1]
     system = parse_system(re.search(r"```yaml\n(.*?)```", text, re.DOTALL)[1])

@@ -1,11 +1,13 @@
 """From a file as a test rig writes it to a named law: inspect writes the system file, diagnose reads it."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.io
 
+from sprung.model.signals import FloatArray
 from sprung.service.cli import main
 
 h5py = pytest.importorskip("h5py")
@@ -19,7 +21,7 @@ from tests.replay.test_series import uff58  # noqa: E402
 FRICTION, STEP = 60.0, 0.01  # N, s
 
 
-def columns():
+def columns() -> dict[str, FloatArray]:
     """A damper with dry friction under two sines."""
     random, t = np.random.default_rng(6), STEP * np.arange(900)
     stroke = 0.012 * np.sin(4.4 * t + 0.3) + 0.004 * np.sin(12 * t)
@@ -28,11 +30,11 @@ def columns():
     return {"time": t, "stroke": stroke + 1e-6 * random.standard_normal(len(t)), "force": force}
 
 
-def mat5(path):
+def mat5(path: Path) -> None:
     scipy.io.savemat(path, columns())
 
 
-def hdf5(path, userblock=0):
+def hdf5(path: Path, userblock: int = 0) -> None:
     with h5py.File(path, "w", userblock_size=userblock) as file:
         for name, values in columns().items():
             file[name] = values[None, :] if userblock else values
@@ -40,17 +42,17 @@ def hdf5(path, userblock=0):
                 file[name].attrs["unit"] = "N"
 
 
-def mat73(path):
+def mat73(path: Path) -> None:
     hdf5(path, 512)
     with path.open("r+b") as raw:
         raw.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM")
 
 
-def parquet(path):
+def parquet(path: Path) -> None:
     pq.write_table(pa.table(columns()), path)
 
 
-def tdms(path):
+def tdms(path: Path) -> None:
     waveform = {"wf_increment": STEP, "wf_start_offset": 0.0}
     with nptdms.TdmsWriter(path) as writer:
         writer.write_segment(
@@ -62,7 +64,7 @@ def tdms(path):
         )
 
 
-def uff(path):
+def uff(path: Path) -> None:
     data = columns()
     path.write_bytes(
         b"".join(
@@ -72,7 +74,7 @@ def uff(path):
     )
 
 
-def german(path):
+def german(path: Path) -> None:
     """Semicolons, decimal commas, kilonewtons, milliseconds and a row of units."""
     t, stroke, force = columns().values()
     rows = (f"{1e3 * a:.1f};{1e3 * b:.5f};{1e-3 * c:.6f}" for a, b, c in zip(t, stroke, force, strict=True))
@@ -91,7 +93,9 @@ FILES = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_rigs_file_leads_to_its_friction_without_a_script(tmp_path, capfd, name):
+def test_a_rigs_file_leads_to_its_friction_without_a_script(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
+) -> None:
     path, system = tmp_path / name, tmp_path / "rig.yaml"
     FILES[name](path)
     assert main(["inspect", str(path), "--write-system", str(system)]) == 0
