@@ -32,16 +32,17 @@ class Served:
             self.port: int = probe.getsockname()[1]
         self._traced = bool(before)
         arguments = ["serve", "--port", str(self.port), "--data-dir", str(folder), "--system", str(system)]
+        self._started: subprocess.Popen[bytes] | None = None
         if zygote is not None:
             self.process: Forked = zygote.command(*arguments)
             return
-        started = subprocess.Popen(
+        self._started = subprocess.Popen(
             [*before, sys.executable, "-m", "sprung", *arguments],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             preexec_fn=end_with_parent,  # noqa: PLW1509 (one system call)
         )
-        self.process = Forked(started.pid)
+        self.process = Forked(self._started.pid)
 
     def __enter__(self) -> Served:
         return self
@@ -54,10 +55,10 @@ class Served:
         begun = time.monotonic()
         while time.monotonic() - begun < READY_SECONDS and self.process.alive:
             try:
-                connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=5)
-                connection.request("GET", "/health/ready")
-                if connection.getresponse().status == 200:
-                    return time.monotonic() - begun
+                with closing(http.client.HTTPConnection("127.0.0.1", self.port, timeout=5)) as connection:
+                    connection.request("GET", "/health/ready")
+                    if connection.getresponse().status == 200:
+                        return time.monotonic() - begun
             except (OSError, http.client.HTTPException):
                 time.sleep(0.1)
         raise ValueError("the service did not become ready")
@@ -69,6 +70,8 @@ class Served:
             Forked(made[0]).kill()
             self.process.wait(30.0)
         self.process.kill()
+        if self._started is not None:
+            self._started.poll()  # it is gone, and its end was taken note of
         deadline = time.monotonic() + 10
         while (left := [pid for pid in made if alive(pid)]) and time.monotonic() < deadline:
             time.sleep(0.05)

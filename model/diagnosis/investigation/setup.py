@@ -128,6 +128,7 @@ def _best(
     rules = problem.rules.setup
     total = float(np.sum(present))
     accepted: list[_Accepted] = []
+    sharpened: dict[int, _Accepted] = {}  # by the identity of the accepted one
     for ranked in _ranked(system, signals, problem, fit, total):
         for hypothesis in _seen_on_a_stretch(ranked, system, signals, declared, problem):
             if problem.worked_out:
@@ -144,11 +145,16 @@ def _best(
                     fault = _fault(hypothesis, total, left), changed, mended, other, again
                     return _sharpened(fault, declared, fitted)
                 accepted.append((_fault(hypothesis, total, left), changed, mended, other, again))
-        accepted.sort(key=lambda one: one[0].after)
-        if accepted:
-            best = _best_sharpened(accepted, declared, signals, split)
-            if not best[0].effect.ordinary:
-                return best
+        accepted.sort(key=_after)
+        rivals = _rivals(accepted, rules.rivals)
+        if all(one[0].effect.ordinary for one in rivals):
+            continue  # whichever of them is the best
+        for one in rivals:
+            if id(one) not in sharpened:
+                sharpened[id(one)] = _sharpened(one, declared, fitted_samples(signals, one[2], split))
+        best = min((sharpened[id(one)] for one in rivals), key=_after)
+        if not best[0].effect.ordinary:
+            return best
     return None  # the fault of one sensor: sought with everything else, and judged on the held-out part
 
 
@@ -181,20 +187,19 @@ def _seen_on_a_stretch(
     return [ranked[number] for number in sorted(number for _, number in good)]
 
 
-def _best_sharpened(accepted: list[_Accepted], declared: Noise, signals: Signals, split: int) -> _Accepted:
-    """The best of accepted hypotheses, least misfit first, estimated again on the structure fitted without it.
+def _rivals(accepted: list[_Accepted], most: int) -> list[_Accepted]:
+    """Those of accepted hypotheses, least misfit first, of which the best is to be found by estimating them again.
 
     What else the channel of a wrong gain or lag may have is weighed like it: rough values rank these by chance.
     """
-
-    def sharpened(one: _Accepted) -> _Accepted:
-        return _sharpened(one, declared, fitted_samples(signals, one[2], split))
-
+    if not accepted or not accepted[0][0].effect.ordinary:
+        return accepted[:1]
     first = accepted[0]
-    if not first[0].effect.ordinary:
-        return sharpened(first)
-    rivals = [one for one in accepted if one[0].site.location == first[0].site.location]
-    return min((sharpened(one) for one in rivals[: first[3].rules.setup.rivals]), key=lambda one: one[0].after)
+    return [one for one in accepted if one[0].site.location == first[0].site.location][:most]
+
+
+def _after(accepted: _Accepted) -> float:
+    return accepted[0].after
 
 
 def _ranked(system: System, signals: Signals, problem: Problem, fit: Fit, total: float) -> Iterator[list[Hypothesis]]:
