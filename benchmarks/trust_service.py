@@ -71,7 +71,7 @@ class Served:
             self.process.wait(30.0)
         self.process.kill()
         if self._started is not None:
-            self._started.poll()  # it is gone, and its end was taken note of
+            self._started.wait()  # it is gone; Python hears it, too
         deadline = time.monotonic() + 10
         while (left := [pid for pid in made if alive(pid)]) and time.monotonic() < deadline:
             time.sleep(0.05)
