@@ -211,8 +211,7 @@ def spoken(parameter: str) -> str:
 
 def told(alarm: Alarm | AlarmRow) -> str:
     """What an alarm is about; what the measurements do not tell it from comes first, for a sensor is checked sooner."""
-    rivals = alarm.alternatives if isinstance(alarm, Alarm) else ()
-    return " or ".join([*rivals, spoken(alarm.parameter or "")])
+    return " or ".join([*alarm.alternatives, spoken(alarm.parameter or "")])
 
 
 def unclear(rivals: Sequence[str]) -> str:
@@ -299,7 +298,7 @@ def alarm_dict(alarm: Alarm | AlarmRow) -> dict[str, Any]:
         "std": finite(alarm.std),
         "severity": alarm.severity,
     }
-    if isinstance(alarm, Alarm) and alarm.alternatives:
+    if alarm.alternatives:
         found["alternatives"] = list(alarm.alternatives)
     if alarm.kind == "sensor":
         found["channel"], _, found["fault"] = (alarm.parameter or "").rpartition(".")

@@ -167,6 +167,7 @@ class AlarmAnswer(BaseModel):
     report: str | None = Field(default=None, description="mismatch report that belongs to it")
     acknowledged: str | None = None
     acknowledged_by: str | None = None
+    alternatives: list[str] = Field(default=[], description="what the evidence does not tell it from")
     bundle: str | None = Field(default=None, description="the signals around it, as one MCAP file")
 
 

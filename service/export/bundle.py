@@ -18,6 +18,7 @@ from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.history import Series
 from sprung.service.store.marks import MarkRow
 from sprung.service.times import NANOSECONDS
+from sprung.service.views import told
 
 BUNDLE_MEDIA = "application/octet-stream"
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log
@@ -93,7 +94,7 @@ def _compared(file: McapSink, engine: Engine, window: Compared) -> None:
 
 def _alarm(file: McapSink, alarm: AlarmRow) -> None:
     level = ERROR if alarm.severity == "alarm" else WARNING
-    what = alarm.parameter or "windows no longer fit the model"
+    what = told(alarm) or "windows no longer fit the model"
     change = "" if alarm.change is None else f" {100 * alarm.change:+.1f} %"
     file.event(alarm.onset, level, alarm.kind, f"{alarm.severity}: {what}{change}: begins here")
     file.event(alarm.opened, level, alarm.kind, f"{alarm.severity}: {what}{change}: raised")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sprung.model.tracking.tracker import Alarm
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
@@ -83,9 +82,8 @@ def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> lis
             if together
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
-        now = next((a for a in view.active if (a.kind, a.parameter) == (worst.kind, worst.parameter)), worst)
-        rivals = now.alternatives if isinstance(now, Alarm) else ()
-        found.append(Hint(level, f"{told(now)} has changed{size}{many}", f"{unclear(rivals)}{what} {ask}"))
+        unsure = unclear(worst.alternatives)
+        found.append(Hint(level, f"{told(worst)} has changed{size}{many}", f"{unsure}{what} {ask}"))
     if any(a.kind == "misfit" for a in active):
         text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
         found.append(Hint("warning", "Windows no longer fit the model", text))

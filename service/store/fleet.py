@@ -10,7 +10,7 @@ from sqlalchemy import Connection, Select, and_, func, or_, select, update
 
 from sprung.model.tracking.tracker import Alarm
 from sprung.service.store.engine import insert_or_ignore, upsert
-from sprung.service.store.schema import STAGING, alarms, fleet_status, models, tracker_states, vehicles
+from sprung.service.store.schema import LONGEST_NAME, STAGING, alarms, fleet_status, models, tracker_states, vehicles
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,7 @@ class AlarmRow:
     vehicle: str | None = None
     acknowledged: int | None = None  # ns since epoch
     acknowledged_by: str | None = None
+    alternatives: tuple[str, ...] = ()  # what the evidence does not tell it from, "bogie1_1l.gain"
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +193,7 @@ def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iter
             "vehicle_id": vehicle,
             "model_id": model_id,
             "kind": alarm.kind,
-            "parameter": alarm.parameter or "",
+            "parameter": _stored_name(alarm),
             "opened_ns": alarm.opened,
             "onset_ns": alarm.onset,
             "closed_ns": alarm.closed,
@@ -200,6 +201,7 @@ def save_alarms(connection: Connection, vehicle: str, model_id: int, found: Iter
             "std": alarm.std,
             "peak": alarm.peak,
             "severity": alarm.severity,
+            "alternatives": list(alarm.alternatives),
         }
         for alarm in found
     ]
@@ -217,7 +219,7 @@ def _changes(connection: Connection, vehicle: str, model_id: int, found: list[Al
     stored = {(row.kind, row.parameter, row.opened_ns): row for row in connection.execute(query)}
     changes = []
     for alarm in found:
-        row = stored.get((alarm.kind, alarm.parameter or "", alarm.opened))
+        row = stored.get((alarm.kind, _stored_name(alarm), alarm.opened))
         if row is None:
             changes.append(AlarmChange("opened", alarm, None))
         if alarm.closed is not None and (row is None or row.closed_ns is None):
@@ -225,6 +227,11 @@ def _changes(connection: Connection, vehicle: str, model_id: int, found: list[Al
         elif row is not None and row.closed_ns is None and row.severity != alarm.severity:
             changes.append(AlarmChange("changed", alarm, row.severity))
     return changes
+
+
+def _stored_name(alarm: Alarm) -> str:
+    """Of a fault that many channels share, what fits; empty for a misfit."""
+    return (alarm.parameter or "")[:LONGEST_NAME]
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,14 +253,14 @@ def list_alarms(
     """Alarms of every model, newest first; `after` holds (opened, id) of the last one of the page before."""
     table = alarms
     names = ("kind", "parameter", "onset_ns", "opened_ns", "closed_ns", "severity", "change", "std", "peak")
-    more = ("report_id", "id", "vehicle_id", "acknowledged_ns", "acknowledged_by")
+    more = ("report_id", "id", "vehicle_id", "acknowledged_ns", "acknowledged_by", "alternatives")
     query = _asked_for(select(*(table.c[name] for name in (*names, *more))), wanted)
     query = query.order_by(table.c.opened_ns.desc(), table.c.id.desc()).limit(limit).offset(offset)
     if after is not None:
         opened, identity = after
         same = and_(table.c.opened_ns == opened, table.c.id < identity)
         query = query.where(or_(table.c.opened_ns < opened, same))
-    return [AlarmRow(row[0], row[1] or None, *row[2:]) for row in connection.execute(query)]
+    return [AlarmRow(row[0], row[1] or None, *row[2:-1], tuple(row[-1] or ())) for row in connection.execute(query)]
 
 
 def count_alarms(connection: Connection, wanted: WantedAlarms) -> int:

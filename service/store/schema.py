@@ -25,6 +25,7 @@ from sqlalchemy import (
 )
 
 STAGING = "staging:"  # digests of models whose history is not shown yet begin so (`service.store.staging`)
+LONGEST_NAME = 1000  # characters of what an alarm is about: a fault that many channels share names them all
 
 metadata = MetaData(
     naming_convention={
@@ -199,7 +200,7 @@ alarms = Table(
     Column("vehicle_id", String(128), ForeignKey("vehicles.id"), nullable=False),
     Column("model_id", Integer, ForeignKey("models.id"), nullable=False),
     Column("kind", String(10), nullable=False),  # change, misfit
-    Column("parameter", String(160), nullable=False),  # empty for a misfit: NULL would not be unique
+    Column("parameter", String(LONGEST_NAME), nullable=False),  # empty for a misfit: NULL would not be unique
     Column("opened_ns", BigInteger, nullable=False),
     Column("onset_ns", BigInteger, nullable=False),
     Column("closed_ns", BigInteger, nullable=True),
@@ -210,6 +211,7 @@ alarms = Table(
     Column("report_id", String(36), ForeignKey("reports.id"), nullable=True),
     Column("acknowledged_ns", BigInteger, nullable=True),
     Column("acknowledged_by", String(128), nullable=True),
+    Column("alternatives", JSON, nullable=True),  # what the evidence does not tell it from, ["bogie1_1l.gain"]
     Index("ix_alarms_opened_ns", "opened_ns"),
     UniqueConstraint("vehicle_id", "model_id", "kind", "parameter", "opened_ns"),
 )

@@ -71,6 +71,17 @@ def test_a_page_of_alarms_behind_the_last_leads_back(client: TestClient, alarmed
         assert client.get(f"/pages/alarms?{wrong}").status_code == 422
 
 
+def test_what_an_alarm_is_not_told_from_stays_beside_it(client: TestClient, core: Core) -> None:
+    rivals = ("bogie1_1l.gain", "bogie1_1l.delay")
+    with core.store.write() as connection:
+        fleet.ensure_vehicle(connection, "a", 1)
+        fleet.save_alarms(connection, "a", core.pipeline.model_id, [replace(FIRST, closed=2, alternatives=rivals)])
+    (alarm,) = client.get("/vehicles/a/alarms").json()["alarms"]
+    assert alarm["alternatives"] == list(rivals)
+    for page in ("/pages/vehicles/a", "/pages/alarms?active=false"):
+        assert "bogie1_1l.gain or bogie1_1l.delay or " in client.get(page).text
+
+
 def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: TestClient, core: Core) -> None:
     assert "Live buses" not in client.get("/pages/work").text
     down = FeedStatus("socketcan:can0", "car-17", "down", "no such device", 0.0, 3, 2, 1, 5, 4)

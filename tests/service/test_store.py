@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from alembic.config import Config
 from alembic.migration import MigrationContext
 from sqlalchemy import func, select, text
 
+from sprung.model.tracking.state import Alarm
 from sprung.service.errors import UserError
 from sprung.service.fleet.local_postgres import PostgresServer
 from sprung.service.store import Store, fleet, history, open_store, partitions, retention, work
@@ -226,6 +228,31 @@ def test_a_store_of_the_version_before_keeps_its_windows(any_store: Store) -> No
         found = known_windows(connection, "a", model, [START, START + 70 * DAY])
     assert len(found) == 2
     assert found[START].posterior is not None and found[START].posterior.std[0] == 0.01
+
+
+def test_what_an_alarm_is_not_told_from_is_kept_with_it(any_store: Store) -> None:
+    """Also while it is closed, and in a list after the tracker has forgotten it; alarms of an older store have none."""
+    alarm = Alarm("change", "primary_11l.damping", 0, 1, "warning", -0.1, 0.02, alternatives=("bogie1_1l.gain",))
+    model = fill(any_store, [])
+    _save(any_store, model, [alarm, replace(alarm, opened=2, alternatives=())])
+    assert _alternatives(any_store) == [(), ("bogie1_1l.gain",)]
+    _save(any_store, model, [replace(alarm, closed=3)])
+    assert _alternatives(any_store) == [(), ("bogie1_1l.gain",)]
+    _migrate(any_store, "downgrade", "0006")
+    _migrate(any_store, "upgrade", "head")
+    assert _alternatives(any_store) == [(), ()]
+    _save(any_store, model, [alarm])  # which the tracker still knows
+    assert _alternatives(any_store) == [(), ("bogie1_1l.gain",)]
+
+
+def _save(store: Store, model: int, found: list[Alarm]) -> None:
+    with store.write() as connection:
+        fleet.save_alarms(connection, "a", model, found)
+
+
+def _alternatives(store: Store) -> list[tuple[str, ...]]:
+    with store.read() as connection:
+        return [row.alternatives for row in fleet.list_alarms(connection, fleet.WantedAlarms("a"), 10)]
 
 
 def _migrate(store: Store, direction: str, revision: str) -> None:

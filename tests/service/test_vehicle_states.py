@@ -46,7 +46,8 @@ def test_a_closed_alarm_accuses_nobody() -> None:
 
 def test_what_an_alarm_cannot_be_told_from_is_said() -> None:
     view = replace(VIEW, alarms=(DAMPER,))
-    active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None)]
+    rivals = DAMPER.alternatives
+    active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None, alternatives=rivals)]
     said = hints(ROW, view, active, [], False, sensor_marks(SYSTEM, view))
     assert said[0].title == "bogie1_1l.gain or primary_11l.damping has changed by -10.0 %"
     assert "do not tell it from bogie1_1l.gain: check the sensor first" in said[0].text
