@@ -17,7 +17,7 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
         per_sensor = np.where(refined.rms > 0, refined.error / refined.rms, np.nan)
     fits = refined.chi_square < fit_limit(refined.freedom)
     # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
-    told = np.where(fits, refined.identifiable.any(axis=1) & refined.converged, True)
+    told = np.where(fits, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
     informative = (refined.excitation > EXCITED) & told
     return [
         Estimate(

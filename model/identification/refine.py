@@ -43,6 +43,9 @@ _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 _SLACK = (
     0.5  # rise of the weighted squares that is no failure: the solution with smoothed inputs is not quite its minimum
 )
+_PER_UNKNOWN = (
+    1.0  # the same, of each unknown, where nothing moves any more: in weak windows noise of the inputs lies along all
+)
 _CONVERGED = 0.3  # a chord step this small, in standard deviations, leaves an error far below it
 
 
@@ -185,8 +188,9 @@ class Refiner:
         second = self.model.chord(at, x + step, at.state_after(step), data)
         worse = at.cost > cost * (1 + 1e-6) + _SLACK
         std = torch.diagonal(at.covariance, dim1=1, dim2=2).sqrt()
-        held = second.cost <= at.cost * (1 + 1e-6) + _SLACK
-        small = ((second.step.abs() / std).amax(dim=1) < _CONVERGED) & held
+        settled = (second.step.abs() / std).amax(dim=1) < _CONVERGED
+        held = second.cost <= at.cost * (1 + 1e-6) + _SLACK + torch.where(settled, _PER_UNKNOWN * x.shape[1], 0.0)
+        small = settled & held
         forward = torch.where(held[:, None], x + step + _limited(second.step), x + step / 3)
         # A step that made things worse is taken back to a third.
         progress.x[rows] = torch.where(worse[:, None], best + (x - best) / 3, forward)

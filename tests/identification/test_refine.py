@@ -52,6 +52,14 @@ def test_errors_are_what_the_intervals_say_from_nominal_and_from_a_near_start(
     assert near.iterations.mean() < 0.6 * from_nominal.iterations.mean()
 
 
+def test_windows_that_hardly_tell_anything_come_to_rest() -> None:
+    system = load_system()
+    slow = simulate_runs(system, np.zeros((24, 24)), system.window, np.random.default_rng(3), speed=(2.0, 3.0))
+    refined = Refiner(system).refine(slow.values, loads=True, built=True)
+    assert refined.converged.all()
+    assert refined.iterations.mean() < 3
+
+
 def test_one_window_alone_is_the_window_in_a_batch(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     refiner = Refiner(system)
