@@ -37,8 +37,8 @@ def through(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[
         starts = [START + round(k / rate * 1e9) for k in begins]
         found, _ = engine.identify(windows, starts=starts)
         for k, start, estimate in zip(begins, starts, found, strict=True):
-            state = tracker.update(state, estimate, start)
-            yield Moment((k + system.window / 2) / rate, estimate, state, state.last == start)
+            before, state = state.used, tracker.update(state, estimate, start)
+            yield Moment((k + system.window / 2) / rate, estimate, state, state.used > before)
 
 
 def _windows(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[tuple[FloatArray, list[int]]]:

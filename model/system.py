@@ -41,6 +41,7 @@ DELAY_STD = 0.002  # s: filters, scheduling and clocks of nodes
 AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: wheels wear, and new ones are put on
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
+COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken or short, and nobody knows the temperature
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
 
 
@@ -189,7 +190,10 @@ class System:
         if not math.isfinite(lateral):
             lateral = usual * values.get("yaw_rate", math.nan)
         pressure = tuple(values.get(f"{load.body}.pressure", math.nan) for load in self.loads)
-        return Conditions(speed, values.get("temperature", math.nan), lateral, pressure)
+        temperature = values.get("temperature", math.nan)
+        if not COLDEST < temperature < HOTTEST:
+            temperature = math.nan
+        return Conditions(speed, temperature, lateral, pressure)
 
     @cached_property
     def signals(self) -> tuple[Channel, ...]:

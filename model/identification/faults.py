@@ -38,6 +38,7 @@ _TRIALS = 3  # of those, by their squares at the nominal values
 _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 _FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
 _CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
+_SHAKEN = 10.0  # deviations of its noise that a sensor moves by when the vehicle runs; doors and people stay below
 
 
 @dataclass(slots=True)
@@ -319,6 +320,22 @@ class Explainer:
                     found.append(MeasurementFault(channel.name, "saturated", float(end)))
                     break
         return tuple(found)
+
+    def still(self, window: FloatArray) -> tuple[MeasurementFault, ...]:
+        """Whether all inputs of one window (T, C) are frozen although most sensors show that the vehicle runs: one
+        fault of them all, since what froze them is what they share.
+
+        At a standstill inputs may be as flat, where steps of the converter are coarse, but then sensors are quiet.
+        """
+        inputs = len(self.system.inputs)
+        if inputs == 0 or not np.all(np.mean(np.diff(window[:, :inputs], axis=0) == 0, axis=0) > _FLAT):
+            return ()
+        noise = np.array([channel.noise for channel in self.system.channels[inputs:]])
+        moves = window[:, inputs:].std(axis=0) > _SHAKEN * noise  # one that is absent is NaN and does not
+        if np.count_nonzero(moves) <= len(moves) / 2:
+            return ()
+        names = "|".join(channel.name for channel in self.system.channels[:inputs])
+        return (MeasurementFault(names, "frozen", float(window[-1, 0])),)
 
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
         """Windows with one sign turned or two channels exchanged that fit much better at nominal values."""

@@ -77,6 +77,10 @@ class Identifier:
             found = [self._doubted(estimate) for estimate in found]
             self.times = StageTimes(between - begin, time.perf_counter() - between)
             return found
+        still = self._explainer(windows.shape[1]).still
+        found = [
+            e if e.informative else replace(e, faults=still(window)) for e, window in zip(found, windows, strict=True)
+        ]
         bad = np.array([b for b, e in enumerate(found) if self._asks(e, windows.shape[1])], dtype=np.int64)
         if len(bad):
             for b, cause in self._explainer(windows.shape[1]).explain(windows, bad).items():

@@ -189,9 +189,9 @@ class Fusion:
         """Weather and change tests after a window, less what deviations and weather account for."""
         settings, belief, fresh, mask = self.settings, filtered.belief, filtered.fresh, window.mask
         off = self._of_baseline(state, calibration, window.cross, belief)
-        at = weathers.features(conditions, self.load(belief))
-        usable = mask & (state.changes.learned >= settings.learning)
         assert state.weather is not None
+        at = weathers.features(state.weather, conditions, self.load(belief))
+        usable = mask & (state.changes.learned >= settings.learning)
         weather = weathers.foreseen(state.weather, self.weather, at, learning=not self.armed(state))
         left = np.where(usable, window.value - off - np.where(usable, state.changes.baseline, 0.0), 0.0)
         weather = weathers.together(weather, self.weather, left, fresh, usable, window.centre)
@@ -231,11 +231,14 @@ class Fusion:
             pressure = np.array(conditions.pressure)
         departs = elapsed - self.settings.window > dev.STOPPED
         changed = found is not None and state.last is not None and not departs and dev.moved(belief, model, found)
-        if not (departs or changed):
+        believed = belief.mean[rows], np.diag(belief.covariance)[rows]
+        nothing = np.diag(model.prior)[model.loads]
+        belied = not (departs or changed) and cargos.contradicted(cargo, *believed, nothing)
+        if not (departs or changed or belied):
             return belief, cargos.felt(cargo, pressure)
         if state.last is not None and departs:
-            cargo = cargos.arrived(cargo, belief.mean[rows], np.diag(belief.covariance)[rows])
-        cargo = cargos.departed(cargo, pressure, np.diag(model.prior)[model.loads])
+            cargo = cargos.arrived(cargo, *believed)
+        cargo = cargos.departed(cargo, pressure * np.nan if belied else pressure, nothing)
         return dev.boarded(belief, model, cargo.prior, cargo.prior_variance), cargo
 
     def load(self, belief: kalman.Belief) -> float | None:

@@ -154,7 +154,7 @@ class TrackerState:
                 ),
                 coverage=_coverage(data),
                 weather=_weather(data),
-                cargo=None if data.get("cargo") is None else Cargo(**_unpack_all(data["cargo"])),
+                cargo=_cargo(data),
             )
         except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise TrackerStateError(f"stored tracker state can't be read: {error!r}") from error
@@ -175,7 +175,14 @@ def _weather(data: Mapping[str, Any]) -> Weather | None:
     shapes = {"mean": (-1, size), "covariance": (-1, size, size)}
     shaped = {name: arrays[name].reshape(shapes[name.removeprefix("kind_")]) for name in
               ("mean", "covariance", "kind_mean", "kind_covariance")}  # fmt: skip
-    return Weather(**arrays | shaped)
+    return Weather(**{"warmth": np.full(1, np.nan)} | arrays | shaped)
+
+
+def _cargo(data: Mapping[str, Any]) -> Cargo | None:
+    if data.get("cargo") is None:
+        return None
+    arrays = _unpack_all(data["cargo"])
+    return Cargo(**{"scatter": np.zeros(len(arrays["constant"]))} | arrays)
 
 
 def _belief(data: Mapping[str, Any]) -> Belief:

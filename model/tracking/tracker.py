@@ -23,7 +23,7 @@ from sprung.model.tracking.alarms import WINDOWS, Attribution, LoadLimit, counte
 from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds, proper
 from sprung.model.tracking.reports import ParameterLike, ParameterReport, health_of, reported
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
-from sprung.model.tracking.state import Alarm, Health, TrackerState, TrackerStateError
+from sprung.model.tracking.state import Alarm, Health, Stuck, TrackerState, TrackerStateError
 from sprung.model.tracking.weather import WeatherModel
 
 __all__ = [
@@ -36,6 +36,8 @@ __all__ = [
     "TrackerState",
     "TrackerStateError",
 ]
+
+MOVING = 10.0  # m/s, from which on wheels move on any track: inputs that are still are not measured
 
 
 class Tracker:
@@ -116,13 +118,11 @@ class Tracker:
         state = self.whole(state)
         if state.time is not None and time_ns <= state.time:
             return state
-        seen = coverage.update(state.coverage, usable=True)
-        if not estimate.informative:
-            return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         centre = time_ns + nanoseconds(self.settings.window / 2)
-        if conditions is not None and conditions.curving and not estimate.adequate:
-            return replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
-        stuck = counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)
+        curving = conditions is not None and conditions.curving and not estimate.adequate
+        if curving or not estimate.informative:
+            return self._passed_over(state, estimate, time_ns, centre, conditions)
+        stuck = _stuck(state, estimate, centre)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
         new, jump = replace(state, rejected=state.rejected + 1), None
@@ -142,9 +142,27 @@ class Tracker:
                 time=centre,
             )
             new = replace(new, fit=fit)
+        seen = coverage.update(state.coverage, usable=new.used > state.used)
         new = replace(new, time=time_ns, stuck=stuck, coverage=seen)
         told = jump if jump is not None and self._fusion.armed(state) else None
         return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), told, centre))
+
+    def _passed_over(
+        self, state: TrackerState, estimate: Estimate, time_ns: int, centre: int, conditions: Conditions | None
+    ) -> TrackerState:
+        """State after a window that speaks neither for nor against anything.
+
+        Nobody can watch a vehicle that stands.  One that runs is not watched meanwhile: where inputs are still though
+        it is fast, or frozen, and where a window does not fit in a curve; a yaw rate whose zero is off makes every
+        window one.
+        """
+        runs = estimate.informative or (conditions is not None and conditions.speed > MOVING) or bool(estimate.faults)
+        seen = coverage.update(state.coverage, usable=not runs)
+        new = replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
+        if estimate.informative or not estimate.faults:
+            return new
+        new = replace(new, stuck=_stuck(state, estimate, centre))
+        return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), None, centre))
 
     def whole(self, state: TrackerState) -> TrackerState:
         """One of an older format, or of a pooled prior that is gone, knows nothing of weather, pressures, centres.
@@ -286,3 +304,7 @@ class Tracker:
             if np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
                 found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + self._doubt[1][h, h])))
         return found
+
+
+def _stuck(state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:
+    return counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)

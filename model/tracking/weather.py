@@ -86,6 +86,7 @@ class Weather:
     began: IntArray  # ns, of the first window, and of the last, shape (2,); 0: none
     effect: FloatArray  # of the conditions of the last window on each parameter, shape (P,)
     doubt: FloatArray  # its variance, shape (P,)
+    warmth: FloatArray  # the last temperature that was measured, 10 K; NaN: none, shape (1,)
 
 
 def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection[str] = ()) -> WeatherModel:
@@ -131,7 +132,7 @@ def start(model: WeatherModel) -> Weather:
     return Weather(
         model.mean.copy(), covariances[0], model.kind_mean.copy(), covariances[1], np.zeros(CONDITIONS),
         np.zeros(CONDITIONS), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(G), np.zeros(2, dtype=np.int64),
-        np.zeros(P), np.zeros(P),
+        np.zeros(P), np.zeros(P), np.full(1, math.nan),
     )  # fmt: skip
 
 
@@ -149,11 +150,16 @@ def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather
     return replace(weather, mean=mean, covariance=covariance, **fresh)
 
 
-def features(conditions: Conditions | None, load: float | None) -> FloatArray:
-    """Conditions (K,), NaN where nobody knows; `load`: logarithm of the loaded mass over the empty one."""
+def features(weather: Weather, conditions: Conditions | None, load: float | None) -> FloatArray:
+    """Conditions (K,), NaN where nobody knows; `load`: logarithm of the loaded mass over the empty one.
+
+    A temperature that is measured no more is that of the last window that knew it: weather does not jump when a probe
+    is lost, and what it does from then on is followed as where nobody measures it.
+    """
     temperature = math.nan if conditions is None else conditions.temperature
+    warmth = temperature / KELVIN if math.isfinite(temperature) else float(weather.warmth[0])
     speed = math.nan if conditions is None else conditions.speed
-    return np.array([temperature / KELVIN, math.nan if load is None else load, speed / SPEED])
+    return np.array([warmth, math.nan if load is None else load, speed / SPEED])
 
 
 def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning: bool) -> Weather:
@@ -161,6 +167,7 @@ def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning:
 
     The offset corrects the baseline itself, so that it is part of the effect and of its doubt.
     """
+    weather = replace(weather, warmth=at[:1])
     known = np.isfinite(at)
     if learning or np.any(known & (weather.weight == 0)):
         taken = known & (learning | (weather.weight == 0))

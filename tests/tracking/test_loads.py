@@ -114,6 +114,30 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     assert state.cargo.prior_variance[0] < 0.02**2
 
 
+def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_believed() -> None:
+    rng = np.random.default_rng(6)
+    tracker, at = follow(), 0
+    wrong: list[bool] = []
+    state = tracker.initial_state()
+
+    def pressure(load: float) -> Callable[[int], Conditions]:
+        return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
+
+    for load in (0.0, 0.2, -0.1, 0.1):
+        state = ride(rng, tracker, state, 60, lambda k, load=load: load, at, pressure(load))
+        at += 100
+    for load in (0.25, -0.2, 0.2, -0.25, 0.15):
+        for k in range(at, at + 60):
+            state = ride(rng, tracker, state, 1, lambda k, load=load: load, k, pressure(0.1))
+            value, std = tracker.loads(state)["car"]
+            wrong.append(abs(value - load) > 4 * std)
+        at += 100
+    assert sum(wrong[:60]) <= 5
+    assert sum(wrong[60:]) == 0
+    assert state.alarms == ()
+    assert state.cargo.scatter[0] > 0.05**2
+
+
 def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over() -> None:
     rng = np.random.default_rng(5)
     tracker = follow()
@@ -123,6 +147,7 @@ def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over() -> None:
     )
     assert bent.active == ()
     assert bent.idle == 40
+    assert tracker.health(bent) == "check_function"  # nobody has watched for 40 s
     straight = ride(rng, tracker, state, 40, lambda k: 0.0, 60, adequate=False, chi_square=9.0)
     assert [a.kind for a in straight.active] == ["misfit"]
 

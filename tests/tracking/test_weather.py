@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sprung.model.signals import Conditions, FloatArray, SampleBlock, Window
+from sprung.model.system import parse_system
 from sprung.model.tracking import weather
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
 from sprung.replay.beside import Beside
@@ -24,6 +25,18 @@ class One:
     name: str
     unit: str
     nominal: float
+
+
+FILE = """
+name: with a thermometer
+sample_rate: 100
+window: 100
+temperature: {csv: T, unit: degC}
+bodies: {car: {mass: 1000}}
+inputs: {road: {kind: displacement, displacement: {csv: road}}}
+elements: {spring: {upper: car, lower: road, stiffness: 40000, damping: 2000}}
+sensors: {a: {kind: acceleration, body: car, csv: a}}
+"""
 
 
 def tracker() -> Tracker:
@@ -89,6 +102,19 @@ def test_a_true_change_beside_the_weather_is_found_and_is_the_only_one(measured:
     assert [alarm.parameter for alarm in state.alarms] == [NAMES[row]]
     assert state.alarms[0].change == pytest.approx(-0.15, abs=0.02)
     assert state.alarms[0].onset >= EPOCH + 1490 * MINUTE
+
+
+@pytest.mark.parametrize("lost", [np.nan, -273.15])
+def test_a_temperature_that_is_lost_on_a_cold_day_accuses_no_damper(lost: float) -> None:
+    rng, cold = np.random.default_rng(15), np.zeros(24)
+    cold[DAMPERS] = np.log1p(0.002 * 45.0)
+    system = parse_system(FILE)
+    state = day(
+        rng, tracker().initial_state(), 160, lambda k: cold * min(k / 100, 1),
+        lambda k: system.conditions(np.array([20.0 - 45.0 * min(k / 100, 1) if k < 120 else lost])),
+    )  # fmt: skip
+    assert state.alarms == ()
+    assert state.weather.warmth[0] == pytest.approx(-2.5)
 
 
 def test_oil_that_leaves_all_dampers_at_once_is_one_message() -> None:
