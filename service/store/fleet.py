@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from sqlalchemy import Connection, Select, and_, func, or_, select, update
@@ -260,7 +260,12 @@ def list_alarms(
         opened, identity = after
         same = and_(table.c.opened_ns == opened, table.c.id < identity)
         query = query.where(or_(table.c.opened_ns < opened, same))
-    return [AlarmRow(row[0], row[1] or None, *row[2:-1], tuple(row[-1] or ())) for row in connection.execute(query)]
+    return [_alarm_row(*row) for row in connection.execute(query)]
+
+
+def _alarm_row(kind: str, parameter: str, *rest: Any) -> AlarmRow:
+    *others, alternatives = rest
+    return replace(AlarmRow(kind, parameter or None, *others), alternatives=tuple(alternatives or ()))
 
 
 def count_alarms(connection: Connection, wanted: WantedAlarms) -> int:
