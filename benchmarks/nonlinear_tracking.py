@@ -4,9 +4,9 @@ Recordings come from the generator (Runge-Kutta at 2 kHz, no code shared with th
 bundled one with the law in place: its values off by some per cent as a diagnosis leaves them, widths of friction's
 corner and Bouc-Wen's shape fixed; springs and dampers stay at the bundled values, up to 18 % away from the vehicle's.
 
-For every law: windows that fit with and without it, coverage of the windows' 95 % intervals, what the tracker believes
-at the end in deviations from the truth, windows per CPU second beside those of the linear vehicle, and the alarm after
-the law's strength has changed from one recording to the next.
+For every law: windows that fit with and without it, coverage of the windows' 95 % intervals, what the service's tracker
+believes at the end in deviations from the truth, windows per CPU second beside those of the linear vehicle, and the
+alarm after the law's strength has changed from one recording to the next.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.laws import CATALOGUE
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import MANCHESTER, System, load_system
-from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
+from sprung.model.tracking.tracker import Tracker, TrackerState
+from sprung.service.engine import make_tracker
 
 LAWS = ("coulomb_friction", "bump_stop", "bouc_wen")
 FIXED = ("smoothing", "beta", "n")  # what a window cannot tell
@@ -67,7 +68,7 @@ def _one(
     truth = _truth(case, system)
     used = [e for e in estimates if e.adequate]
     inside = [bool(x) for e in used for x in _inside(e, truth)]
-    tracker = Tracker(system.tracked, TrackerSettings(window=system.window / 100, hop=system.hop / 100))
+    tracker = make_tracker(system)
     state = _follow(tracker, tracker.initial_state(), estimates, 0, system)
     level, std = tracker.posterior(state)
     errors = (level - truth) / std

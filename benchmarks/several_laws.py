@@ -2,7 +2,8 @@
 
 The independent generator conceals laws of the catalogue in the bundled vehicle.  A law counts where its signal-to-noise
 ratio, for a test that knows places and names of all of them and leaves to the others what they imitate, is at least
-twice its limit.  A finding is right where a law of its name is at its place, whatever else is there.
+twice its limit.  A finding is right where a law of its name is at its place, whatever else is there.  Forces that are
+told without a name, or by a formula, are no names: they are counted apart, and so are those where no law acts at all.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from sprung.benchmarks.generator.make import make_with_each_missing
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.benchmarks.structure import LIMIT, VISIBLE, MadeSamples, in_order
 from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.system import MANCHESTER, load_system
 
 WEAK = 0.5  # laws from the middle of their range on
@@ -28,30 +30,36 @@ NAMED = tuple(name for name, law in LAWS.items() if law.named)
 def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[str, Any]]:
     """Yields one line per recording, then precision and recall."""
     vehicle, system = read_vehicle(MANCHESTER), load_system(MANCHESTER)
-    said = right = visible = found = everything = 0
+    said = right = visible = found = everything = unnamed = astray = 0
     for number in range(count):
         case = drawn(vehicle, np.random.default_rng([seed, number]))
         values, ratios = make_with_each_missing(vehicle, case, seconds)
         began = time.process_time()
         report = diagnose(system, MadeSamples(in_order(vehicle, system, values)), Options(file=f"several-{number}"))
         truth = {(place, law): ratio / LIMIT for (place, law, _), ratio in zip(case.effects, ratios, strict=True)}
-        told = [(f.location, f.effect) for f in report.findings]
+        listed = {f.effect: kind_named(f.effect, system.catalogue) is not EffectKind.UNLISTED for f in report.findings}
+        told = [(f.location, f.effect) for f in report.findings if listed[f.effect]]
+        forces = [f.location for f in report.findings if not listed[f.effect]]
+        unnamed, astray = unnamed + len(forces), astray + sum(at not in {place for place, _ in truth} for at in forces)
         due = [one for one, limits in truth.items() if limits >= VISIBLE]
         said, right = said + len(told), right + sum(one in truth for one in told)
         visible, found = visible + len(due), found + sum(one in told for one in due)
-        everything += set(told) == set(truth)
+        everything += set(told) == set(truth) and not forces
         yield {
             "number": number,
             "truth": [[*one, round(limits, 1)] for one, limits in truth.items()],
             "verdict": report.verdict,
             "said": told,
+            "unnamed": forces,
             "false": [one for one in told if one not in truth],
             "missed": [one for one in due if one not in told],
             "cpu_seconds": round(time.process_time() - began, 1),
         }
     yield {
         "recordings": count,
-        "findings": said,
+        "names": said,
+        "unnamed": unnamed,
+        "unnamed_where_nothing_is": astray,
         "precision": round(right / said, 3) if said else None,
         "visible": visible,
         "recall": round(found / visible, 3) if visible else None,

@@ -91,6 +91,7 @@ class Operations:
     def give_model(self, actor: str, vehicle: str, text: str, report: str | None) -> int:
         """Keep a system file as the vehicle's next version and follow it with that from now on; the version.
 
+        One that the vehicle has had before is used again as the version that it was.
         Baselines are learned anew under it; what was estimated before stays under the version before.  Alarms that
         windows do not fit close, since they were said of that one.  Raises NotFound, UserError for a file that is
         not of the same measurements or that windows cannot be identified with.
@@ -101,7 +102,11 @@ class Operations:
             self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
             fleet.hold_vehicle(connection, vehicle)
             model = fleet.ensure_model(connection, engine.digest, engine.system.name, engine.description(), now)
-            version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
+            version = vehicle_models.version_of(connection, vehicle, text)
+            if version is not None and version == vehicle_models.current_version(connection, vehicle):
+                return version
+            if version is None:
+                version = vehicle_models.add_version(connection, vehicle, model, text, report, actor, now)
             engines.remember(vehicle, ServedModel(version, engine, model))
             batch = self._switch(connection, actor, vehicle, version, report, now)
         self._pipeline.tell(batch)

@@ -28,6 +28,7 @@ from sprung.model.system import System
 RUNTIME = Path(__file__).parent / "fmi2.c"
 _STEPS_PER_RADIAN = 20.0  # of the fastest eigenvalue, Runge-Kutta 4: error 1e-7 a period
 _PLATFORMS = {("Linux", "x86_64"): "linux64", ("Linux", "aarch64"): "aarch64-linux", ("Darwin", "arm64"): "darwin64"}
+_LIBRARY = {"Darwin": ".dylib"}  # what FMI calls binaries, elsewhere .so
 
 
 def write_fmu(path: Path, system: System, *, compiler: str | None = "cc") -> None:
@@ -65,7 +66,7 @@ def _compile(compiler: str, sources: Path, folder: Path, name: str) -> None:
     if shutil.which(compiler) is None:
         raise ExchangeError(f"{compiler}: no such C compiler; install one, or export sources only")
     folder.mkdir(parents=True)
-    target = folder / f"{name}.so"
+    target = folder / f"{name}{_LIBRARY.get(platform.system(), '.so')}"
     command = [compiler, "-O2", "-std=c99", "-fPIC", "-shared", "-o", str(target), str(sources / "fmi2.c"), "-lm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:

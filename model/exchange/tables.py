@@ -19,9 +19,10 @@ POINTS = 201
 def write_tables(folder: Path, system: System, deflection: float, rate: float) -> list[Path]:
     """One CSV per element and axis up to `deflection` (m) and `rate` (m/s): motion, force of spring or damper and laws.
 
-    A law with memory has no such curve and is refused before anything is written: `ExchangeError`.
+    A law with memory, or one that changes over time, has no such curve and is refused before anything is written:
+    `ExchangeError`.
     """
-    _refuse_memory(system)
+    _refuse_what_is_no_curve(system)
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for index, element in enumerate(system.elements):
@@ -41,11 +42,12 @@ def write_tables(folder: Path, system: System, deflection: float, rate: float) -
     return written
 
 
-def _refuse_memory(system: System) -> None:
+def _refuse_what_is_no_curve(system: System) -> None:
     for placed in system.laws:
-        if isinstance(placed.law, ElementLaw) and placed.law.memory:
-            name = placed.law.name
-            raise ExchangeError(f"{placed.location}: {name} has memory, so that no curve F(d) or F(v) describes it")
+        law = placed.law
+        if isinstance(law, ElementLaw) and (law.memory or law.over_time):
+            why = "has memory" if law.memory else "changes over time"
+            raise ExchangeError(f"{placed.location}: {law.name} {why}, so that no curve F(d) or F(v) describes it")
 
 
 def _of_laws(laws: list[PlacedLaw], d: FloatArray, v: FloatArray, element: SpringDamper) -> FloatArray:

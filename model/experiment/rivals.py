@@ -26,7 +26,8 @@ def rival(system: System, element: str, effect: str, name: str, inputs: FloatArr
     spring and a damper aside; a fit goes on from them.  Errors: `NoRival`.
     """
     law = next((one for one in system.catalogue if one.name == name), None)
-    if not isinstance(law, ElementLaw) or law.where != "element" or law.memory > 1:
+    alone = element in system.elements  # neither between two, nor at a body, nor of a sensor
+    if not alone or not isinstance(law, ElementLaw) or law.where != "element" or law.memory > 1:
         raise NoRival(f"{name}: cannot be put in the place of {effect} at {element}, so it is left out")
     ride, e = simulate_ride(system, inputs), system.elements.index(element)
     mechanics = system.mechanics

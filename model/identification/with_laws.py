@@ -41,9 +41,10 @@ def acting_laws(system: System) -> list[Acting]:
         if isinstance(law, SensorLaw) or is_linear(placed):
             continue  # undone in the signals; part of the mechanics
         if not isinstance(law, ElementLaw) or law.memory > 1 or law.over_time:
+            followed = ": what changes over time is tracked" if isinstance(law, ElementLaw) and law.over_time else ""
             raise UnusableWindow(
-                f"{placed.location}: windows cannot be identified with {law.name} in place; "
-                "diagnose, simulate and compare can use it"
+                f"{placed.location}: windows cannot be identified with {law.name} in place, which diagnose, simulate "
+                f"and compare can use; take it out of the file{followed}"
             )
         at = [system.elements.index(name) for name in placed.places]
         for group in [at] if law.where == "pair" else [[e] for e in at]:

@@ -20,7 +20,8 @@ from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.diagnosing import load_excerpt
-from sprung.service.improved import write_improved
+from sprung.service.errors import UserError
+from sprung.service.improved import left_out, write_improved
 from sprung.service.loading import RecordRequest
 from sprung.service.own_laws import write_laws
 
@@ -39,6 +40,7 @@ class Asked:
 
 def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, json_lines: bool) -> int:
     """Diagnose one recording; 1 for any verdict but `consistent`, or when it could not be decided."""
+    _check_targets(asked)
     catalogue = CATALOGUE
     if asked.laws is not None:
         catalogue += load_laws(asked.laws, tuple(law.name for law in CATALOGUE))
@@ -63,7 +65,9 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
     if asked.write_system is not None:
         source = (system_file or MANCHESTER).read_text(encoding="utf-8")
         write_improved(asked.write_system, source, system, report)
-        print(f"sprung: {asked.write_system}: the system with what was found", file=sys.stderr)
+        missing = left_out(report)
+        more = f"; not in it: {', '.join(missing)}" if missing else ""
+        print(f"sprung: {asked.write_system}: the system with what was found{more}", file=sys.stderr)
     if asked.write_laws is not None:
         count = write_laws(asked.write_laws, report)
         told = f"{count} of them, for --laws; give them names" if count else "no formula was found; nothing is written"
@@ -73,6 +77,16 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
     else:
         print(text(report))
     return 0 if report.verdict == "consistent" and not report.advice else 1
+
+
+def _check_targets(asked: Asked) -> None:
+    """Files that cannot be written are told before the work, not after it."""
+    for path in (asked.write_system, asked.write_laws):
+        if path is not None and (path.is_dir() or not path.parent.is_dir()):
+            what = "is a folder; a file is to be written" if path.is_dir() else f"there is no folder {path.parent}"
+            raise UserError(f"{path}: {what}")
+    if asked.out is not None and asked.out.exists() and not asked.out.is_dir():
+        raise UserError(f"{asked.out}: is a file; the page and the pictures need a folder")
 
 
 def load(file: Path, system: System, dbc: Path | None, start: int | None = None) -> Record:

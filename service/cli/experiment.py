@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sprung.model.experiment.choose import RankedRun, rank_runs
-from sprung.model.experiment.drives import loaded, run_inputs
+from sprung.model.experiment.drives import run_inputs
 from sprung.model.experiment.evidence import KNOWN
 from sprung.model.experiment.menu import BUNDLED, Menu, check_menu, read_menu
 from sprung.model.experiment.rivals import NoRival, rival
@@ -72,8 +72,7 @@ def _from_report(path: Path, system_file: Path, menu: Menu) -> dict[str, System]
         )
     system = load_system(system_file)
     check_menu(menu, system)
-    chosen = next(iter(menu.runs.values()))
-    inputs = run_inputs(system, chosen)
+    inputs = run_inputs(system, next(iter(menu.runs.values())))
     systems = {"as found": system}
     for finding in findings:
         element, effect = finding["location"], finding["effect"]
@@ -81,7 +80,7 @@ def _from_report(path: Path, system_file: Path, menu: Menu) -> dict[str, System]
             continue
         for name in _nearest(finding):
             try:
-                systems[f"{element}: {name}"] = rival(loaded(system, chosen), element, effect, name, inputs)
+                systems[f"{element}: {name}"] = rival(system, element, effect, name, inputs)
             except NoRival as told:
                 print(told, file=sys.stderr)
     if len(systems) < 2:

@@ -81,6 +81,13 @@ def text_of(connection: Connection, vehicle: str, version: int) -> str | None:
     return connection.execute(query).scalar_one_or_none()
 
 
+def version_of(connection: Connection, vehicle: str, text: str) -> int | None:
+    """The newest version of this very system file; None: the vehicle never had it."""
+    table = vehicle_models
+    known = select(func.max(table.c.version)).where(table.c.vehicle_id == vehicle, table.c.text == text)
+    return connection.execute(known).scalar()
+
+
 def add_version(
     connection: Connection, vehicle: str, model_id: int, text: str, report_id: str | None, author: str, now: int
 ) -> int:

@@ -221,6 +221,8 @@ def test_tables_hold_the_forces_of_spring_damper_and_laws(tmp_path: Path) -> Non
     np.testing.assert_allclose(force, 1500 * v + 40 * np.tanh(v / 0.05), rtol=1e-7, atol=1e-6)
     with pytest.raises(ExchangeError, match="memory"):
         write_tables(tmp_path / "none", system(LAWS["hysteresis"]), 0.02, 0.5)
+    with pytest.raises(ExchangeError, match="changes over time"):
+        write_tables(tmp_path / "none", system(", laws: [{time_varying_stiffness: {p: 0.2, tau: 30}}]"), 0.02, 0.5)
     assert not (tmp_path / "none").exists()
 
 

@@ -104,6 +104,8 @@ def test_a_rival_takes_the_place_of_a_law_with_values_that_come_near() -> None:
     assert law.law.name == "damper_blowoff" and law.values[0] > 0
     with pytest.raises(NoRival, match="bending"):
         rival(friction, "strut", "coulomb_friction", "bending_mode", inputs)
+    with pytest.raises(NoRival, match="body_a"):
+        rival(friction, "body_a", "sensor_lag", "series_stiffness", inputs)  # what a sensor shows is no element's force
 
 
 def test_the_command_ranks_the_runs_of_a_menu(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -21,7 +21,7 @@ from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import parse_system
 from sprung.replay.writing import write_recording
 from sprung.service.cli import main
-from sprung.service.improved import improved_text
+from sprung.service.improved import improved_text, left_out
 
 TEXT = """# my vehicle
 name: quarter-car
@@ -76,6 +76,35 @@ def test_values_laws_and_noise_are_written_and_comments_stay() -> None:
     assert again.file.elements["tyre"].damping.fixed
     # written again, laws are replaced and not doubled
     assert len(parse_system(improved_text(text, again, report((friction,)))).laws) == 2  # the bias stays: it was undone
+
+
+def test_what_the_file_holds_fixed_stays_fixed() -> None:
+    held = LAW.replace("force: 60", "force: {value: 60, fixed: true}")
+    given = TEXT.replace("damping: 1800}", f"damping: 1800, laws: [{held}]}}")
+    friction = IdentifiedLaw(
+        "strut", "coulomb_friction",
+        (LawParameter("force", 60.0, 0.06, "N"), LawParameter("smoothing", 0.01, 1e-5, "m/s")),
+    )  # fmt: skip
+    (law,) = parse_system(improved_text(given, parse_system(given), report((friction,)))).laws
+    assert law.fixed == (True, True)
+
+
+def test_what_no_file_can_hold_is_told() -> None:
+    friction = IdentifiedLaw("strut", "coulomb_friction", (LawParameter("force", 41.0, 0.5, "N"),))
+    named = Finding("strut", "coulomb_friction", (), 1e-9, -50.0)
+    late = Finding("wheel_a|car_a", "node_delay", (), None, None)
+    noisy = Finding("wheel_a", "sensor_noise", (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
+    assert left_out(report((friction,), (named, late, noisy))) == ["node delay at wheel_a and car_a"]
+
+
+def test_files_that_cannot_be_written_are_told_before_the_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "page").write_text("a file")
+    for target in (["--write-system", str(tmp_path / "none" / "a.yaml")], ["--out", str(tmp_path / "page")]):
+        assert main(["diagnose", str(tmp_path / "ride.csv"), *target]) == 2  # that recording is not even looked at
+        told = capsys.readouterr().err
+        assert target[1] in told and "ride.csv" not in told
 
 
 def test_every_fault_of_a_measurement_stays_as_it_was_undone_before() -> None:

@@ -169,7 +169,9 @@ def test_what_a_diagnosis_found_is_used_and_taken_back(
     assert client.post("/vehicles/a/model", json={"version": 0}).json()["in_use"] == 0
     back = client.get("/vehicles/a").json()
     assert back["model_version"] == 0 and "strut.coulomb_friction.force" not in {p["name"] for p in back["parameters"]}
-    assert client.post("/vehicles/a/model", json={"version": 1}).json()["in_use"] == 1
+    again = client.post("/vehicles/a/model", json={"report": report}).json()  # by the page's button: no second version
+    assert again["in_use"] == 1 and len(again["versions"]) == 2
+    assert len(client.post("/vehicles/a/model", json={"system": FOUND}).json()["uses"]) == len(again["uses"]) == 3
     kept = client.get("/vehicles/a").json()["parameters"]
     assert kept == vehicle["parameters"]  # its tracker went on where it had been
 

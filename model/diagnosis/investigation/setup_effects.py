@@ -11,7 +11,9 @@ from dataclasses import dataclass
 from sprung.model.diagnosis.investigation import setup_changes as changes
 from sprung.model.diagnosis.investigation.setup_response import NOTHING, Group, ModelResponse
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores, Weighed
+from sprung.model.laws import StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_GAIN, SENSOR_LAG
+from sprung.model.laws.structure import WRONG_POSITION
 from sprung.model.system import System
 
 NEAR = 0.02  # m, of differences
@@ -48,6 +50,7 @@ class SetupEffect:
     ordinary: bool = False  # a fault of one sensor that screening seeks: it only has to be beaten
     undo: Callable[[SetupPlace, float], changes.Undo] | None = None  # of a value
     left: Callable[[SetupPlace, Weighing], tuple[Weighed, float]] | None = None  # of its value, in units of the second
+    law: StructureLaw | None = None  # that says the same in a system file: its variant is the axis
 
     def undone(self, site: SetupPlace, value: float) -> changes.Undo:
         """The change that undoes a value of it."""
@@ -106,7 +109,9 @@ def _scaled(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
     return fitted.scores.of(one.scaled(site.group, 1 + _SMALL) - one.shown), _SMALL
 
 
-def _moved(move: Callable[[System, str, int, float], System], name: str) -> SetupEffect:
+def _moved(
+    move: Callable[[System, str, int, float], System], name: str, law: StructureLaw | None = None
+) -> SetupEffect:
     """A position: of sensors or elements, each moved in its own way."""
 
     def undo(site: SetupPlace, offset: float) -> changes.Undo:
@@ -116,7 +121,7 @@ def _moved(move: Callable[[System, str, int, float], System], name: str) -> Setu
         return fitted.scores.of_system(move(fitted.system, site.location, site.axis, NEAR)), NEAR
 
     words = "{place}: sits {value} along {axis} from where the system file says"
-    return SetupEffect(name, words, ("offset", "m"), undo=undo, left=left)
+    return SetupEffect(name, words, ("offset", "m"), undo=undo, left=left, law=law)
 
 
 SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
@@ -137,7 +142,7 @@ WRONG_SCALE = SetupEffect(
     left=_scaled,
 )
 SENSOR_POSITION = _moved(changes.moved_sensor, "wrong_position")
-ELEMENT_POSITION = _moved(changes.moved_element, "wrong_position")
+ELEMENT_POSITION = _moved(changes.moved_element, WRONG_POSITION.name, WRONG_POSITION)
 WRONG_BODY = SetupEffect("wrong_body", "{place}: is not fixed to what the system file says; its {detail} fits")
 ONE_GAIN = SetupEffect(SENSOR_GAIN.name, relative=True, ordinary=True, undo=_rescaled, left=_scaled)
 ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced, left=_late)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+
 import numpy as np
 
 from sprung.model.diagnosis.investigation.course import Investigation, Outcome, Recorded
+from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
@@ -66,7 +69,10 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
 
 
 def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
-    """Every law of the final model that has a name and values: those of the file, then those that were found."""
+    """Every law of the final model that has a name and values: those of the file, then those that were found.
+
+    Among them are places of elements that were put right before anything was fitted.
+    """
     fit, course = outcome.final, outcome.investigation
     count = course.given + (len(course.found) if outcome.judgement.carried else 0)
     found = []
@@ -78,7 +84,16 @@ def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
         parameter = LawParameter(spec.name, value, fault.std, spec.unit)
         found.append(IdentifiedLaw(fault.term.location, fault.term.law.name, (parameter,)))
-    return tuple(found)
+    return (*found, *places_put_right(course.setup_faults))
+
+
+def places_put_right(faults: Iterable[SetupFault]) -> Iterator[IdentifiedLaw]:
+    """Elements at other places than stated, as laws: the system file can take them over."""
+    for fault in faults:
+        law, at = fault.effect.law, fault.site
+        if law is not None and fault.value is not None:
+            offset = LawParameter(law.names[0], fault.value, fault.std, law.parameters[0].unit)
+            yield IdentifiedLaw(at.location, law.name, (offset,), law.variants[at.axis])
 
 
 def _noise(course: Investigation) -> dict[str, float]:

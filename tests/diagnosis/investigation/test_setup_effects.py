@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.setup_changes import attached
 from sprung.model.diagnosis.investigation.setup_effects import (
     ELEMENT_POSITION,
@@ -25,10 +26,11 @@ from sprung.model.diagnosis.investigation.setup_structure import structure_hypot
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
+from sprung.model.diagnosis.report.compose import places_put_right
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.damping import COULOMB_FRICTION
-from sprung.model.system import load_system, parse_system
+from sprung.model.system import System, load_system, parse_system
 from tests.diagnosis_cases import SYSTEM as QUARTER_CAR
 from tests.diagnosis_cases import quarter_car, simulate
 
@@ -68,6 +70,14 @@ def test_a_delay_is_taken_back_and_positions_move_in_the_file() -> None:
         assert same is signals and effect.name == "wrong_position"
         before, after = (getattr(one.file, kind)[name].position for one in (train, moved))
         assert after[1] - before[1] == pytest.approx(0.25) and after[0] == before[0]
+    # the same as a law, which a system file can take over
+    fault = SetupFault(ELEMENT_POSITION, SetupPlace(element, axis=1), 0.25, 0.01, 1.0, 0.1)
+    (found,) = places_put_right([fault, replace(fault, effect=SENSOR_POSITION)])
+    assert (found.location, found.effect, found.parameters[0].value) == (element, "wrong_position", 0.25)
+    law = {"wrong_position": {"offset": 0.25, "variant": found.variant}}
+    stated = train.file.elements | {element: train.file.elements[element].model_copy(update={"laws": (law,)})}
+    whole = System(train.file.model_copy(update={"elements": stated})).whole_system
+    np.testing.assert_allclose(whole.mechanics.H, moved.mechanics.H, atol=1e-12)
 
 
 def test_a_changed_system_knows_the_laws_of_a_user_still() -> None:
