@@ -6,7 +6,7 @@ A new kind is a new value here and an iterator of hypotheses beside the others.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from sprung.model.diagnosis.investigation import setup_changes as changes
 from sprung.model.diagnosis.investigation.setup_response import NOTHING, Group, ModelResponse
@@ -50,7 +50,7 @@ class SetupEffect:
     ordinary: bool = False  # a fault of one sensor that screening seeks: it only has to be beaten
     undo: Callable[[SetupPlace, float], changes.Undo] | None = None  # of a value
     left: Callable[[SetupPlace, Weighing], tuple[Weighed, float]] | None = None  # of its value, in units of the second
-    law: StructureLaw | None = None  # that says the same in a system file: its variant is the axis
+    law: StructureLaw | None = field(default=None, compare=False)  # the same in a system file, its variant the axis
 
     def undone(self, site: SetupPlace, value: float) -> changes.Undo:
         """The change that undoes a value of it."""

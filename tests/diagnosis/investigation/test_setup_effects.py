@@ -70,6 +70,7 @@ def test_a_delay_is_taken_back_and_positions_move_in_the_file() -> None:
         assert same is signals and effect.name == "wrong_position"
         before, after = (getattr(one.file, kind)[name].position for one in (train, moved))
         assert after[1] - before[1] == pytest.approx(0.25) and after[0] == before[0]
+    assert len({*SETUP_EFFECTS}) == len(SETUP_EFFECTS)  # hypotheses are sorted by them
     # the same as a law, which a system file can take over
     fault = SetupFault(ELEMENT_POSITION, SetupPlace(element, axis=1), 0.25, 0.01, 1.0, 0.1)
     (found,) = places_put_right([fault, replace(fault, effect=SENSOR_POSITION)])
