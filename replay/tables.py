@@ -90,10 +90,13 @@ def find_columns(
 ) -> list[tuple[int, int]]:
     """(channel, column) of every channel that the table has.
 
+    Where the system file names no columns at all, they are called as its channels are.
     Errors: UnreadableRecording when it has none, or when a name is nearly that of a column that nothing else uses.
     """
     wanted = [(i, (c.csv or c.column) if csv else (c.column or c.csv)) for i, c in enumerate(channels)]
     named = [(place, name) for place, name in wanted if name]
+    if not named:  # tables that `sprung simulate` wrote are headed by the channels' own names
+        named = [(place, channel.name) for place, channel in enumerate(channels) if channel.name in names]
     if not named:
         key = "`csv: name`" if csv else "`column: name`"
         raise UnreadableRecording(f"{path}: the system file names no columns; give its channels {key} to read tables")

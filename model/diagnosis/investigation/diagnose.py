@@ -228,7 +228,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     plain = [t for t in worthy if any(t is one for one in believed)]
     trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
-    state = replace(state, notes=(*state.notes, *_disbelieved(worthy, trials, plausible)))
+    disbelieved = _disbelieved(worthy, trials, plausible)
+    state = replace(state, notes=(*state.notes, *(_words_of(one, plausible) for one in disbelieved)))
     if wide is not None and outdoes(state, wide, trials):
         return _next_finding(with_wider(state, wide), number, tell)
     if not trials:
@@ -251,22 +252,21 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         state,
         fit=fit,
         held=replace(state.held, noise=problem.noise),
-        found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value)),
+        found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value, disbelieved)),
         last=screen(problem, fit, options.catalogue, options.project),
         notes=(*state.notes, *note),
     )
 
 
-def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> list[str]:
+def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> tuple[Trial, ...]:
     """What fits better than every plausible candidate, with values that it cannot have."""
-    words = []
     best = max((trial.evidence for trial in believed), default=-np.inf)
-    for trial in worthy:
-        reason = doubt(trial.fit, trial.term, rules)
-        if reason is not None and trial.evidence > best:
-            name = trial.term.law.name.replace("_", " ")
-            words.append(f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}")
-    return words
+    return tuple(t for t in worthy if t.evidence > best and doubt(t.fit, t.term, rules) is not None)
+
+
+def _words_of(trial: Trial, rules: PlausibleRules) -> str:
+    name, reason = trial.term.law.name.replace("_", " "), doubt(trial.fit, trial.term, rules)
+    return f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}"
 
 
 def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[Trial, Fit]:

@@ -1,0 +1,26 @@
+"""When a law is named alone, and when with its look-alikes."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+from sprung.model.diagnosis.investigation.course import Found
+from sprung.model.diagnosis.report.findings import _look_alikes
+from sprung.model.diagnosis.rules import RULES
+from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_BLOWOFF
+
+
+def trial(law: Any, evidence: float, location: str = "strut") -> Any:
+    return SimpleNamespace(evidence=evidence, named=True, term=SimpleNamespace(law=law, location=location))
+
+
+def test_a_name_that_says_clearly_less_than_an_implausible_one_is_not_told_alone() -> None:
+    chosen = trial(COULOMB_FRICTION, 100.0)
+    better, hardly, elsewhere = (
+        trial(DAMPER_BLOWOFF, 120.0), trial(DAMPER_BLOWOFF, 103.0), trial(DAMPER_BLOWOFF, 120.0, "tyre")
+    )  # fmt: skip
+    for other, family in ((better, "coulomb_friction or damper_blowoff"), (hardly, None), (elsewhere, None)):
+        assert _look_alikes(Found(chosen, (), None, 1e-9, (other,)), RULES.report)[0] == family
+    near = Found(chosen, (trial(DAMPER_BLOWOFF, 97.0),), None, 1e-9)
+    assert _look_alikes(near, RULES.report)[0] == "coulomb_friction or damper_blowoff"
