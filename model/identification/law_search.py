@@ -149,7 +149,8 @@ class LawSearch:
                 going, second, columns.take(going), near.take(going), data.take(going), smooth[:, going.numpy()]
             )
         done = ((second.small(std) & held) | still) & ~worse
-        ripe = ((done | last) & self.wanted[rows]).nonzero().squeeze(1)
+        _, astray = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
+        ripe = ((done | last) & (astray == 0) & self.wanted[rows]).nonzero().squeeze(1)
         if len(ripe):
             weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)
             self._weigh(rows[ripe], columns.take(ripe), *weighed)

@@ -103,3 +103,13 @@ def test_a_window_whose_sensors_show_nonsense_is_no_end_of_the_batch() -> None:
     _, nonsense, last = load_identifier(system).identify(spoiled)
     assert not nonsense.adequate and last.adequate
     assert np.all(np.abs(last.log_ratio) < 2 * np.sqrt(np.diag(last.covariance)))
+
+
+def test_a_law_that_pushes_windows_away_is_no_end_of_the_batch() -> None:
+    """Gains and delays are weighed of windows whose motion has not run away."""
+    _, values = ride(CUBIC, 4.0)
+    windows = windows_of(values)[:3]
+    pushing = parse_system(VEHICLE.replace("LAWS", "[{formula: {formula: 'a * d * abs(v)', a: 3.0e+8}}]"))
+    found = load_identifier(pushing).examine(windows, np.ones(3, dtype=bool))
+    assert not any(estimate.adequate for estimate in found)
+    assert all(np.isfinite(estimate.covariance).all() for estimate in found)
