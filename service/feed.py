@@ -18,7 +18,7 @@ from sprung.service.compute import Priority
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch, Identified
 from sprung.service.reading import Apart, Ending, Here, Reading, ReadRequest, prefetched
-from sprung.service.times import NANOSECONDS, to_iso
+from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
 from sprung.service.worker import ProcessLimits
 
 MOST_MINUTES = 1440  # of comfort that a summary keeps
@@ -159,6 +159,9 @@ def _ended(fed: Fed, ending: Ending) -> None:
     fed.tally, fed.problems, fed.incomplete = ending.tally, ending.problems, ending.incomplete
     fed.expected, fed.lost = ending.expected, ending.lost
     fed.first_ns, fed.last_ns = ending.first_ns, ending.last_ns
+    if fed.last_ns is not None and fed.last_ns > now_ns() + AHEAD:
+        line = f"the recording ends on {to_iso(fed.last_ns)}, which is in the future by this host's clock"
+        fed.problems = [*fed.problems, line]
 
 
 def ride_dict(ride: comfort.RideQuality) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from sprung.service.processed import Batch
 from sprung.service.recordings import file_row, finish_row
 from sprung.service.settings import settings_with
 from sprung.service.store import Store, open_store, work
-from sprung.service.times import AHEAD, now_ns, to_iso
+from sprung.service.times import to_iso
 from sprung.service.views import VehicleView, alarm_dict, load_parameters, told, vehicle_view, window_dict
 from sprung.service.worker import ProcessLimits
 
@@ -208,8 +208,6 @@ def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
     lines = [f"{recorded:.1f} s recorded in {fed.wall_seconds:.1f} s ({pace:.0f} x real time); windows: {counts}"]
     if fed.adequate < fed.windows["used"] + fed.windows["repaired"]:
         lines.append(f"{fed.adequate} of {fed.windows['used'] + fed.windows['repaired']} windows fit the model")
-    if fed.last_ns is not None and fed.last_ns > now_ns() + AHEAD:
-        lines.append(f"the recording ends on {to_iso(fed.last_ns)}, which is in the future by this host's clock")
     if fed.stored_before:
         lines.append(f"{fed.stored_before} windows were in the store already")
     for alarm in view.active:

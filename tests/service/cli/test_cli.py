@@ -106,6 +106,16 @@ def test_replay_prints_a_line_per_window_and_a_summary(
     assert summary["wall_seconds"] > 0
 
 
+def test_a_recording_of_the_future_is_told_to_machines_and_people(
+    healthy: Path, csv_system: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sprung.service.feed.now_ns", lambda: START - 86_400 * 10**9)
+    assert main(["replay", str(healthy), "--system", str(csv_system), "--json"]) == 0
+    captured = capsys.readouterr()
+    (problem,) = lines(captured.out)[-1]["summary"]["problems"]
+    assert "in the future" in problem and problem in captured.err
+
+
 def test_replay_shows_a_table_for_people(healthy: Path, csv_system: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(healthy), "--system", str(csv_system)]) == 0
     out = capsys.readouterr().out
