@@ -25,6 +25,8 @@ from sprung.model.signals import FloatArray
 
 _ERRORS = 1.0, 0.1  # of the laws' forces, round by round, in their rms along the linear motion
 _RIDGE = 1e-9  # relative, on the responses
+_STRETCHES = 5  # of a window, each without the columns of forces after it: half of the work
+_SPREAD = 12  # samples before a force that a spline moves, by 0.27 from one to the next
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,18 +57,38 @@ def opened(w: LawWindows, start: WindowPoint, data: WindowBatch) -> WindowPoint:
         along = w.along(states, data, smooth, point, steps)
         law = w.forces_along(along, point, steps)
         size = law.square().mean(dim=(0, 1)).sqrt().clamp_min(1e-9) if size is None else size
-        by_d, by_v = w.slopes_along(along, point, steps)
-        bend = -(by_d.unsqueeze(3) * by.deflection + by_v.unsqueeze(3) * by.rate).flatten(1, 2)
-        bend[:, :, N:] += torch.eye(T * L, dtype=torch.float64)
-        weight = (error * size).repeat(T)[:, None] ** -1
-        bend, off = bend * weight, (point.force - law).view(B, T * L, 1) * weight
-        gradient = by.shown @ w.residual(Moved(states, outputs), data, whiten) - bend.mT @ off
-        factor, failed = torch.linalg.cholesky_ex(products + bend.mT @ bend)
+        squares, pull = _errors(w.slopes_along(along, point, steps), by, point.force - law, (error * size) ** -1)
+        gradient = by.shown @ w.residual(Moved(states, outputs), data, whiten) - pull
+        factor, failed = torch.linalg.cholesky_ex(products + squares)
         step = torch.cholesky_solve(gradient, factor).squeeze(2)
         sound = (failed == 0) & step.isfinite().all(dim=1)  # sensors that show nonsense: such a window stays
         step = step.where(sound[:, None], 0.0)
         point = replace(point, x0=point.x0 + step[:, :N], force=point.force + step[:, N:].view(B, T, L))
     return point
+
+
+def _errors(slopes: tuple[Tensor, Tensor], by: _Responses, off: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Squares (B, X, X) of the laws' errors, weighed, by the unknowns, and their products with `off`, (B, X, 1).
+
+    slopes: of the laws by deflection and rate, off: forces less the laws' (B, T, L); weight: of the errors, (L,).  A
+    force moves nothing before it, but for what the spline through the samples spreads: the first samples depend on few
+    unknowns.
+    """
+    (B, T, L), X = off.shape, len(by.shown)
+    N = X - T * L
+    squares, pull = off.new_zeros(B, X, X), off.new_zeros(B, X, 1)
+    for times in torch.arange(T).tensor_split(_STRETCHES):
+        first, last = int(times[0]), int(times[-1]) + 1
+        seen = min(X, N + (last + _SPREAD) * L)
+        by_d, by_v = (slope[:, first:last].unsqueeze(3) for slope in slopes)
+        bend = by_d * by.deflection[first:last, :, :seen]
+        bend = bend.addcmul_(by_v, by.rate[first:last, :, :seen]).neg_().flatten(1, 2)
+        own = torch.arange((last - first) * L)
+        bend[:, own, N + first * L + own] += 1.0
+        bend *= weight.repeat(last - first)[:, None]
+        squares[:, :seen, :seen] += bend.mT @ bend
+        pull[:, :seen] += bend.mT @ (off[:, first:last] * weight).flatten(1, 2).unsqueeze(2)
+    return squares, pull
 
 
 def _middle(w: LawWindows, start: WindowPoint, data: WindowBatch) -> tuple[Steps, Tensor]:
