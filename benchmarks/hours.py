@@ -24,6 +24,7 @@ from sprung.service.settings import settings_with
 
 HOUR = 3600.0
 RUNNING = 5.0  # m/s
+EXCITED = 10.0  # m/s, from which on the track moves more than noise does in most windows
 SETTLED = 60.0  # s of the day after which values are held against the truth
 SILENT = 3.0  # stated deviations
 
@@ -48,12 +49,16 @@ def _hour(number: int, seed: int) -> dict[str, Any]:
     begin = time.process_time()
     engine, vehicle = _product()
     timetable = draw_timetable(vehicle, Service(), HOUR, 10_000 * seed + number, start=6 * HOUR)
-    ran, unused, scores, loads, state = 0, 0, [], [], None
+    ran, fast, scores, loads, state = 0, 0, [], [], None
+    unused = {RUNNING: 0, EXCITED: 0}  # windows at these speeds or more
     for moment in through(engine, vehicle, timetable):
         state = moment.state
-        if timetable.at(timetable.speed, moment.time) < RUNNING:
+        speed = timetable.at(timetable.speed, moment.time)
+        if speed < RUNNING:
             continue
-        ran, unused = ran + 1, unused + (not moment.used or state.misfit_since is not None)
+        ran, fast = ran + 1, fast + (speed >= EXCITED)
+        for least in unused:
+            unused[least] += speed >= least and (not moment.used or state.misfit_since is not None)
         if moment.time > SETTLED and ran % 60 == 0:
             mean, std = engine.tracker.posterior(state)
             scores.append((mean - timetable.log_ratio(vehicle, moment.time)) / std)
@@ -64,7 +69,8 @@ def _hour(number: int, seed: int) -> dict[str, Any]:
     assert state is not None
     alarms = [f"{a.kind} {a.parameter}" for a in state.alarms]
     return {
-        "name": "full_hour", "vehicle": number, "windows_running": ran, "unmonitored_%": 100 * unused / ran,
+        "name": "full_hour", "vehicle": number, "windows_running": ran,
+        "unmonitored_%": 100 * unused[RUNNING] / ran, "unmonitored_from_10_m/s_%": 100 * unused[EXCITED] / max(fast, 1),
         "false_alarms": [a for a in alarms if not a.startswith("sensor")],
         "sensor_alarms": [a for a in alarms if a.startswith("sensor")],
         "rms_error_over_std": float(np.sqrt(np.mean(score**2))),

@@ -155,8 +155,10 @@ class Fusion:
         settings, mask, value = self.settings, window.mask, window.value
         variance = np.where(mask, window.covariance.diagonal(), 1.0)
         open_ = self._open(calibration, belief, window.cross)
+        # What is not known of gains and delays moves windows unlike each other: that is no contradiction.
+        told = variance + self._carried(belief, window.cross, ~self.model.own)
         measured = inflation.update(
-            state.inflation, value, variance + open_, mask, time=window.time_ns, window=nanoseconds(settings.window)
+            state.inflation, value, told, mask, time=window.time_ns, window=nanoseconds(settings.window)
         )
         wide = np.sqrt(measured.factor)
         covariance = window.covariance * np.outer(wide, wide)
@@ -301,11 +303,14 @@ class Fusion:
 
     def _open(self, calibration: dev.DeviationRecord, belief: kalman.Belief, cross: FloatArray) -> FloatArray:
         """Variance (P,) that deviations bring in which were otherwise in the windows of the baseline."""
+        return self._carried(belief, cross, (calibration.moved > 0) | self.model.cargo)
+
+    def _carried(self, belief: kalman.Belief, cross: FloatArray, chosen: BoolArray) -> FloatArray:
+        """Variance (P,) of a window's values by what is not known of some deviations (H,)."""
         H = self.model.size
-        other = (calibration.moved > 0) | self.model.cargo
-        if H == 0 or not other.any():
+        if H == 0 or not chosen.any():
             return np.zeros(len(cross))
-        at = np.flatnonzero(other)
+        at = np.flatnonzero(chosen)
         own = belief.covariance[-H:, -H:][at][:, at]
         return np.asarray(((cross[:, at] @ own) * cross[:, at]).sum(axis=1))
 

@@ -5,7 +5,7 @@ import numpy as np
 from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import Deviating, FloatArray
 from sprung.model.tracking import filter as kalman
-from sprung.model.tracking.tracker import Tracker
+from sprung.model.tracking.tracker import Tracker, TrackerSettings
 from tests.tracker_windows import EPOCH, TrackedParameter, estimate
 
 SECOND = 1_000_000_000
@@ -93,3 +93,24 @@ def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated() -> None:
     gain = np.stack([corrected(unit).mean for unit in np.eye(2)], axis=1)  # linear in the value
     errors = values @ gain.T - truth
     np.testing.assert_allclose(np.cov(errors.T), after.covariance, atol=0.04 * np.abs(covariance).max())
+
+
+def test_what_clocks_move_is_no_contradiction_between_windows() -> None:
+    """Clocks wander between rides by more than one ride tells of them, and move each ride's value by another amount."""
+    rng = np.random.default_rng(5)
+    clocks = [Deviation(f"c{i}", "delay", 0.002, i, i) for i in range(2)]
+    tracker = Tracker(
+        [TrackedParameter("element.stiffness")], TrackerSettings(window=60.0, hop=60.0, learning=600.0), clocks
+    )
+    state, late, std, seen = tracker.initial_state(), np.array([0.003, -0.003]), 0.002, 6e-5
+    for k in range(300):
+        late = late + 2e-5 * np.sqrt(300.0) * rng.normal(size=2)
+        cross = 60.0 * np.array([[1.0, -1.0]]) * rng.uniform(0.8, 1.2, 2)
+        value = std * rng.normal(size=1) - cross @ late
+        information = np.eye(2) / seen**2
+        score = information @ late + rng.normal(size=2) / seen
+        found = Deviating(np.zeros(2), np.array([[std**2]]), cross, information, score, 300.0, True)
+        told = estimate(value, np.array([[std**2]]), deviating=found)
+        state = tracker.update(state, told, EPOCH + 300 * k * SECOND)
+    assert state.inflation.factor[0] < 1.6
+    assert not [alarm for alarm in state.alarms if alarm.kind != "sensor"]
