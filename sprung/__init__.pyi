@@ -14,3 +14,4 @@ from .api import write_report as write_report
 from .client import Client as Client
 
 __version__: str
+__all__: list[str]

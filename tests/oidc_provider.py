@@ -99,5 +99,5 @@ def provider_settings(provider: FakeProvider, folder: Path, **more: Any) -> Sett
         min_free_bytes=0,
         oidc_issuer=provider.issuer,
         oidc_client_id="sprung",
-        **secret | more,  # type: ignore[arg-type]
+        **secret | more,
     )

@@ -27,7 +27,8 @@ CHANNELS = [
     Channel("right", "m/s^2", 0.01, mcap="/body/acceleration.axes[1].right", can="Body.Right", csv="right"),
 ]
 NUMBERS = np.arange(ROWS)
-LEFT, RIGHT = np.round(np.sin(NUMBERS / 7.0), 3), np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
+LEFT: FloatArray = np.round(np.sin(NUMBERS.astype(float) / 7.0), 3)
+RIGHT: FloatArray = np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
 VALUES = np.stack([LEFT, RIGHT], axis=1)
 TIMES = START + NUMBERS * STEP
 Samples = dict[int, tuple[IntArray, FloatArray]]  # of each channel: times, ns, and values
@@ -121,7 +122,7 @@ def write_ros2(path: Path, stamped: bool = True) -> None:
 
 def database() -> Database:
     conversion = BaseConversion.factory(scale=0.001, offset=0)
-    wide = {"is_signed": True, "conversion": conversion, "minimum": -30, "maximum": 30}
+    wide: dict[str, Any] = {"is_signed": True, "conversion": conversion, "minimum": -30, "maximum": 30}
     signals = [Signal("Left", 0, 16, **wide), Signal("Right", 23, 16, byte_order="big_endian", **wide)]
     return Database([Message(0x310, "Body", 8, signals)])
 
@@ -143,7 +144,7 @@ def write_can(path: Path) -> None:
             logger.on_message_received(frame(row, channel=0))
             if row % 10 == 0:
                 stamp = int(TIMES[row]) / 1e9
-                extra = {"timestamp": stamp, "channel": 0}
+                extra: dict[str, Any] = {"timestamp": stamp, "channel": 0}
                 logger.on_message_received(can.Message(arbitration_id=0x311, is_extended_id=False, data=b"1", **extra))
                 logger.on_message_received(can.Message(arbitration_id=0x310, data=b"12345678", **extra))
                 remote = can.Message(arbitration_id=0x310, is_extended_id=False, is_remote_frame=True, dlc=8, **extra)

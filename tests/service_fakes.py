@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sprung.model.identifier import StageTimes
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.system import System
 from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
@@ -22,20 +24,12 @@ STANDING = 9.0  # the level of windows that tell nothing
 
 
 @dataclass
-class Times:
-    """Stage times as the identifier has them."""
-
-    estimate: float = 0.001
-    refine: float = 0.002
-
-
-@dataclass
 class FakeIdentifier:
     """Reads log-ratios off the window: parameter i is the mean of channel i.  Refuses what the real one refuses."""
 
     system: System
     digest: str = "fake-1"
-    times: Times = field(default_factory=Times)
+    times: StageTimes = field(default_factory=lambda: StageTimes(0.001, 0.002))
     identified: int = 0
     std: float = 0.01
     chi_square: float = 1.0
@@ -107,3 +101,9 @@ def eventually(check: Callable[[], Any], seconds: float = 30.0) -> Any:
         time.sleep(wait)
         wait = min(1.5 * wait, 0.2)  # asking takes the time of what is waited for
     return found
+
+
+def hold(started: threading.Event, release: threading.Event) -> None:
+    """Keep the thread that runs it busy until `release`."""
+    started.set()
+    release.wait()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -84,7 +86,7 @@ def test_a_gap_begins_a_new_minute_and_too_little_says_nothing(vehicle: System) 
 def test_mean_comfort_needs_five_minutes(vehicle: System) -> None:
     ride = RideQuality(vehicle)
     values = np.random.default_rng(3).normal(size=(6000, len(vehicle.channels)))
-    told = []
+    told: list[dict[str, Any]] = []
     for number in range(6):
         ride.push(number * 60_000_000_000, values)
         told.append(ride.summary())

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import sprung
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.benchmarks.sensitivity_cases import RIG, rig
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System
@@ -25,7 +26,6 @@ from sprung.service.engine import Engine
 from sprung.service.feed import feed_file
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
-from tests.diagnosis_cases import SYSTEM
 from tests.served import served
 from tests.service_fakes import make_window
 

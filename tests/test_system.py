@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sprung.model.system import MANCHESTER, SystemFileError, load_system, parse_system
+from sprung.model.schema import SystemFileError
+from sprung.model.system import MANCHESTER, load_system, parse_system
 
 TEXT = MANCHESTER.read_text()
 

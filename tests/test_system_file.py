@@ -82,7 +82,7 @@ def test_recorded_numbers_become_si_by_scale_offset_sign_and_unit() -> None:
     ],
 )
 def test_units_are_what_the_standards_say(unit: str, si: str, one: float) -> None:
-    assert to_si(unit, si, None, 0.0, 1) == (pytest.approx(one, rel=1e-12), 0.0)
+    assert to_si(unit, si, None, 0.0, 1) == pytest.approx((one, 0.0), rel=1e-12, abs=0.0)
 
 
 def test_every_unit_of_the_tables_is_found_by_its_own_name() -> None:
@@ -90,7 +90,7 @@ def test_every_unit_of_the_tables_is_found_by_its_own_name() -> None:
         assert names[si] == 1.0
         for name, factor in names.items():
             zero = -(3.0 + ZEROS.get(name, 0.0)) * factor
-            assert to_si(name, si, 2.0, 3.0, -1) == (pytest.approx(-2 * factor), pytest.approx(zero))
+            assert to_si(name, si, 2.0, 3.0, -1) == pytest.approx((-2 * factor, zero))
     assert to_si("degF", "degC", None, 212.0, 1)[1] == pytest.approx(100.0)
     assert to_si("K", "degC", None, 0.0, 1) == (1.0, -273.15)
 
@@ -124,7 +124,7 @@ def test_time_of_tables_has_a_column_a_unit_and_an_epoch() -> None:
     labview = parse_system(RIG.replace("unit: ms, epoch: 2026-09-21T14:00:00Z", "epoch: labview")).time
     assert labview.epoch == -(date(1970, 1, 1) - date(1904, 1, 1)).days * 86400 * 10**9
     days = parse_system(RIG.replace("unit: ms, epoch: 2026-09-21T14:00:00Z", "unit: d, epoch: matlab")).time
-    assert 719529 * 86400 * 10**9 + days.epoch == 0  # datenum of 1970-01-01
+    assert days.epoch is not None and 719529 * 86400 * 10**9 + days.epoch == 0  # datenum of 1970-01-01
 
 
 def test_what_only_says_where_data_are_does_not_change_the_digest() -> None:

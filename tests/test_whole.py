@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ SHARED = Path(__file__).parents[1].parent / "shared" / "recordings"
 DRIFTING = (("secondary_2l.damping", 0.45, 250.0), ("primary_12r.stiffness", 0.2, 300.0))
 
 
-def replay(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[dict], str]:
+def replay(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, list[dict[str, Any]], str]:
     status = main(["replay", *map(str, arguments), "--json"])
     captured = capsys.readouterr()
     return status, [json.loads(line) for line in captured.out.splitlines()], captured.err

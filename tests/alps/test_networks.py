@@ -121,7 +121,9 @@ def test_estimates_start_in_the_middle_and_stay_positive() -> None:
     torch.testing.assert_close(estimator(states), estimator.at_middle(4))
     assert float(estimator.at_middle(1)) == pytest.approx(2.002e6, rel=1e-3)
     with torch.no_grad():
-        estimator.net[-1].bias -= 100
+        last = estimator.net[-1]
+        assert isinstance(last, torch.nn.Linear)
+        last.bias.sub_(100)
     assert float(estimator(states).min()) > 0
 
 

@@ -21,8 +21,9 @@ from sprung.model.ambient.track import Running, TrackExcitation
 from sprung.model.ambient.whittle import Whittle
 from sprung.model.identification.identify import identifiability, load_identifier
 from sprung.model.identifier import UnusableWindow
+from sprung.model.schema import SystemFileError, TrackInput
 from sprung.model.signals import FloatArray
-from sprung.model.system import BUNDLED, System, SystemFileError, load_system, parse_system
+from sprung.model.system import BUNDLED, System, load_system, parse_system
 
 ACCELEROMETERS = BUNDLED / "accelerometers.yaml"
 TOWER = """
@@ -46,7 +47,9 @@ def vehicle() -> System:
 
 def wheels(system: System) -> tuple[FloatArray, np.ndarray]:
     sources = list(system.file.inputs.values())
-    return np.array([s.position[0] for s in sources]), np.array([s.rail == "left" for s in sources])
+    tracks = [s for s in sources if isinstance(s, TrackInput) and s.position]
+    assert len(tracks) == len(sources)
+    return np.array([s.position[0] for s in tracks if s.position]), np.array([s.rail == "left" for s in tracks])
 
 
 def responses(system: System, loads: tuple[str, ...] | list[str] = ()) -> Responses:

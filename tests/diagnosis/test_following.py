@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.system import parse_system
-from tests.diagnosis_cases import DAMPING, FINE, SYSTEM, simulate
+from tests.diagnosis_cases import DAMPING, FINE, simulate
 
 SLOPE, BEGIN, CALLS = -0.015, 0.3, 5  # 1/K; s that the filter takes from the start; of the law in one step
 

@@ -5,9 +5,10 @@ import pytest
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
 from sprung.model.diagnosis.api import diagnose
-from sprung.model.laws import CLOCK_LEAD, find_law
+from sprung.model.laws import CLOCK_LEAD
 from sprung.model.laws.channel import delayed
 from sprung.model.system import MANCHESTER, load_system
+from tests.named_laws import support_law
 
 SYSTEM = load_system(MANCHESTER)
 RATE = SYSTEM.sample_rate
@@ -32,7 +33,7 @@ class HealthyRecord:
     def hide_dip(self, law: str, wheel: str, depth: float, frequency: float, phase: float) -> None:
         """The wheels go over a dip that their measured motion does not show; anti-aliased at 42 Hz."""
         time = np.arange(len(self.values)) / RATE + CLOCK_LEAD
-        for n, weight in enumerate(find_law(law).harmonics, 1):
+        for n, weight in enumerate(support_law(law).harmonics, 1):
             if n * frequency < 42:
                 angle = 2 * np.pi * n * (frequency * time - phase)
                 omega = 2 * np.pi * n * frequency

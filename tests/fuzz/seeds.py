@@ -9,7 +9,7 @@ from pathlib import Path
 import scipy.io
 from mcap.writer import CompressionType
 
-from sprung.model.signals import Channel
+from sprung.model.signals import Channel, FloatArray
 from tests.replay_files import (
     CHANNELS,
     LEFT,
@@ -29,8 +29,8 @@ from tests.replay_files import (
 TABLE = [Channel(c.name, c.unit, c.noise, c.mcap, c.can, c.csv, column=c.csv) for c in CHANNELS]
 GROUPED = [Channel(c.name, c.unit, c.noise, column=f"group/{c.csv}") for c in CHANNELS]  # as TDMS names them
 UNIVERSAL = [Channel(c.name, c.unit, c.noise, column=name) for c, name in zip(CHANNELS, ("12+Z", "7-X"), strict=True)]
-SECONDS = NUMBERS / 100
-COLUMNS = {"time": SECONDS, "left": LEFT, "right": RIGHT}
+SECONDS: FloatArray = NUMBERS / 100
+COLUMNS: dict[str, FloatArray] = {"time": SECONDS, "left": LEFT, "right": RIGHT}
 
 
 def _mcap(compression: CompressionType) -> Callable[[Path], None]:

@@ -28,7 +28,7 @@ sensors:
 """
 
 
-def quarter_car(mass: float) -> System:
+def quarter_car(mass: float | str) -> System:
     return parse_system(QUARTER_CAR.format(mass=mass))
 
 
@@ -146,7 +146,7 @@ def test_what_is_fixed_or_stated_is_not_doubted_beside() -> None:
 
 
 def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it() -> None:
-    def stated(stiffness: float, rate: float) -> float:
+    def stated(stiffness: str, rate: int) -> float:
         law = f"damping: 1500.0, laws: [{{bump_stop: {{gap: 0.01, stiffness: {stiffness}}}}}]"
         text = QUARTER_CAR.format(mass=40.0).replace("damping: 1500.0", law)
         system = parse_system(text.replace("sample_rate: 100", f"sample_rate: {rate}"))

@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_system import QUARTER_CAR
 
 from sprung.model.identification import training
 from sprung.model.identification.estimator import WEIGHTS, ModelError, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import draw_log_ratios, simulate_runs
-from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.identification.training import TrainingSettings, train
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import System, load_system, parse_system
+from tests.test_system import QUARTER_CAR
 
 TINY = TrainingSettings(records=100, windows_per_record=2, steps=30, batch=64, checkpoint_every=10, recording_steps=6)
 SMALL_CAR = QUARTER_CAR.replace("window: 200", "window: 100")
@@ -36,7 +36,9 @@ def test_the_shipped_estimator_is_near_the_bound_and_says_how_near(
     vehicle: tuple[System, FloatArray, FloatArray],
 ) -> None:
     system, truth, windows = vehicle
-    output = bundled_estimator(system).estimate(windows)
+    estimator = bundled_estimator(system)
+    assert estimator is not None
+    output = estimator.estimate(windows)
     error = output.log_ratio - truth
     std = np.sqrt(np.diagonal(output.covariance, axis1=1, axis2=2))
     assert np.abs(error).mean() < 0.016
@@ -153,6 +155,7 @@ def test_its_start_knows_a_load_so_that_one_iteration_is_enough(
     truth = np.hstack([draw_log_ratios(system, 48, 0.2, rng), np.tile(terms, (48, 1))])
     windows = simulate_runs(system, truth, system.window, rng).values
     identifier = load_identifier(system)
+    assert isinstance(identifier, Identifier) and identifier.estimator is not None
     start = identifier.estimator.estimate(windows, loads=True).log_ratio
     assert start.shape == (48, 29)
     error = np.sqrt(np.mean((start - truth) ** 2, axis=0))
@@ -171,6 +174,8 @@ def test_linear_changes_of_masses_become_the_terms_of_a_load() -> None:
     loading = LinearSimulator(system).loading
     terms = torch.tensor([[0.25, -0.08, 0.06, 0.02, -0.03]], dtype=torch.float64)
     factors = loading.factors(terms)[0, :3]
-    along, aside = (loading.coupling(terms)[0, 0, at] * (factors[0] * factors[at]).sqrt() for at in (2, 1))
+    coupling = loading.coupling(terms)
+    assert coupling is not None
+    along, aside = (coupling[0, 0, at] * (factors[0] * factors[at]).sqrt() for at in (2, 1))
     linear = torch.stack([factors[0] - 1, factors[1] - factors[0], factors[2] - factors[0], along, aside])[None]
     np.testing.assert_allclose(loading.terms_of(linear).numpy(), terms.numpy(), atol=1e-12)

@@ -9,9 +9,8 @@ from scipy.interpolate import make_interp_spline
 
 from sprung.model.identification.deviations import clock_groups, deviations
 from sprung.model.identification.excitation import simulate_runs
-from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.refine import Refiner
-from sprung.model.identifier import Identifies
 from sprung.model.signals import FloatArray
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
@@ -27,8 +26,10 @@ def system() -> System:
 
 
 @pytest.fixture(scope="module")
-def identifier(system: System) -> Identifies:
-    return load_identifier(system)
+def identifier(system: System) -> Identifier:
+    found = load_identifier(system)
+    assert isinstance(found, Identifier)
+    return found
 
 
 def record(seconds: float, seed: int, load: float = 0.0, truth: FloatArray | None = None) -> FloatArray:
@@ -58,7 +59,7 @@ def windows(system: System, samples: FloatArray, seed: int = 0, hop: int = 50) -
     return np.stack([values[i : i + 100] for i in range(0, len(values) - 99, hop)])
 
 
-def tracked(system: System, identifier: Identifies, samples: FloatArray, seed: int = 0) -> tuple[Tracker, TrackerState]:
+def tracked(system: System, identifier: Identifier, samples: FloatArray, seed: int = 0) -> tuple[Tracker, TrackerState]:
     """Tracker and state after overlapping windows, one of three weighed."""
     values = windows(system, samples, seed)
     estimates = identifier.examine(values, np.arange(len(values)) % 3 == 0)
@@ -126,7 +127,7 @@ def test_a_gain_or_delay_that_all_channels_share_changes_nothing_and_is_not_clai
     ],
 )
 def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(
-    system: System, identifier: Identifies, change: Callable[[FloatArray], FloatArray], channel: str, kind: str
+    system: System, identifier: Identifier, change: Callable[[FloatArray], FloatArray], channel: str, kind: str
 ) -> None:
     values = windows(system, change(record(6, 4)), hop=100)[1:5]
     found = identifier.examine(values, np.zeros(len(values), dtype=bool))
@@ -139,7 +140,7 @@ def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(
 
 @pytest.mark.parametrize("kind", ["frozen", "saturated"])
 def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
-    system: System, identifier: Identifies, kind: str
+    system: System, identifier: Identifier, kind: str
 ) -> None:
     values = windows(system, record(6, 5), hop=100)[1:5]
     most = 1.1 * values[:, :, 21].std()
@@ -152,7 +153,7 @@ def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
 
 @pytest.mark.parametrize("gain", [0.02, 0.05, 0.1])
 def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(
-    system: System, identifier: Identifies, gain: float
+    system: System, identifier: Identifier, gain: float
 ) -> None:
     healthy = record(70, 6)
     wrong = healthy * np.where(np.arange(28) == 20, 1 + gain, 1)
@@ -165,7 +166,7 @@ def test_a_gain_that_jumps_is_the_sensors_alarm_and_no_springs(
     assert np.abs(mean / std).max() < 3.5
 
 
-def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, identifier: Identifies) -> None:
+def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, identifier: Identifier) -> None:
     healthy = record(75, 7)
     tracker, state = tracked(system, identifier, after(healthy, late(healthy, [20], -0.003), 35))
     assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "bogie1_1l.delay")]
@@ -174,7 +175,7 @@ def test_a_delay_that_jumps_leaves_the_springs_where_they_were(system: System, i
     assert np.abs(drift).max() < 0.025
 
 
-def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system: System, identifier: Identifies) -> None:
+def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system: System, identifier: Identifier) -> None:
     tracker, state = tracked(system, identifier, late(record(20, 8), [8], 0.03))
     assert state.rejected <= 6 and not state.alarms
     assert {(f.channel, f.kind) for f in tracker.sensors(state)} == {("wheel_21l.displacement", "delay")}
@@ -183,7 +184,7 @@ def test_a_large_delay_from_the_first_window_on_is_believed_at_once(system: Syst
 
 
 @pytest.mark.parametrize("load", [0.02, 0.1, 0.3])
-def test_passengers_change_the_load_and_no_spring(system: System, identifier: Identifies, load: float) -> None:
+def test_passengers_change_the_load_and_no_spring(system: System, identifier: Identifier, load: float) -> None:
     tracker, state = tracked(system, identifier, record(40, 7, load))
     assert state.alarms == ()
     assert tracker.sensors(state) == ()
@@ -194,7 +195,7 @@ def test_passengers_change_the_load_and_no_spring(system: System, identifier: Id
 
 
 def test_a_true_change_is_the_elements_and_all_dampers_together_are_one_message(
-    system: System, identifier: Identifies
+    system: System, identifier: Identifier
 ) -> None:
     one, every = np.zeros(24), np.zeros(24)
     one[8] = np.log(0.92)
@@ -220,7 +221,7 @@ def test_a_declared_load_leaves_the_weights_usable() -> None:
 
 @pytest.mark.parametrize(("speed", "count"), [(4.0, 64), (35.0, 24)])
 def test_gains_are_read_without_bias_where_inputs_are_noisy(
-    system: System, identifier: Identifies, speed: float, count: int
+    system: System, identifier: Identifier, speed: float, count: int
 ) -> None:
     """At walking pace the model answers to the noise of the inputs, which sensors do not show: along the inputs as
     measured all sensors would seem to show 4 % too little, five standard deviations."""

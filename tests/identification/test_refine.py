@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from test_system import OSCILLATOR, QUARTER_CAR
 
 from sprung.model.identification.excitation import Runs, draw_log_ratios, simulate_runs
 from sprung.model.identification.features import ForceBalance, magnitudes
@@ -13,6 +12,7 @@ from sprung.model.identification.refine import Refined, Refiner
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system, parse_system
+from tests.test_system import OSCILLATOR, QUARTER_CAR
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_a_missing_input_is_refused_by_name(vehicle: tuple[System, FloatArray, R
 def test_states_are_the_simulated_ones(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, truth, runs = vehicle
     (estimate,) = Identifier(system).identify(runs.clean[:1], truth[:1], states=True)
-    assert estimate.states.shape == (100, 18)
+    assert estimate.states is not None and estimate.states.shape == (100, 18)
     rate = np.gradient(estimate.states[:, 0], 0.01)
     assert np.abs(rate - estimate.states[:, 9])[5:-5].max() < 0.02 * np.abs(estimate.states[:, 9]).max()
 

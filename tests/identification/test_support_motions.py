@@ -11,6 +11,7 @@ from sprung.model.identification.excitation import draw_log_ratios, simulate_run
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.refine import Refiner
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.drives import drives_of
 from sprung.model.simulate.fusion import motion, motion_noise, motion_shares
 from sprung.model.system import BUNDLED, System, load_system, parse_system
@@ -129,7 +130,7 @@ def test_integrated_noise_has_the_stated_spectrum() -> None:
     window = np.hanning(200)
     apart = d[:, 28:-28] - d[:, 28:-28].mean(axis=1, keepdims=True)
     power = (np.abs(np.fft.rfft(apart * window, axis=1)) ** 2).mean(axis=0) / (window**2).sum()
-    frequency = np.fft.rfftfreq(200, 0.01)
+    frequency: FloatArray = np.fft.rfftfreq(200, 0.01).astype(float)
     band = (frequency > 4) & (frequency < 30)
     stated = motion_noise(2 * np.pi * frequency[band], 0.01, noise) ** 2
     assert abs((power[band] / stated).mean() - 1) < 0.05

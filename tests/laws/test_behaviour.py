@@ -1,14 +1,13 @@
 """What a law carries beside its force: branch, path, other starts, prior cost."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 
-from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, find_law, reversal_step
+from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.base import RARE, FittedElement
 from sprung.model.laws.trajectory import along
+from tests.named_laws import element_law, wider_law
 
 TIME = np.arange(4000) / 1000
 D = 3e-3 * np.sin(2 * np.pi * 1.3 * TIME) + 1e-3 * np.sin(2 * np.pi * 4.1 * TIME + 1)
@@ -17,7 +16,8 @@ V = np.gradient(D, TIME)
 
 @pytest.mark.parametrize(("name", "p"), [("series_stiffness", (1.2e6,)), ("air_spring", (3e5, 0.2))])
 def test_a_branch_is_the_law_that_its_memory_integrates(name: str, p: tuple[float, ...]) -> None:
-    law, element = find_law(name), SpringDamper(4e5, 2e4)
+    law, element = element_law(name), SpringDamper(4e5, 2e4)
+    assert law.branch is not None
     branch = law.branch(p, element.damping)
     stepped = along(law, p, D, V, sample_rate=1000.0, element=element)
     s = 2j * np.pi * np.fft.rfftfreq(len(D), 1e-3)
@@ -48,7 +48,9 @@ def test_a_path_is_the_law_that_its_memory_integrates(law: ElementLaw) -> None:
 
 def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alike() -> None:
     read = FittedElement(stiffness=4e5, damping=8e3, nominal_damping=2e4, frequency=12.0, rate=0.05)
-    (restart,) = find_law("series_stiffness").restarts(read)
+    law = element_law("series_stiffness")
+    assert law.restarts is not None
+    (restart,) = law.restarts(read)
     c, (ks,) = restart.damping * read.damping, restart.parameters
     r = read.frequency * c / ks
     assert c / (1 + r**2) == pytest.approx(read.damping)
@@ -58,7 +60,9 @@ def test_a_damper_behind_a_spring_is_started_from_a_stronger_one_that_reads_alik
 
 def test_a_damper_without_a_spring_beside_it_has_other_starts_too() -> None:
     """A slide on a guide: what is read has no stiffness."""
-    (restart,) = find_law("series_stiffness").restarts(FittedElement(0.0, 200.0, 400.0, 12.0, 0.05))
+    law = element_law("series_stiffness")
+    assert law.restarts is not None
+    (restart,) = law.restarts(FittedElement(0.0, 200.0, 400.0, 12.0, 0.05))
     assert restart.stiffness == 1.0 and np.all(np.isfinite(restart.parameters))
 
 
@@ -71,12 +75,13 @@ def test_the_step_of_the_rate_at_a_reversal_does_not_count_what_trembles_at_rest
 
 @pytest.mark.parametrize("p", [(9e4, 300.0, 1.0), (9e4, 300.0**2, 2.0, 0.2)])
 def test_other_starts_of_a_hysteresis_yield_at_the_same_force(p: tuple[float, ...]) -> None:
-    law = find_law("bouc_wen") if len(p) == 3 else find_law("bouc_wen").wider
+    law = element_law("bouc_wen") if len(p) == 3 else wider_law("bouc_wen")
     way = np.linspace(0, 1.0, 200)  # far beyond yielding
 
-    def yields(values: Sequence[float]) -> float:
+    def yields(values: tuple[float, ...]) -> float:
         return force_along(law, values, way, np.ones(200), np.arange(200) / 200, SpringDamper(4e5, 2e4))[-1]
 
+    assert law.alike is not None
     others = law.alike(p)
     assert len(others) == 2
     for other in others:
@@ -106,4 +111,4 @@ def test_laws_of_rigs_are_no_candidates_for_a_vehicle() -> None:
         "progressive_stop",
         "preload",
     }
-    assert find_law("bouc_wen").wider.prior_cost == RARE
+    assert wider_law("bouc_wen").prior_cost == RARE

@@ -18,6 +18,7 @@ from sprung.model.laws.base import CLOCK_LEAD, Motion
 from sprung.model.laws.stiffness import CLEARANCE
 from sprung.model.laws.trajectory import along, phi
 from sprung.model.signals import FloatArray
+from tests.named_laws import element_law, support_law, wider_law
 
 SPRING = SpringDamper(4.3e5, 2.0e4)
 RATE = 1000.0
@@ -65,7 +66,7 @@ def test_every_trial_is_admissible_and_finite(law: ElementLaw) -> None:
 def test_a_batch_of_trials_gives_what_each_gives_alone(law: ElementLaw) -> None:
     d, v, _ = cycle(seconds=1.6)
     trials = law.shapes(seen())
-    together = along(law, trials.T[:, :, None], d, v, sample_rate=RATE, element=SPRING)
+    together = along(law, tuple(trials.T[:, :, None]), d, v, sample_rate=RATE, element=SPRING)
     assert together.shape == (len(trials), len(d))
     alone = along(law, tuple(trials[-1]), d, v, sample_rate=RATE, element=SPRING)
     np.testing.assert_allclose(together[-1], alone, rtol=1e-12, atol=1e-9)
@@ -90,7 +91,7 @@ def test_the_force_is_linear_in_the_strength_where_the_law_says_so(law: ElementL
     d, v, _ = cycle(seconds=1.6)
     p = trial(law)
     one = along(law, tuple(p), d, v, sample_rate=RATE, element=SPRING)
-    two = along(law, tuple(law.scaled(p, 0.5)), d, v, sample_rate=RATE, element=SPRING)
+    two = along(law, tuple(law.scaled(tuple(p), 0.5)), d, v, sample_rate=RATE, element=SPRING)
     np.testing.assert_allclose(two, 0.5 * one, rtol=1e-9, atol=1e-6)
 
 
@@ -111,7 +112,7 @@ def test_a_passive_element_creates_no_energy_over_a_cycle(law: ElementLaw) -> No
         d, v, _ = cycle(amplitude, seconds=2.4)
         trials = law.shapes(seen()).T[:, :, None]
         total = SPRING.stiffness * d + SPRING.damping * v
-        total = total + along(law, trials, d, v, sample_rate=RATE, element=SPRING)
+        total = total + along(law, tuple(trials), d, v, sample_rate=RATE, element=SPRING)
         last = slice(len(d) - int(0.8 * RATE), None)  # the last whole period, memories settled
         assert (np.sum(total[:, last] * v[last], axis=1) >= 0).all()
 
@@ -185,37 +186,37 @@ def test_clearance_leaves_no_spring_force_inside_the_gap_and_full_slope_outside(
 
 def test_friction_dissipates_four_f_a_per_cycle() -> None:
     d, v, _ = cycle(0.004, 1.25, 0.8, rate=100_000.0)
-    force = along(find_law("coulomb_friction"), (300.0, 1e-5), d, v, sample_rate=1e5, element=SPRING)
+    force = along(element_law("coulomb_friction"), (300.0, 1e-5), d, v, sample_rate=1e5, element=SPRING)
     assert np.sum(force * v) / 1e5 == pytest.approx(4 * 300.0 * 0.004, rel=1e-3)
 
 
 def test_quadratic_damping_dissipates_its_closed_form() -> None:
     d, v, omega = cycle(0.004, 1.25, 0.8)
-    force = along(find_law("quadratic_damping"), (3e5,), d, v, sample_rate=RATE, element=SPRING)
+    force = along(element_law("quadratic_damping"), (3e5,), d, v, sample_rate=RATE, element=SPRING)
     peak = 0.004 * omega  # 8/3 c2 (A omega)^2 A per cycle
     assert np.sum(force * v) / RATE == pytest.approx(8 / 3 * 3e5 * peak**2 * 0.004, rel=1e-4)
 
 
 def test_the_cubic_has_three_quarters_of_its_peak_in_the_fundamental() -> None:
     d, v, _ = cycle()
-    force = along(find_law("cubic_stiffness"), (1e9,), d, v, sample_rate=RATE, element=SPRING)
+    force = along(element_law("cubic_stiffness"), (1e9,), d, v, sample_rate=RATE, element=SPRING)
     fundamental = 2 * np.mean(force * d) / 0.004  # amplitude of the sine part
     assert fundamental == pytest.approx(0.75 * 1e9 * 0.004**3, rel=1e-9)
 
 
 def test_bump_stop_stores_half_kb_times_squared_penetration() -> None:
     d = np.linspace(0, 0.01, 100_001)
-    force = find_law("bump_stop").force(Motion(d, 0 * d), (0.004, 2e6), SPRING)
+    force = element_law("bump_stop").force(Motion(d, 0 * d), (0.004, 2e6), SPRING)
     assert np.trapezoid(force, d) == pytest.approx(0.5 * 2e6 * 0.006**2, rel=1e-6)
 
 
 def test_blow_off_and_asymmetry_have_the_contracts_slopes() -> None:
     v = np.linspace(-0.2, 0.2, 4001)
     c = SPRING.damping
-    slope = np.gradient(c * v + find_law("damper_blowoff").force(Motion(0 * v, v), (0.05, 0.3), SPRING), v)
+    slope = np.gradient(c * v + element_law("damper_blowoff").force(Motion(0 * v, v), (0.05, 0.3), SPRING), v)
     np.testing.assert_allclose(slope[np.abs(v) < 0.049], c, rtol=1e-6)
     np.testing.assert_allclose(slope[np.abs(v) > 0.051], 0.3 * c, rtol=1e-6)
-    slope = np.gradient(c * v + find_law("damper_asymmetry").force(Motion(0 * v, v), (-0.31,), SPRING), v)
+    slope = np.gradient(c * v + element_law("damper_asymmetry").force(Motion(0 * v, v), (-0.31,), SPRING), v)
     np.testing.assert_allclose(slope[v > 1e-3], 0.69 * c, rtol=1e-6)
     np.testing.assert_allclose(slope[v < -1e-3], 1.31 * c, rtol=1e-6)
 
@@ -225,7 +226,7 @@ def test_branches_have_the_frequency_response_of_a_maxwell_element(name: str, br
     d, v, omega = cycle(frequency=5.0)
     ks, c = 1.2e6, SPRING.damping
     p = (ks,) if branch else (ks, c / ks)
-    force = along(find_law(name), p, d, v, sample_rate=RATE, element=SPRING)
+    force = along(element_law(name), p, d, v, sample_rate=RATE, element=SPRING)
     if branch:
         force = force + c * v
     last = slice(len(d) - 1000, None)
@@ -238,20 +239,20 @@ def test_bouc_wen_saturates_at_its_yield_deflection() -> None:
     t = np.arange(2000) / 1e3
     d, v = 0.01 * t, np.full_like(t, 0.01)
     beta, alpha = 700.0, 9e4
-    force = along(find_law("bouc_wen"), (alpha, beta, 1.0), d, v, sample_rate=1e3, element=SPRING)
+    force = along(element_law("bouc_wen"), (alpha, beta, 1.0), d, v, sample_rate=1e3, element=SPRING)
     expected = alpha / (1.5 * beta) * (1 - np.exp(-1.5 * beta * d))  # z' = v (1 - 1.5 beta z) for v > 0
     np.testing.assert_allclose(force, expected, rtol=1e-8, atol=1e-8)
 
 
 def test_drift_starts_before_the_recording() -> None:
     d, v, _ = cycle()
-    force = along(find_law("time_varying_stiffness"), (0.2, 16.0), d, v, sample_rate=RATE, element=SPRING)
+    force = along(element_law("time_varying_stiffness"), (0.2, 16.0), d, v, sample_rate=RATE, element=SPRING)
     t = np.arange(len(d)) / RATE + CLOCK_LEAD
     np.testing.assert_allclose(force, SPRING.stiffness * 0.2 * (1 - np.exp(-t / 16.0)) * d, rtol=1e-9, atol=1e-6)
 
 
 def test_a_dip_has_its_depth_and_its_rate_is_the_slope() -> None:
-    law = find_law("wheel_flat")
+    law = support_law("wheel_flat")
     t = np.arange(20_000) / 20_000
     moved, rate = law.movement(t, (1e-3, 4.0, 0.2))
     assert t[np.argmin(moved)] == pytest.approx(0.05, abs=1e-3)
@@ -271,13 +272,13 @@ def test_phi_functions_are_accurate_where_series_and_recursion_meet() -> None:
 
 def test_valves_of_a_damper_that_is_harder_in_one_direction_keep_their_forces_ratio() -> None:
     a, knee, ratio, v = 0.3, 0.05, 0.25, np.linspace(-0.2, 0.2, 4001)
-    valves = find_law("damper_blowoff").force(Motion(0 * v, v), (knee, ratio), SPRING)
-    harder = find_law("damper_asymmetry").wider.force(Motion(0 * v, v), (a, knee, ratio), SPRING)
+    valves = element_law("damper_blowoff").force(Motion(0 * v, v), (knee, ratio), SPRING)
+    harder = wider_law("damper_asymmetry").force(Motion(0 * v, v), (a, knee, ratio), SPRING)
     one_way = SPRING.damping * np.where(np.abs(v) < knee, v, np.sign(v) * knee + ratio * (v - np.sign(v) * knee))
     np.testing.assert_allclose(SPRING.damping * v + valves + harder, (1 + a * np.sign(v)) * one_way, atol=1e-9)
 
 
 def test_stops_of_either_side_have_gaps_and_stiffnesses_of_their_own() -> None:
     d = np.array([-0.03, -0.02, -0.01, 0.0, 0.01, 0.02])
-    force = find_law("bump_stop").wider.force(Motion(d, 0 * d), (0.015, 2e5, 0.02, 3e5), SPRING)
+    force = wider_law("bump_stop").force(Motion(d, 0 * d), (0.015, 2e5, 0.02, 3e5), SPRING)
     np.testing.assert_allclose(force, [-3e3, 0.0, 0.0, 0.0, 0.0, 1e3], atol=1e-9)

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.laws import CATALOGUE, SensorLaw, find_law
+from sprung.model.laws import CATALOGUE, SensorLaw
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.nonlinear import NonlinearSimulator
 from sprung.model.system import load_system
+from tests.named_laws import body_law, sensor_law
 
 SYSTEM = load_system()
 MECHANICS = SYSTEM.mechanics
@@ -25,7 +26,7 @@ def frequencies(mechanics: Mechanics) -> FloatArray:
 
 def test_a_mode_of_a_body_that_hangs_on_nothing_has_its_frequency_and_damping() -> None:
     free = replace(MECHANICS, stiffness=np.zeros(12), damping=np.zeros(12))
-    law = find_law("flexible_mode")
+    law = body_law("flexible_mode")
     bent = law.modify(free, CAR, (11.9, 0.02, 0.5), "bending")
     (mode,) = [mode for mode in bent.modes(SYSTEM.bodies) if mode.frequency > 1e-3]
     assert mode.frequency == pytest.approx(11.9, rel=1e-9)
@@ -33,7 +34,7 @@ def test_a_mode_of_a_body_that_hangs_on_nothing_has_its_frequency_and_damping() 
 
 
 def test_a_mode_without_participation_changes_no_sensor() -> None:
-    law = find_law("flexible_mode")
+    law = body_law("flexible_mode")
     bent = law.modify(MECHANICS, CAR, (11.9, 0.02, 0.0), "bending")
     knots = _road(200)
     plain = NonlinearSimulator(MECHANICS, 100.0).run(knots, [])
@@ -48,7 +49,7 @@ def test_a_mode_without_participation_changes_no_sensor() -> None:
 def test_mode_shapes_have_their_pattern_at_the_secondary_springs_and_the_sensors_there(
     variant: str, pattern: list[int]
 ) -> None:
-    bent = find_law("flexible_mode").modify(MECHANICS, CAR, (11.9, 0.02, 0.25), variant)
+    bent = body_law("flexible_mode").modify(MECHANICS, CAR, (11.9, 0.02, 0.25), variant)
     np.testing.assert_allclose(bent.H[8:12, -1], 0.5 * np.array(pattern), rtol=1e-12)
     np.testing.assert_allclose(bent.S[:4, -1], 0.5 * np.array(pattern), rtol=1e-12)
     assert not bent.H[:8, -1].any() and not bent.S[4:, -1].any()
@@ -57,20 +58,20 @@ def test_mode_shapes_have_their_pattern_at_the_secondary_springs_and_the_sensors
 def test_the_first_bending_moves_the_middle_against_the_ends() -> None:
     with_middle = replace(MECHANICS, S=MECHANICS.S.copy())
     with_middle.S[0] = np.eye(9)[0]  # a sensor in the middle of the car
-    bent = find_law("flexible_mode").modify(with_middle, CAR, (11.9, 0.02, 1.0), "bending")
+    bent = body_law("flexible_mode").modify(with_middle, CAR, (11.9, 0.02, 1.0), "bending")
     assert bent.S[0, -1] < 0 < bent.S[1, -1]
 
 
 def test_a_heavier_body_lowers_its_modes_by_the_root_of_the_ratio() -> None:
     stiff_bogies = replace(MECHANICS, stiffness=np.where(np.arange(12) < 8, 1e12, MECHANICS.stiffness))
-    heavy = find_law("mass_change").modify(stiff_bogies, CAR, (1.21,), "")
+    heavy = body_law("mass_change").modify(stiff_bogies, CAR, (1.21,), "")
     ratio = frequencies(heavy)[:3] / frequencies(stiff_bogies)[:3]
     np.testing.assert_allclose(ratio, 1 / 1.1, rtol=1e-4)
 
 
 def test_an_unmeasured_force_enters_like_a_measured_one() -> None:
-    law = find_law("external_force")
-    assert law.variants(MECHANICS, CAR) == ("z", "roll", "pitch")
+    law = body_law("external_force")
+    assert law.load is not None and law.variants(MECHANICS, CAR) == ("z", "roll", "pitch")
     driven = law.modify(MECHANICS, CAR, (150.0, 3.0, 0.0), "z")
     t = np.arange(4000) / 100.0
     load = law.load(t, (150.0, 3.0, 0.3))
@@ -104,7 +105,7 @@ def signal(samples: int = 600, rate: float = 100.0) -> tuple[FloatArray, Callabl
 @pytest.mark.parametrize("late", [0.0075, -0.0031, 0.02])
 def test_a_late_sensor_shows_the_past(late: float) -> None:
     t, truth = signal()
-    shown = find_law("sensor_lag").distort(truth(t), (late,), 100.0)
+    shown = sensor_law("sensor_lag").distort(truth(t), (late,), 100.0)
     inner = slice(40, -40)
     np.testing.assert_allclose(shown[inner], truth(t - late)[inner], atol=2e-3)
 
@@ -124,5 +125,5 @@ def test_every_fault_that_can_be_undone_is_undone(law: SensorLaw) -> None:
 
 def test_a_stuck_sensor_repeats_its_first_value() -> None:
     t, truth = signal()
-    shown = find_law("sensor_stuck").distort(truth(t), (), 100.0)
+    shown = sensor_law("sensor_stuck").distort(truth(t), (), 100.0)
     assert np.ptp(shown) == 0 and shown[0] == truth(t)[0]

@@ -26,6 +26,7 @@ def law(tmp_path: Path) -> ElementLaw:
     path = tmp_path / "my_laws.py"
     path.write_text(example(), encoding="utf-8")
     (found,) = load_laws(path, tuple(law.name for law in CATALOGUE))
+    assert isinstance(found, ElementLaw)
     return found
 
 
@@ -36,7 +37,7 @@ def test_the_documented_law_screens_like_any_other(law: ElementLaw) -> None:
     trials = law.shapes(seen)
     assert all(law.admits(p) for p in trials)
     element = SpringDamper(4e5, 2e4)
-    forces = along(law, trials.T[:, :, None], d, v, sample_rate=100.0, element=element)
+    forces = along(law, tuple(trials.T[:, :, None]), d, v, sample_rate=100.0, element=element)
     assert forces.shape == (len(trials), 500)
     assert (forces * v >= 0).all()
 

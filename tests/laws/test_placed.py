@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sprung.model.identification.estimator import bundled_estimator
+from sprung.model.laws import ElementLaw
 from sprung.model.schema import SystemFileError
 from sprung.model.system import System, load_system, parse_system
 
@@ -44,7 +45,7 @@ def test_laws_are_placed_with_values_and_deviations() -> None:
 def test_a_formula_is_a_law() -> None:
     text = ', laws: [{formula: {formula: "a * d**3 + b * z", memory: "v - abs(v) * z / y", a: 1.0e6, b: 100, y: 0.01}}]'
     (law,) = system(text).laws
-    assert law.law.names == ("a", "b", "y") and law.law.memory == 1
+    assert isinstance(law.law, ElementLaw) and law.law.names == ("a", "b", "y") and law.law.memory == 1
 
 
 @pytest.mark.parametrize(

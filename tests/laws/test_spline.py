@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from sprung.model.laws import ElementLaw, find_law
+from sprung.model.laws import ElementLaw
 from sprung.model.laws.spline import Axis, LatentForce, Surface, estimate_force
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.nonlinear import DiscreteSystem, NonlinearRun, NonlinearSimulator, Placement
 from sprung.model.simulate.stepping import cubic_chain, exact_steps
 from sprung.model.system import parse_system
+from tests.named_laws import element_law
 
 RATE, SAMPLES, NOISE = 100.0, 2000, np.array([0.01, 0.05])
 SYSTEM = """
@@ -39,10 +40,10 @@ Force = Callable[[FloatArray, FloatArray], FloatArray]  # of deflection, m, and 
 
 def hidden(name: str, force: Force) -> ElementLaw:
     """A law that is not in the catalogue."""
-    return replace(find_law("damper_asymmetry"), name=name, force=lambda m, p, e: force(m.deflection, m.rate))
+    return replace(element_law("damper_asymmetry"), name=name, force=lambda m, p, e: force(m.deflection, m.rate))
 
 
-TRUTHS = {
+TRUTHS: dict[str, Force] = {
     "quadratic stiffness": lambda d, v: 1.5e5 * d**2,
     "position-dependent damping": lambda d, v: 6e6 * d**2 * v,
     "nothing": lambda d, v: 0.0 * d,
@@ -76,23 +77,24 @@ def respond_of(model: DiscreteSystem) -> Callable[[FloatArray], FloatArray]:
     return respond
 
 
-def found(name: str, rounds: int = 4, seed: int = 0) -> tuple[LatentForce, NonlinearRun, NonlinearRun]:
+def found(name: str, rounds: int = 4, seed: int = 0) -> tuple[NonlinearRun, LatentForce, NonlinearRun]:
     """Measure, then let the estimate of the surface and the fit of the strut's spring and damper take turns."""
     knots, rng = road(seed), np.random.default_rng(seed + 100)
     simulator = NonlinearSimulator(MECHANICS, RATE)
     truth = simulator.run(knots, [Placement(hidden(name, TRUTHS[name]), (1,), (1.0,))])
     measured = truth.outputs + NOISE * rng.standard_normal(truth.outputs.shape)
     values = np.array([MECHANICS.stiffness[1], MECHANICS.damping[1]])
-    run, latent, surface = simulator.run(knots, []), None, None
+    run, surface = simulator.run(knots, []), None
+    latent: LatentForce | None = None
     for _ in range(rounds):
         d, v = run.deflection[:, 1], run.rate[:, 1]
         surface = surface or Surface.over(d, v)
         respond = respond_of(run.model)
         residual = ((measured - run.outputs) / NOISE).ravel()
         jacobian = respond(np.stack([d, v], axis=1))
-        before = latent
+        before = latent.force(d, v) if latent else 0.0
         latent = estimate_force(surface, (d, v), respond, residual, jacobian, current=latent)
-        change = latent.force(d, v) - (before.force(d, v) if before else 0.0)
+        change = latent.force(d, v) - before
         values = values + np.linalg.lstsq(jacobian, residual - respond(change[:, None])[:, 0])[0]
         run = simulator.run(
             knots,
@@ -100,6 +102,7 @@ def found(name: str, rounds: int = 4, seed: int = 0) -> tuple[LatentForce, Nonli
             stiffness=np.array([MECHANICS.stiffness[0], values[0]]),
             damping=np.array([MECHANICS.damping[0], values[1]]),
         )
+    assert latent is not None
     return truth, latent, run
 
 
@@ -153,9 +156,10 @@ def test_the_surface_as_a_law_explains_a_recording_that_it_never_saw() -> None:
     fresh = road(7)
     simulator = NonlinearSimulator(MECHANICS, RATE)
     measured = simulator.run(fresh, [Placement(hidden(name, TRUTHS[name]), (1,), (1.0,))]).outputs
-    values = {"stiffness": fitted.model.mechanics.stiffness, "damping": fitted.model.mechanics.damping}
-    before = simulator.run(fresh, [], **values).outputs - measured
-    after = simulator.run(fresh, [Placement(latent.law(), (1,), (1.0,))], **values).outputs - measured
+    k, c = fitted.model.mechanics.stiffness, fitted.model.mechanics.damping
+    before = simulator.run(fresh, [], stiffness=k, damping=c).outputs - measured
+    placed = [Placement(latent.law(), (1,), (1.0,))]
+    after = simulator.run(fresh, placed, stiffness=k, damping=c).outputs - measured
     assert (np.std(after, axis=0) < 0.3 * np.std(before, axis=0)).all()
 
 

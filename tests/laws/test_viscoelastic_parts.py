@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.laws import CATALOGUE, SpringDamper
+from sprung.model.laws import SpringDamper
 from sprung.model.laws.base import Motion
 from sprung.model.laws.expression import MOTION, parse
+from tests.named_laws import element_law
 
-(RUBBER,) = (law for law in CATALOGUE if law.name == "fractional_stiffness")
+RUBBER = element_law("fractional_stiffness")
 
 
 @pytest.mark.parametrize("order", [0.1, 0.2, 0.35, 0.5])

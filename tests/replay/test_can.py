@@ -63,7 +63,8 @@ def test_random_layouts_decode_as_cantools_does(seed: int) -> None:
     rng = np.random.default_rng(seed)
     size = int(rng.choice([8, 8, 3, 12, 24, 64]))
     extended = bool(rng.random() < 0.5)
-    signals, taken = [], set()
+    signals: list[Signal] = []
+    taken: set[tuple[int, int]] = set()
     for index in range(200):
         signal = random_signal(rng, f"S{index}", max(size, 8))
         if last_bit(signal) < 8 * size and not taken & bits_of(signal):
@@ -81,7 +82,7 @@ def test_random_layouts_decode_as_cantools_does(seed: int) -> None:
     for row, payload in enumerate(payloads):
         expected = message.decode(payload, decode_choices=False)
         for column, name in enumerate(s.name for s in message.signals):
-            truth = float(expected[name])
+            truth = float(expected[name])  # type: ignore[call-overload,arg-type]
             if not np.isfinite(truth) or abs(truth) > 1e300:
                 assert np.isnan(values[row, column])
             else:
@@ -109,7 +110,7 @@ def test_every_single_bit_of_a_long_frame_is_found_in_both_byte_orders() -> None
         data[0, bit // 8] = 1 << (bit % 8)
         assert raw_bits(data, bit, 1, big_endian=False)[0] == 1
         assert raw_bits(data, bit, 1, big_endian=True)[0] == 1
-        assert raw_bits(data ^ 0xFF, bit, 1, big_endian=True)[0] == 0
+        assert raw_bits(data ^ np.uint8(0xFF), bit, 1, big_endian=True)[0] == 0
 
 
 def multiplexed() -> Message:
@@ -222,7 +223,8 @@ def test_a_database_file_gives_the_same_as_its_objects(tmp_path: Path) -> None:
     message = Message(0x18FF1234, "Ext", 8, [Signal("s", 7, 16, "big_endian", is_signed=True)], is_extended_frame=True)
     path = tmp_path / "ext.dbc"
     path.write_text(Database([message]).as_dbc_string())
-    assert cantools.database.load_file(path).messages[0].is_extended_frame
+    loaded = cantools.database.load_file(path)
+    assert isinstance(loaded, Database) and loaded.messages[0].is_extended_frame
     account = Account()
     frames = block([b"\xff\xfe\0\0\0\0\0\0"], 0x18FF1234 | EXTENDED)
     samples = CanDecoder(channels_of(message), path).decode(frames, account)

@@ -6,14 +6,14 @@ from collections import Counter
 from collections.abc import Callable
 from itertools import count
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import can
 import numpy as np
 import pytest
 from cantools.database.can import Database, Message, Signal
 
-from sprung.model.signals import Channel
+from sprung.model.signals import Channel, SampleBlock
 from sprung.replay import UnreadableRecording
 from sprung.replay.account import Account
 from sprung.replay.live import LiveBus, frame_block, send
@@ -46,7 +46,7 @@ class CollectingListener:
 
     def __init__(self, bus: LiveBus) -> None:
         self.bus = bus
-        self.blocks = []
+        self.blocks: list[tuple[float, SampleBlock]] = []
         self.thread = threading.Thread(target=self._run)
         self.thread.start()
 
@@ -113,7 +113,7 @@ def test_a_bus_that_is_lost_is_opened_again(dbc: Path, bus_name: str, monkeypatc
         def __exit__(self, *_: object) -> None:
             return None
 
-        def recv(self, timeout: float | can.Message) -> None:
+        def recv(self, timeout: float) -> can.Message | None:
             self.sent += 1
             if self.sent <= 3:
                 return frame(10 * self.number + self.sent)
@@ -128,7 +128,7 @@ def test_a_bus_that_is_lost_is_opened_again(dbc: Path, bus_name: str, monkeypatc
             raise OSError("No such device")
         return Breaking(number)
 
-    live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.02, open_bus=open_bus)
+    live = LiveBus("virtual", bus_name, [CHANNEL], dbc, latency=0.02, open_bus=open_bus)  # type: ignore[arg-type]
     listener = CollectingListener(live)
     assert listener.wait(lambda: len(listener.values()) == 6)
     listener.stop()
@@ -181,7 +181,7 @@ def test_playing_can_be_scaled_and_stopped(dbc: Path, bus_name: str, tmp_path: P
 
 
 def test_udp_multicast_carries_frames_between_buses(dbc: Path) -> None:
-    group = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219}
+    group: dict[str, Any] = {"interface": "udp_multicast", "channel": "239.74.163.7", "port": 43219}
     try:
         with can.Bus(**group) as probe, can.Bus(**group) as other:
             other.send(frame(1))
@@ -254,8 +254,8 @@ def test_frames_that_the_kernel_dropped_are_counted_once(
     bus = LiveBus("virtual", bus_name, [CHANNEL], dbc)
     counter = iter([7, 7, 12, 12])  # of the socket, which may have lost some before it was opened here
     monkeypatch.setattr("sprung.replay.live.lost_by_kernel", lambda *_: next(counter))
-    bus._opened(None)
+    bus._opened(None)  # type: ignore[arg-type]
     for _ in range(3):
         bus._asked = -1e9
-        bus._ask(None)
+        bus._ask(None)  # type: ignore[arg-type]
     assert (bus.lost, bus.tally.dropped, bus.account.incomplete) == (5, 5, True)

@@ -34,7 +34,7 @@ def stream(time: FloatArray, value: FloatArray, seconds: float = 20.0, size: int
 def reduced(time: FloatArray, value: FloatArray, **options: Any) -> tuple[FloatArray, FloatArray, FloatArray, Account]:
     """Times (s) and values of the fast channel, values of the slow one, the account."""
     account = Account()
-    out = list(at_rate(stream(time, value, **options), CHANNELS, GRID, account, "ride.csv"))
+    out = list(at_rate(stream(time, value, **options), CHANNELS, GRID, account, Path("ride.csv")))
     times = np.concatenate([block.time for block in out])
     assert (np.diff(times) >= 0).all()
     channel = np.concatenate([block.channel for block in out])
@@ -115,10 +115,11 @@ def test_values_that_are_missing_stay_missing() -> None:
 def test_the_pace_of_a_channel_does_not_mind_gaps() -> None:
     time = np.rint(np.r_[np.arange(500), 5000 + np.arange(800)] * 1e6).astype(np.int64)
     found = pace(time)
-    assert found.period == pytest.approx(1e-3)
+    assert found is not None and found.period == pytest.approx(1e-3)
     assert found.jitter < 1e-6
     uneven = np.cumsum(np.random.default_rng(0).exponential(1e6, 3000)).astype(np.int64)
-    assert pace(uneven).jitter > 3
+    found = pace(uneven)
+    assert found is not None and found.jitter > 3
 
 
 def test_times_in_another_unit_than_assumed_are_refused_with_the_likely_one(tmp_path: Path) -> None:
@@ -136,7 +137,7 @@ def test_a_channel_that_is_too_slow_is_left_out_and_named() -> None:
     order = np.argsort(time, kind="stable")
     block = SampleBlock(np.rint(time[order] * 1e9).astype(np.int64), channel[order], time[order])
     account = Account()
-    list(at_rate([block], CHANNELS, GRID, account, "ride.csv"))
+    list(at_rate([block], CHANNELS, GRID, account, Path("ride.csv")))
     assert account.problems == ["slower than half of 100 Hz, so left out: slow (10 Hz)"]
 
 

@@ -9,6 +9,7 @@ import cantools
 import numpy as np
 import pytest
 import yaml
+from cantools.database.can import Database
 
 from sprung.model.signals import Channel, Window
 from sprung.replay import open_recording
@@ -132,12 +133,13 @@ def test_a_real_car_log_decodes_as_with_cantools() -> None:
     log, dbc = folder / "gt350-suspensionchange.log", folder / "ford_lincoln_base_pt.dbc"
     database = cantools.database.load_file(dbc, strict=False)
     frames = list(can.LogReader(log))
+    assert isinstance(database, Database)
     known = {m.frame_id: m for m in database.messages}
     present = [known[i] for i in {f.arbitration_id for f in frames} & set(known)]
     channels = [Channel(f"{m.name}.{s.name}", "", 1.0, can=f"{m.name}.{s.name}") for m in present for s in m.signals]
     index = {channel.name: i for i, channel in enumerate(channels)}
     recording = open_recording(log, channels, dbc=database)
-    found = {i: [] for i in range(len(channels))}
+    found: dict[int, list[float]] = {i: [] for i in range(len(channels))}
     for block in recording.blocks():
         for channel, value in zip(block.channel.tolist(), block.value.tolist(), strict=True):
             found[channel].append(value)
@@ -145,12 +147,14 @@ def test_a_real_car_log_decodes_as_with_cantools() -> None:
     assert sum(tally.values()) == len(frames) == 13_072
     assert (tally["used"] + tally["dropped"], tally["corrupt"]) == (12_534, 0)
     missing = compared = 0
-    place = Counter()
+    place: Counter[int] = Counter()
     for frame in frames:
         message = known.get(frame.arbitration_id)
         if message is None:
             continue
-        for name, truth in message.decode(frame.data, decode_choices=False).items():
+        told = message.decode(bytes(frame.data), decode_choices=False)
+        assert isinstance(told, dict)
+        for name, truth in told.items():
             channel = index[f"{message.name}.{name}"]
             value = found[channel][place[channel]]
             place[channel] += 1
@@ -158,6 +162,6 @@ def test_a_real_car_log_decodes_as_with_cantools() -> None:
             if np.isnan(value):
                 missing += 1
             else:
-                assert math.isclose(value, truth, rel_tol=1e-12, abs_tol=1e-12)
+                assert isinstance(truth, int | float) and math.isclose(value, truth, rel_tol=1e-12, abs_tol=1e-12)
     assert compared > 100_000
     assert missing == sum(recording.account.values.values()) > 0

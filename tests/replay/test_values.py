@@ -128,7 +128,7 @@ LINES = [
 
 
 @pytest.mark.parametrize("line", LINES, ids=range(len(LINES)))
-def test_a_line_of_a_candump_log_costs_itself(line: str, tmp_path: Path, dbc: Path) -> None:
+def test_a_line_of_a_candump_log_costs_itself(line: bytes, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.log"
     write_can(path)
     lines = path.read_bytes().splitlines()
@@ -154,7 +154,7 @@ ASC = [
 
 
 @pytest.mark.parametrize("line", ASC, ids=range(len(ASC)))
-def test_a_line_of_an_asc_log_costs_itself(line: str, tmp_path: Path, dbc: Path) -> None:
+def test_a_line_of_an_asc_log_costs_itself(line: bytes, tmp_path: Path, dbc: Path) -> None:
     path = tmp_path / "a.asc"
     write_can(path)
     lines = path.read_bytes().splitlines()

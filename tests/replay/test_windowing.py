@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
+from sprung.model.signals import BoolArray, Channel, FloatArray, SampleBlock, Window
 from sprung.replay.windowing import Windower
 
 RATE = 100.0
@@ -18,7 +19,7 @@ NAMES = ("road", "roof", "axle")
 CHANNELS = [Channel(name, "m", 1e-3) for name in NAMES]
 
 
-def truth(seconds: FloatArray, channel: int | IntArray) -> FloatArray:
+def truth(seconds: FloatArray, channel: int | NDArray[np.int32]) -> FloatArray:
     """A smooth signal with content at 1.3 Hz and 11 Hz, different in every channel."""
     return np.sin(2 * np.pi * 1.3 * seconds + channel) + 0.3 * np.sin(2 * np.pi * 11.0 * seconds + 2.0 * channel)
 

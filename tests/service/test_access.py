@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
+from pydantic import SecretStr
 
 from sprung.model.system import System
 from sprung.service.api.app import create_app
@@ -237,12 +238,12 @@ def test_the_last_token_revoked_does_not_open_the_service(client: TestClient, co
 
 
 def test_the_settings_token_allows_everything(engine: Engine, tmp_path: Path) -> None:
-    core = build_core(Settings(data_dir=tmp_path, admin_token="a-very-long-secret-of-mine"), engine)
+    core = build_core(Settings(data_dir=tmp_path, admin_token=SecretStr("a-very-long-secret-of-mine")), engine)
     with TestClient(create_app(core)) as client:
         assert client.get("/tokens", headers=bearer("a-very-long-secret-of-mine")).status_code == 200
         assert client.get("/tokens", headers=bearer("a-very-long-secret-of-mine2")).status_code == 401
     with pytest.raises(ValueError, match="20 characters"):
-        Settings(admin_token="short")
+        Settings(admin_token=SecretStr("short"))
 
 
 def test_no_secret_is_kept(core: Core, tmp_path: Path) -> None:
@@ -400,7 +401,12 @@ def test_who_tries_tokens_runs_dry_and_others_do_not(strict: Core, token: str, m
     good = strict.tokens.create("feeder", ["read"])[0]
     looked: list[str] = []
     actor = strict.tokens.actor
-    monkeypatch.setattr(strict.tokens, "actor", lambda text: (looked.append(text), actor(text))[1])
+
+    def noted(text: str) -> Any:
+        looked.append(text)
+        return actor(text)
+
+    monkeypatch.setattr(strict.tokens, "actor", noted)
     found = statuses(strict, *[("a", "/vehicles", token)] * 4, ("b", "/vehicles", good))
     assert found == [401, 429, 429, 429, 200]
     assert len(looked) == 1 + bool(token)  # what is refused for coming too often is not looked up

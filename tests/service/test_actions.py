@@ -7,7 +7,7 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import httpx
+import httpx2
 import jsonschema
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) 
 def test_a_key_that_was_used_for_another_upload_is_refused(client: TestClient, path: str) -> None:
     headers = {"Idempotency-Key": "k"}
 
-    def send(name: str = "ride.csv", content: bytes = b"time,a\n0,1\n", vehicle: str = "a") -> httpx.Response:
+    def send(name: str = "ride.csv", content: bytes = b"time,a\n0,1\n", vehicle: str = "a") -> httpx2.Response:
         return client.post(path, files={"file": (name, content)}, data={"vehicle": vehicle}, headers=headers)
 
     first = send()

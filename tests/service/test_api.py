@@ -17,7 +17,7 @@ from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.settings import Settings
-from tests.service_fakes import FakeIdentifier, make_window
+from tests.service_fakes import FakeIdentifier, hold, make_window
 
 PROBLEM = "application/problem+json"
 JSON = {"content-type": "application/json"}
@@ -210,7 +210,7 @@ def test_unknown_paths_methods_and_vehicles_are_problems(client: TestClient) -> 
 
 def test_a_full_queue_is_503_with_a_time_to_wait(client: TestClient, core: Core, body: dict[str, Any]) -> None:
     release, started = threading.Event(), threading.Event()
-    core.compute.submit(lambda: (started.set(), release.wait()))
+    core.compute.submit(lambda: hold(started, release))
     started.wait(5)
     for _ in range(2):
         core.compute.submit(release.wait)

@@ -6,6 +6,8 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +19,7 @@ from sprung.service.api.problems import ApiProblem
 from sprung.service.batching import AnsweredWindow, AskedWindow
 from sprung.service.core import Core
 from sprung.service.errors import Busy
+from sprung.service.processed import Folded, ToFold
 from sprung.service.store.windows import known_starts
 from sprung.service.times import NANOSECONDS
 
@@ -32,6 +35,10 @@ def running(core: Core) -> Iterator[Core]:
 def asked(core: Core, system: System, vehicle: str, second: int) -> AskedWindow:
     values = np.full((system.window, len(system.channels)), 0.01)
     return AskedWindow(values, core.pipeline.engines.shared, vehicle, start=START + second * NANOSECONDS)
+
+
+def ready(one: AskedWindow) -> Callable[[], AskedWindow]:
+    return lambda: one
 
 
 def at_once(core: Core, reads: list[Callable[[], AskedWindow]]) -> list[AnsweredWindow | BaseException]:
@@ -68,7 +75,7 @@ def test_windows_of_several_vehicles_are_tracked_in_one_transaction(
 
     monkeypatch.setattr(running.store, "write", counted)
     wanted = [asked(running, system, f"v{n % 3}", n // 3) for n in range(12)]
-    answers = at_once(running, [lambda one=one: one for one in wanted])
+    answers = at_once(running, [ready(one) for one in wanted])
     assert len(transactions) == 1
     for one, answer in zip(wanted, answers, strict=True):
         assert isinstance(answer, AnsweredWindow)
@@ -97,7 +104,12 @@ def test_windows_gather_while_the_tracker_is_busy_and_those_for_no_tracker_do_no
 ) -> None:
     windows: list[int] = []
     identified = running.batcher._estimate
-    monkeypatch.setattr(running.batcher, "_estimate", lambda batch: (windows.append(len(batch)), identified(batch)))
+
+    def counted(batch: Any) -> Any:
+        windows.append(len(batch))
+        return identified(batch)
+
+    monkeypatch.setattr(running.batcher, "_estimate", counted)
 
     async def ask() -> list[AnsweredWindow]:
         def sent(second: int) -> asyncio.Future[AnsweredWindow]:
@@ -141,15 +153,13 @@ def test_a_vehicle_that_cannot_be_tracked_costs_only_itself(
 ) -> None:
     real = running.pipeline.fold_all
 
-    def failing(
-        connection: Connection, asked: Sequence[AskedWindow], recording_id: str | None = None
-    ) -> list[AnsweredWindow]:
+    def failing(connection: Connection, asked: Sequence[ToFold], recording_id: str | None = None) -> list[Folded]:
         if any(one.vehicle == "sick" for one in asked):
             raise FloatingPointError("no posterior")
         return real(connection, asked, recording_id)
 
     monkeypatch.setattr(running.pipeline, "fold_all", failing)
-    answers = at_once(running, [lambda v=v: asked(running, system, v, 1) for v in ("a", "sick", "b")])
+    answers = at_once(running, [partial(asked, running, system, v, 1) for v in ("a", "sick", "b")])
     assert isinstance(answers[1], FloatingPointError)
     assert stored(running, "a", range(2)) == stored(running, "b", range(2)) == {1}
     assert stored(running, "sick", range(2)) == set()
@@ -166,7 +176,7 @@ def test_a_store_that_takes_nothing_is_told_to_all_after_one_try(
 
     with monkeypatch.context() as patched:
         patched.setattr(running.store, "write", locked)
-        answers = at_once(running, [lambda n=n: asked(running, system, f"v{n}", 1) for n in range(3)])
+        answers = at_once(running, [partial(asked, running, system, f"v{n}", 1) for n in range(3)])
     assert len(tries) == 1
     assert all(isinstance(answer, OperationalError) for answer in answers)
     later = at_once(running, [lambda: asked(running, system, "v0", 1)])

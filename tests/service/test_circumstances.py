@@ -43,8 +43,8 @@ def test_means_are_of_all_windows_however_they_came(store: Store) -> None:
         hours = circumstances_between(connection, "a", START, START + 2 * HOUR, 2)
         part_of = circumstances_between(connection, "a", START + HOUR, START + HOUR + 60 * SECOND, 2000)
     assert (minutes.resolution, len(minutes.time), hours.resolution) == (60, 120, 3600)
-    assert np.allclose(minutes.values["car.load"], loads.reshape(120, 60).mean(axis=1))
-    assert np.allclose(hours.values["car.load"], loads.reshape(2, 3600).mean(axis=1))
+    assert np.allclose(np.array(minutes.values["car.load"], dtype=float), loads.reshape(120, 60).mean(axis=1))
+    assert np.allclose(np.array(hours.values["car.load"], dtype=float), loads.reshape(2, 3600).mean(axis=1))
     assert minutes.values["temperature"][:2] == [3.0, None] and hours.values["temperature"] == [3.0, None]
     assert part_of.time[-1] == START + HOUR and part_of.values["car.load"]
 

@@ -12,6 +12,7 @@ from typing import Any
 import can
 import cantools
 import pytest
+from cantools.database.can import Database
 from fastapi.testclient import TestClient
 
 from sprung.model.system import MANCHESTER, MANCHESTER_DBC, parse_system
@@ -21,14 +22,15 @@ from sprung.service.compute import Compute
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
-from sprung.service.feed import feed_file, prefetched, vehicle_of
+from sprung.service.feed import feed_file, vehicle_of
 from sprung.service.live import LiveFeed
 from sprung.service.main import Feeds, live_feed
 from sprung.service.pipeline import Pipeline
+from sprung.service.reading import prefetched
 from sprung.service.settings import Settings
 from sprung.service.store import open_store, work
 from sprung.service.store.work import JobRow
-from tests.service_fakes import START, FakeIdentifier, diagnose, eventually, make_window
+from tests.service_fakes import START, FakeIdentifier, diagnose, eventually, hold, make_window
 
 SECONDS = 5
 
@@ -158,7 +160,7 @@ def test_a_job_that_a_stop_interrupts_goes_on_at_the_next_start(
     core = build_core(settings, csv_engine)
     started, release = threading.Event(), threading.Event()
     with TestClient(create_app(core, on_stop=lambda: None)) as client:
-        core.compute.submit(lambda: (started.set(), release.wait()))
+        core.compute.submit(lambda: hold(started, release))
         started.wait(5)
         job = upload(client, recording).json()
         eventually(lambda: client.get(f"/jobs/{job['id']}").json()["state"] == "running")
@@ -175,7 +177,7 @@ def test_a_job_that_a_stop_interrupts_goes_on_at_the_next_start(
 
 def test_more_jobs_than_the_queue_holds_are_refused(client: TestClient, core: Core, recording: Path) -> None:
     started, release = threading.Event(), threading.Event()
-    core.compute.submit(lambda: (started.set(), release.wait()))
+    core.compute.submit(lambda: hold(started, release))
     started.wait(5)
     answers = [upload(client, recording, vehicle=f"v{i}").status_code for i in range(3)]
     release.set()
@@ -185,6 +187,7 @@ def test_more_jobs_than_the_queue_holds_are_refused(client: TestClient, core: Co
 def test_a_virtual_bus_is_followed_within_two_seconds(engine: Engine, tmp_path: Path) -> None:
     core = build_core(Settings(data_dir=tmp_path), engine)
     database = cantools.database.load_file(MANCHESTER_DBC)
+    assert isinstance(database, Database)
     bus = LiveBus("virtual", "sprung-test", engine.system.channels, MANCHESTER_DBC, stop=core.stopping)
     feed = LiveFeed(core.pipeline, bus, "live", core.stopping, core.tally_counter(bus.name))
     core.feeds.append(feed)

@@ -8,11 +8,12 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -49,7 +50,7 @@ def _doubles(values: list[int]) -> Iterator[int]:
 
 @pytest.fixture
 def doubling() -> Iterator[ForkedFunctions]:
-    functions = {"double": _double, "pid": os.getpid, "doubles": _doubles}
+    functions: dict[str, Callable[..., Any]] = {"double": _double, "pid": os.getpid, "doubles": _doubles}
     with closing(ForkedFunctions("doubles", functions)) as forked:
         yield forked
 

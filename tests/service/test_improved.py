@@ -17,6 +17,7 @@ from sprung.model.diagnosis.report.report import (
     Report,
     ReportedParameter,
 )
+from sprung.model.schema import SupportInput
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import parse_system
 from sprung.replay.writing import write_recording
@@ -72,7 +73,8 @@ def test_values_laws_and_noise_are_written_and_comments_stay() -> None:
     assert again.laws[0].values == (41.2346, 0.02) and again.laws[0].std == (0.512, 0.001)
     assert again.laws[0].fixed == (False, True)  # the corner's width is not for single windows
     assert again.file.sensors["car_a"].noise == 0.0123
-    assert again.file.inputs["road"].velocity.noise == 6e-4
+    road = again.file.inputs["road"]
+    assert isinstance(road, SupportInput) and road.velocity is not None and road.velocity.noise == 6e-4
     assert again.file.elements["tyre"].damping.fixed
     # written again, laws are replaced and not doubled
     assert len(parse_system(improved_text(text, again, report((friction,)))).laws) == 2  # the bias stays: it was undone

@@ -196,7 +196,7 @@ def test_a_lost_bus_is_told_once_and_told_when_it_is_back(tmp_path: Path, store:
 
     feed = Feed()
     settings = Settings(data_dir=tmp_path, webhooks="http://127.0.0.1:1/", webhook_networks="127.0.0.0/8")
-    notices = Notices(settings, store, lambda: [feed])  # type: ignore[list-item,return-value]
+    notices = Notices(settings, store, lambda: [feed])  # type: ignore[list-item]
     for works in (True, False, False, True):
         feed.works = works
         notices.watch_feeds()

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from sqlalchemy import func, select
 
+from sprung.model.signals import Window
 from sprung.model.system import System
 from sprung.service.compute import Compute, Priority
 from sprung.service.engine import Engine
@@ -16,7 +17,7 @@ from sprung.service.errors import Busy
 from sprung.service.pipeline import Pipeline
 from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.schema import windows
-from tests.service_fakes import HOP, START, FakeIdentifier, make_window
+from tests.service_fakes import HOP, START, FakeIdentifier, hold, make_window
 
 
 @pytest.fixture
@@ -62,13 +63,13 @@ def test_a_restart_goes_on_where_it_stopped(engine: Engine, tmp_path: Path, syst
     assert interrupted == in_one_go
 
 
-def _run(engine: Engine, path: Path, sessions: list[list[object]]) -> dict[str, object]:
+def _run(engine: Engine, path: Path, sessions: list[list[Window]]) -> dict[str, object]:
     state: dict[str, object] = {}
     for session in sessions:
         store, compute = open_store(str(path)), Compute(4)
         pipeline = Pipeline(engine, store, compute)
         for first in range(0, len(session), 7):
-            state = pipeline.process("a", session[first : first + 7]).state.to_dict()  # type: ignore[arg-type]
+            state = pipeline.process("a", session[first : first + 7]).state.to_dict()
         compute.close()
         store.close()
     return state
@@ -165,7 +166,7 @@ def test_requests_overtake_recordings() -> None:
 def test_a_full_queue_refuses_and_closing_finishes_what_was_accepted() -> None:
     compute, release, done = Compute(2), threading.Event(), []
     started = threading.Event()
-    compute.submit(lambda: (started.set(), release.wait()))
+    compute.submit(lambda: hold(started, release))
     started.wait(5)
     for number in range(2):
         compute.submit(lambda number=number: done.append(number))  # type: ignore[misc]

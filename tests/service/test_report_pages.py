@@ -14,8 +14,9 @@ from sprung.model.diagnosis.report.report import (
     LawParameter,
 )
 from sprung.model.system import load_system
+from sprung.service.layout import lay_out
 from sprung.service.report import words, write_report
-from sprung.service.report.drawing import draw_system, lay_out
+from sprung.service.report.drawing import draw_system
 from sprung.service.report.values import largest_bias
 from tests.report_made import SYSTEM, friction_report
 

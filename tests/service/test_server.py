@@ -28,6 +28,7 @@ from sprung.service.errors import NoSpace
 from sprung.service.settings import Settings
 from sprung.service.upload_room import UploadRoom
 from tests.served import served
+from tests.service_fakes import hold
 
 
 def ask(port: int, path: str = "/health/live", seconds: float = 10.0, headers: str = "") -> bytes:
@@ -155,13 +156,14 @@ def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engi
 
 def test_wrong_bodies_cost_milliseconds(engine: Engine, system: System) -> None:
     strings = {f"x{i}": ["1.5"] * 100 for i in range(900)}
-    for channels in (
+    wrong: list[dict[str, Any]] = [
         {c.name: ["a"] * system.window for c in system.channels},
         strings,
         {str(i): [] for i in range(160_000)},
         {"x": [1] * 900_000},
         {c.name: [[]] * 20_000 for c in system.channels},
-    ):
+    ]
+    for channels in wrong:
         body = json.dumps({"sample_rate": 100.0, "channels": channels}).encode()
         begun = time.process_time()
         with pytest.raises(ApiProblem) as caught:
@@ -338,9 +340,9 @@ def test_clients_that_ask_at_once_share_a_batch_and_each_gets_its_own(
         sizes.append(len(values))
         return real(values, *rest, **named)
 
-    core.engine.identifier.identify = noted  # type: ignore[method-assign]
+    core.engine.identifier.identify = noted  # type: ignore[method-assign,assignment]
     release, started = threading.Event(), threading.Event()
-    core.compute.submit(lambda: (started.set(), release.wait()))
+    core.compute.submit(lambda: hold(started, release))
     started.wait(5)
     answers: dict[int, float] = {}
 

@@ -227,7 +227,8 @@ def test_a_store_of_the_version_before_keeps_its_windows(any_store: Store) -> No
     with any_store.read() as connection:
         found = known_windows(connection, "a", model, [START, START + 70 * DAY])
     assert len(found) == 2
-    assert found[START].posterior is not None and found[START].posterior.std[0] == 0.01
+    seen = found[START].posterior
+    assert seen is not None and seen.std[0] == 0.01
 
 
 def test_what_an_alarm_is_not_told_from_is_kept_with_it(any_store: Store) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from fastapi.testclient import TestClient
+from pydantic import BaseModel
 
 from sprung.service.api import models
 
@@ -79,4 +80,5 @@ def test_answers_that_clients_are_made_from_have_examples(client: TestClient) ->
         example = paths[path][method]["responses"][status]["content"]["application/json"]["example"]
         assert example, path
         if model is not None:
+            assert issubclass(model, BaseModel)
             assert model.model_validate(example).model_dump().keys() == example.keys(), path

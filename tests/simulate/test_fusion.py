@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.fusion import motion, motion_noise
 
 NOISE = {0: 1e-5, 1: 5e-4}
@@ -22,7 +23,7 @@ def test_remaining_noise_has_the_stated_spectrum() -> None:
     power = (np.abs(np.fft.rfft(d[:, 28:-28] * np.hanning(200), axis=1)) ** 2).mean(axis=0) / (
         np.hanning(200) ** 2
     ).sum()
-    frequency = np.fft.rfftfreq(200, 0.01)
+    frequency: FloatArray = np.fft.rfftfreq(200, 0.01).astype(float)
     stated = motion_noise(2 * np.pi * frequency, 0.01, NOISE) ** 2
     band = (frequency > 2) & (frequency < 30)
     assert np.abs(power[band] / stated[band] - 1).max() < 0.25

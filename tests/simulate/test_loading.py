@@ -100,6 +100,7 @@ def test_what_windows_say_of_a_load_does_not_hold_their_prior(system: System) ->
     total, pull = np.zeros((5, 5)), np.zeros(5)
     for estimate in Identifier(system).examine(runs.values, np.zeros(48, dtype=bool)):
         said = estimate.deviating
+        assert said is not None
         total += said.information[np.ix_(at, at)]
         pull += said.score[at] + said.information[np.ix_(at, along)] @ said.point[along]  # bodies are as drawn
     found, std = np.linalg.solve(total, pull), np.sqrt(np.diag(np.linalg.inv(total)))
@@ -129,13 +130,13 @@ def test_slopes_along_loads_of_air_springs_and_along_how_bogies_are_built_agree_
     runs = simulate_runs(system, x, system.window, np.random.default_rng(6))
     model = Refiner(system).model
     data = model.batch(model.knots(runs.clean), runs.clean, np.ones(len(system.sensors), dtype=bool))
-    x = torch.as_tensor(x)
-    at = model.linearise(x, data)
+    ratio = torch.as_tensor(x)
+    at = model.linearise(ratio, data)
     known = torch.linalg.qr(at.free.mT)[0]
     for row in (24, 27, 28, *range(29, 33)):  # the last ones: how a bogie is built
-        step = torch.zeros_like(x)
+        step = torch.zeros_like(ratio)
         step[:, row] = 1e-5
-        up, down = (model.chord(at, x + sign * step, at.x0, data).residual for sign in (1, -1))
+        up, down = (model.chord(at, ratio + sign * step, at.x0, data).residual for sign in (1, -1))
         expected, slope = (down - up) / 2e-5, at.sensitivities[:, row, :, None]
         expected, slope = (v - known @ (known.mT @ v) for v in (expected, slope))
         assert float((expected - slope).norm() / expected.norm()) < 0.01

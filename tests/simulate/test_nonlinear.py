@@ -11,12 +11,13 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicHermiteSpline
 from scipy.special import ellipk
 
-from sprung.model.laws import CATALOGUE, ElementLaw, Motion, SpringDamper, find_law
+from sprung.model.laws import CATALOGUE, ElementLaw, Motion, SpringDamper
 from sprung.model.laws.bodies import with_element
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.nonlinear import NonlinearSimulator, Placement, band_limited
 from sprung.model.system import load_system, parse_system
+from tests.named_laws import element_law
 
 RATE = 100.0
 TOY = """
@@ -127,7 +128,7 @@ def reference(
     x = np.zeros(2 * n)
     for placement in placements:
         e, law = placement.elements[0], placement.law
-        now = motion(0.0, x, e, inputs(0.0), ())
+        now = motion(0.0, x, e, inputs(0.0), np.zeros(0))
         begin = law.memory_start(now, placement.p, SpringDamper(m.stiffness[e], m.damping[e]))
         x = np.concatenate([x, np.broadcast_to(begin, (law.memory,))])
     path = [x]
@@ -143,7 +144,7 @@ def error(states: FloatArray, truth: FloatArray) -> float:
 
 @pytest.mark.parametrize("name", TRIALS)
 def test_every_law_agrees_with_dop853(name: str) -> None:
-    mechanics, law = toy(), find_law(name)
+    mechanics, law = toy(), element_law(name)
     knots = drives(mechanics, 80)
     placements = [Placement(law, (1,), TRIALS[name])]
     truth = reference(mechanics, knots, placements)
@@ -159,8 +160,8 @@ def test_two_laws_at_once_on_the_whole_vehicle_agree_with_dop853() -> None:
     mechanics = load_system().mechanics
     knots = drives(mechanics, 40)
     placements = [
-        Placement(find_law("cubic_stiffness"), (0,), (2e11,)),
-        Placement(find_law("coulomb_friction"), (9,), (300.0, 0.002)),
+        Placement(element_law("cubic_stiffness"), (0,), (2e11,)),
+        Placement(element_law("coulomb_friction"), (9,), (300.0, 0.002)),
     ]
     truth = reference(mechanics, knots, placements)
     run = NonlinearSimulator(mechanics, RATE, parts=32).run(knots, placements)
@@ -170,7 +171,7 @@ def test_two_laws_at_once_on_the_whole_vehicle_agree_with_dop853() -> None:
 def test_the_error_falls_with_the_fourth_power_of_the_step() -> None:
     mechanics = toy()
     knots = drives(mechanics, 120)
-    placements = [Placement(find_law("cubic_stiffness"), (1,), (5e7,))]
+    placements = [Placement(element_law("cubic_stiffness"), (1,), (5e7,))]
     truth = NonlinearSimulator(mechanics, RATE, parts=64).run(knots, placements).states
     errors = [
         error(NonlinearSimulator(mechanics, RATE, parts=parts).run(knots, placements).states, truth)
@@ -184,8 +185,8 @@ def test_segments_in_parallel_give_what_one_after_the_other_gives(monkeypatch: p
     mechanics = toy()
     knots = drives(mechanics, 700)
     placements = [
-        Placement(find_law("bump_stop"), (1,), (0.004, 6e4)),
-        Placement(find_law("bouc_wen"), (0,), (2e4, 500.0, 1.0)),
+        Placement(element_law("bump_stop"), (1,), (0.004, 6e4)),
+        Placement(element_law("bouc_wen"), (0,), (2e4, 500.0, 1.0)),
     ]
     simulator = NonlinearSimulator(mechanics, RATE)
     together = simulator.run(knots, placements)
@@ -200,7 +201,7 @@ def test_a_start_near_the_answer_needs_fewer_sweeps() -> None:
     mechanics = toy()
     knots = drives(mechanics, 700)
     simulator = NonlinearSimulator(mechanics, RATE)
-    law = find_law("coulomb_friction")
+    law = element_law("coulomb_friction")
     first = simulator.run(knots, [Placement(law, (1,), (60.0, 0.02))])
     second = simulator.run(knots, [Placement(law, (1,), (60.01, 0.02))], near=first)
     assert second.solution.sweeps < first.solution.sweeps
@@ -217,7 +218,7 @@ def test_without_laws_it_is_the_linear_system() -> None:
 def test_a_law_that_only_adds_stiffness_is_a_stiffer_element() -> None:
     mechanics = toy()
     knots = drives(mechanics, 300)
-    bar = find_law("anti_roll_bar")  # stiffness times the difference of two deflections
+    bar = element_law("anti_roll_bar")  # stiffness times the difference of two deflections
     added = NonlinearSimulator(mechanics, RATE, parts=16).run(knots, [Placement(bar, (1, 0), (3e3,))])
     stiffer = with_element(mechanics, mechanics.H[1] - mechanics.H[0], 3e3, 0.0)
     stiffer.G[-1] = mechanics.G[1] - mechanics.G[0]
@@ -230,12 +231,12 @@ def test_a_law_that_only_adds_stiffness_is_a_stiffer_element() -> None:
 def test_sensors_of_force_and_acceleration_include_the_law() -> None:
     mechanics = toy()
     knots = drives(mechanics, 300)
-    run = NonlinearSimulator(mechanics, RATE).run(knots, [Placement(find_law("cubic_stiffness"), (1,), (5e6,))])
+    run = NonlinearSimulator(mechanics, RATE).run(knots, [Placement(element_law("cubic_stiffness"), (1,), (5e6,))])
     total = 2e4 * run.deflection[:, 1] + 1500 * run.rate[:, 1] + run.force[:, 0]
     inner = slice(30, -30)  # the anti-alias filter does not know what was before and comes after
-    np.testing.assert_allclose(run.outputs[inner, 3], total[inner], atol=2e-3 * np.std(run.force))
+    np.testing.assert_allclose(run.outputs[inner, 3], total[inner], atol=2e-3 * float(np.std(run.force)))
     np.testing.assert_allclose(
-        run.outputs[inner, 0] * 400, -total[inner] + knots[inner, 2], atol=2e-3 * np.std(run.force)
+        run.outputs[inner, 0] * 400, -total[inner] + knots[inner, 2], atol=2e-3 * float(np.std(run.force))
     )
 
 
@@ -257,7 +258,7 @@ def test_friction_takes_out_the_energy_that_leaves_the_free_system() -> None:
     conservative = replace(mechanics, damping=np.zeros(2))
     x0 = np.array([0.02, 0.004, 0.1, 0.0])
     run = NonlinearSimulator(conservative, RATE, parts=32).run(
-        np.zeros((200, 4)), [Placement(find_law("coulomb_friction"), (1,), (40.0, 0.02))], x0=x0
+        np.zeros((200, 4)), [Placement(element_law("coulomb_friction"), (1,), (40.0, 0.02))], x0=x0
     )
     q, v = run.states[:, :n], run.states[:, n:]
     energy = 0.5 * v**2 @ conservative.mass + 0.5 * (q @ conservative.H.T) ** 2 @ conservative.stiffness
@@ -273,7 +274,7 @@ def test_free_vibration_of_a_duffing_oscillator_has_the_elliptic_period() -> Non
     mechanics.H[1] = [1.0, 0.0]  # the strut now holds the body to the ground
     k, k3, m, a = 2e4, 5e7, 400.0, 0.01
     run = NonlinearSimulator(mechanics, RATE, parts=16).run(
-        np.zeros((400, 4)), [Placement(find_law("cubic_stiffness"), (1,), (k3,))], x0=np.array([a, 0, 0, 0])
+        np.zeros((400, 4)), [Placement(element_law("cubic_stiffness"), (1,), (k3,))], x0=np.array([a, 0, 0, 0])
     )
     ratio = k3 * a**2 / (2 * (k + k3 * a**2))
     period = 4 * ellipk(ratio) / np.sqrt((k + k3 * a**2) / m)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from test_system import OSCILLATOR, QUARTER_CAR
 from torch import Tensor
 
 from sprung.model.identification.excitation import simulate_runs
@@ -12,6 +11,7 @@ from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import LinearSimulator, phi_functions
 from sprung.model.simulate.ode import LinearRate, solve
 from sprung.model.system import System, load_system, parse_system
+from tests.test_system import OSCILLATOR, QUARTER_CAR
 
 
 def oscillator(stiffness: float = 800.0, damping: float = 4.0, rate: float = 200) -> System:
@@ -136,6 +136,7 @@ def test_adjoint_gradients_agree_with_the_exact_ones() -> None:
     solve(rate, x0, time, method="rk4", adjoint=True, options={"step_size": simulator.dt / 8}).square().sum().backward()
     log_ratio = torch.zeros(1, 3, dtype=torch.float64, requires_grad=True)
     simulator.simulate(log_ratio, w, x0)[1].square().sum().backward()
+    assert rate.log_ratio.grad is not None and log_ratio.grad is not None
     assert torch.allclose(rate.log_ratio.grad, log_ratio.grad, rtol=1e-4)
 
 

@@ -92,7 +92,8 @@ def test_less_than_the_least_is_an_alarm_too() -> None:
     tracker = follow(least=1000.0)
     state = ride(rng, tracker, tracker.initial_state(), 60, lambda k: 0.0)
     assert [a.parameter for a in state.active] == ["car.load"]
-    assert state.active[0].change < 0
+    (alarm,) = state.active
+    assert alarm.change is not None and alarm.change < 0
 
 
 def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
@@ -100,18 +101,21 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     tracker, state, at = follow(), None, 0
     state = tracker.initial_state()
 
+    def constant(load: float) -> Callable[[int], float]:
+        return lambda k: load
+
     def pressure(load: float) -> Callable[[int], Conditions]:
         return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
 
     for load in (0.0, 0.2, -0.1, 0.1):
-        state = ride(rng, tracker, state, 60, lambda k, load=load: load, at, pressure(load))
+        state = ride(rng, tracker, state, 60, constant(load), at, pressure(load))
         at += 100
-    assert state.cargo.constant[0] == pytest.approx(np.log(4.2e5), abs=0.02)
+    assert state.cargo is not None and state.cargo.constant[0] == pytest.approx(np.log(4.2e5), abs=0.02)
     state = ride(rng, tracker, state, 1, lambda k: 0.25, at, pressure(0.25))
     value, std = tracker.loads(state)["car"]
     assert value == pytest.approx(0.25, abs=0.03)
     assert std < 0.01  # a window alone gives SEEN
-    assert state.cargo.prior_variance[0] < 0.02**2
+    assert state.cargo is not None and state.cargo.prior_variance[0] < 0.02**2
 
 
 def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_believed() -> None:

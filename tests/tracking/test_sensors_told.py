@@ -164,6 +164,7 @@ def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begi
     assert all(a.kind == "sensor" for a in state.alarms)
     assert [a.parameter for a in state.active] == ([] if to < dev.CREPT["gain"] else ["c0.gain"])
     for alarm in state.active:
+        assert alarm.change is not None and alarm.std is not None
         assert abs(alarm.change - to) < 3 * alarm.std < 0.02
         assert alarm.opened > EPOCH + begins * SECOND
     assert all(f.channel == "c0" and abs(f.value - 1 - to) < 3 * f.std for f in tracker.sensors(state))

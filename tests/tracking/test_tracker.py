@@ -329,7 +329,7 @@ def test_report_is_in_physical_units_and_relative_to_both_references() -> None:
     assert damping.ratio == pytest.approx(0.8, rel=0.03)
     assert damping.std == pytest.approx(damping.value * damping.log_std)
     assert damping.baseline == pytest.approx(1.6e4, rel=0.01)
-    assert damping.drift == pytest.approx(damping.value / damping.baseline - 1)
+    assert damping.baseline is not None and damping.drift == pytest.approx(damping.value / damping.baseline - 1)
 
 
 def test_unusable_estimates_and_foreign_states_are_refused_in_plain_words() -> None:

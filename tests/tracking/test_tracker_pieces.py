@@ -104,7 +104,7 @@ def test_false_alarms_do_not_exceed_the_stated_rate(std: float) -> None:
         before = fleet.changes.active
         fleet.update(*errors.draw())
         if k >= 600:
-            opened += np.count_nonzero((fleet.changes.active != 0) & (before == 0))
+            opened += int(np.count_nonzero((fleet.changes.active != 0) & (before == 0)))
     allowed = windows * vehicles / 3000
     assert 0 < opened < 1.2 * allowed
 
@@ -157,7 +157,7 @@ def test_the_innovation_cusum_fires_for_a_lasting_offset_and_hardly_ever_without
     fired = 0
     for _ in range(400):
         quiet, reopened = innovation.update(quiet, rng.normal(size=size), unit, everything)
-        fired += np.count_nonzero(reopened)
+        fired += int(np.count_nonzero(reopened))
     assert fired <= 3
     lost, seen = innovation.start(size), np.zeros(size, dtype=bool)
     for _ in range(20):

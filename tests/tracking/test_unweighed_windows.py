@@ -45,9 +45,9 @@ def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it() -> None
         state = tracker.update(
             state, estimate(value, covariance, deviating=found if weighed else None), EPOCH + k * SECOND
         )
-    mean, std = tracker.posterior(state)
-    assert abs(mean[0]) < 3 * std[0]
-    assert std[0] < 0.015
+    mean, deviation = tracker.posterior(state)
+    assert abs(mean[0]) < 3 * deviation[0]
+    assert deviation[0] < 0.015
     (fault,) = tracker.sensors(state)
     assert fault.channel == "c0"
 
@@ -84,7 +84,7 @@ def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated() -> None:
     everything = np.ones(2, dtype=bool)
     silent = np.ones(1, dtype=bool)
 
-    def corrected(value: FloatArray) -> FloatArray:
+    def corrected(value: FloatArray) -> kalman.Belief:
         return kalman.correct(belief, value, noise, everything, share=1.0, bound=1e9, cross=cross, silent=silent)[0]
 
     after = corrected(values[0])

@@ -50,7 +50,7 @@ def day(
     state: TrackerState,
     minutes: int,
     truth: Callable[[int], FloatArray],
-    conditions: Callable[[int], Conditions],
+    conditions: Callable[[int], Conditions | None],
     first: int = 0,
     every: int = 1,
 ) -> TrackerState:
@@ -77,6 +77,7 @@ def test_weather_that_is_measured_raises_nothing_and_its_slope_is_learned() -> N
     state = day(rng, follow.initial_state(), 4320, lambda k: warm(k, slope)[1],
                 lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
     assert state.alarms == ()
+    assert state.weather is not None and follow.weather is not None
     kinds = [k for k in range(4) if state.weather.kind_mean[k, 1] < -0.01]  # of dampers
     assert len(kinds) == 2
     middle, std = state.weather.kind_mean[kinds, 1], np.sqrt(state.weather.kind_covariance[kinds, 1, 1])
@@ -173,8 +174,9 @@ def test_the_fleet_teaches_a_new_vehicle_its_slopes() -> None:
         state = day(rng, tracker().initial_state(), 2880, lambda k: warm(k, slope)[1],
                     lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
         others.append(state)
-    prior = weather.pooled(tracker().weather, [s.weather for s in others])
-    assert np.array_equal(tracker().newcomer(others).weather.kind_mean, prior.kind_mean)
+    prior = weather.pooled(tracker().weather, [s.weather for s in others if s.weather is not None])
+    taught = tracker().newcomer(others).weather
+    assert taught is not None and np.array_equal(taught.kind_mean, prior.kind_mean)
     dampers = prior.kind_mean[:, 1] < -0.01
     assert np.allclose(prior.kind_mean[dampers, 1] / weather.KELVIN, slope, atol=3e-4)
     assert np.all(prior.kind_std[dampers, 1] < tracker().weather.kind_std[dampers, 1])
@@ -186,6 +188,7 @@ def test_a_repaired_damper_keeps_its_slope_and_learns_its_level() -> None:
     follow = tracker()
     state = day(rng, follow.initial_state(), 400, lambda k: warm(k)[1], lambda k: Conditions(temperature=warm(k)[0]))
     new = follow.relearn(state, [NAMES[15]])
+    assert new.weather is not None and state.weather is not None
     assert new.weather.mean[15, 1] == state.weather.mean[15, 1]
     assert new.weather.mean[15, 0] == 0.0
 
@@ -203,4 +206,5 @@ def test_slow_signals_are_taken_beside_the_windows() -> None:
     assert beside.to(Window(0, 1.0, np.zeros((2, 2)))).auxiliary == [10.0]
     assert beside.to(Window(second, 1.0, np.zeros((3, 2)))).auxiliary == [15.0]
     assert beside.to(Window(10 * second, 1.0, np.zeros((3, 2)))).auxiliary == [20.0]
-    assert np.isnan(beside.to(Window(90 * second, 1.0, np.zeros((3, 2)))).auxiliary)
+    silent = beside.to(Window(90 * second, 1.0, np.zeros((3, 2)))).auxiliary
+    assert silent is not None and np.isnan(silent)

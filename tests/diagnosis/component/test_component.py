@@ -313,7 +313,7 @@ def test_what_was_found_is_written_into_the_system_file_and_found_there(tmp_path
     assert {law.effect for law in first.laws} == {"coulomb_friction", "cubic_stiffness", "preload"}
     source = tmp_path / "rig.yaml"
     source.write_text(TEXT)
-    write_improved(tmp_path / "better.yaml", source, system(), first)
+    write_improved(tmp_path / "better.yaml", source.read_text(), system(), first)
     improved = load_system(tmp_path / "better.yaml")
     again = diagnose(improved, RigRecording(columns))
     assert (again.verdict, laws(again)) == ("consistent", [])
@@ -344,7 +344,7 @@ def test_a_force_of_no_law_is_told_as_its_formula_and_goes_into_the_system_file(
     file = tmp_path / "damper.yaml"
     file.write_text(TEXT, encoding="utf-8")
     improved = tmp_path / "improved.yaml"
-    write_improved(improved, file, system(), found)
+    write_improved(improved, file.read_text(encoding="utf-8"), system(), found)
     assert "a * d**2 + b * d * abs(v)" in improved.read_text(encoding="utf-8")
     values = np.column_stack([d, K * d + C * v + 6e4 * d * np.abs(v) + 3e6 * d**2])
     noisy = values + np.random.default_rng(3).normal(0, [1e-6, 1.0], values.shape)

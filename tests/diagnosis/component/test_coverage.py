@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks import naming
+from sprung.benchmarks.naming_rigs import RIGS
 from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
 from sprung.model.diagnosis.component.fit import ComponentModel, refined
 from sprung.model.diagnosis.component.measured import component_records
@@ -18,7 +19,7 @@ LUGRE = next(piece for piece in PIECES if piece.effect == "lugre")
 def deviations(seed: int, motion: str) -> list[float]:
     """Errors of yield force and yield displacement over their stated deviations, fitted from near the truth."""
     random = np.random.default_rng([seed, 7, 3])
-    drawn, rig = int(random.integers(2**31)), naming.RIGS["lugre"]
+    drawn, rig = int(random.integers(2**31)), RIGS["lugre"]
     d = naming.moved(motion, random)
     force = naming.forces(rig, d, drawn, naming.levels(random))
     again = np.random.default_rng(drawn)

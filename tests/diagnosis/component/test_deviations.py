@@ -14,9 +14,8 @@ from sprung.model.signals import FloatArray
 
 RATE, K, C = 100.0, 2e4, 900.0
 T = np.arange(2000) / RATE
-D = sum(
-    size * np.sin(2 * np.pi * f * T + at) for size, f, at in ((0.008, 0.7, 0.2), (0.005, 1.9, 1.1), (0.002, 4.7, 2.0))
-)
+PARTS = ((0.008, 0.7, 0.2), (0.005, 1.9, 1.1), (0.002, 4.7, 2.0))  # m, Hz, phase
+D: FloatArray = sum((size * np.sin(2 * np.pi * f * T + at) for size, f, at in PARTS), np.zeros(len(T)))
 V = np.gradient(D, T)
 
 

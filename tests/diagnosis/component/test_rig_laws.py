@@ -134,4 +134,5 @@ def test_a_friction_that_turns_slowly_is_not_told_from_a_valve(smoothing: float,
     (friction,) = [f for f in report.findings if f.effect in ("coulomb_friction", "damper_blowoff")]
     assert (friction.family is None) is told
     if not told:
+        assert friction.family is not None
         assert {"coulomb_friction", "damper_blowoff"} <= set(friction.family.split(" or "))

@@ -79,8 +79,8 @@ def test_friction_and_offset_come_back_within_their_uncertainty_in_closed_loop(
         fit.point.terms[0].parameters[0],
         fit.point.terms[1].parameters[0],
     ]
-    deviations = np.sqrt(np.diag(fit.covariance))
-    deviations = [*deviations[:2] * values[:2], deviations[2], deviations[4]]
+    std = np.sqrt(np.diag(fit.covariance))
+    deviations = [*std[:2] * values[:2], std[2], std[4]]
     np.testing.assert_allclose(values, truth, rtol=0.05)
     assert np.abs((np.array(values) - truth) / deviations).max() < 4
 

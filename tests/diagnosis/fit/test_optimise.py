@@ -33,7 +33,7 @@ def test_a_fit_is_never_worse_than_any_point_that_it_saw(
     seen = []
     whole = module._state
 
-    def recorded(*args: Any) -> Fit:
+    def recorded(*args: Any) -> module._State:
         seen.append(whole(*args))
         return seen[-1]
 

@@ -9,21 +9,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
 
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, Report, diagnose
 from sprung.model.diagnosis.investigation import diagnose as course
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.compete import Trial
-from sprung.model.laws import CATALOGUE
+from sprung.model.laws import CATALOGUE, ElementLaw
 from sprung.model.laws.own import load_laws
 from sprung.model.system import parse_system
 from sprung.service.cli.export import export
 from sprung.service.improved import improved_text
 from sprung.service.own_laws import write_laws
 from sprung.service.report.forces import force_figure
+from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
+from tests.named_laws import element_law
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +49,11 @@ def test_a_formula_is_written_into_the_system_file_and_read_again(told: Report) 
     system = quarter_car()
     again = parse_system(improved_text(SYSTEM, system, told))
     (placed,) = again.laws
-    assert placed.law.formula == "a * d * abs(v)" and placed.values[0] == pytest.approx(3e6, rel=0.05)
+    assert (
+        isinstance(placed.law, ElementLaw)
+        and placed.law.formula == "a * d * abs(v)"
+        and placed.values[0] == pytest.approx(3e6, rel=0.05)
+    )
 
 
 @pytest.mark.slow
@@ -79,18 +85,21 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     def trial(law: Any, gain: float, freedom: int) -> Trial:
         term = Term(law, "secondary", tuple(1.0 for _ in law.parameters))
         point = SimpleNamespace(terms=(term,))
-        return Trial(None, SimpleNamespace(point=point, **vars(fit)), gain, gain, gain, freedom)
+        nothing: Any = None
+        fitted: Any = SimpleNamespace(point=point, **vars(fit))
+        return Trial(nothing, fitted, gain, gain, gain, freedom)
 
-    (stop,) = (law for law in CATALOGUE if law.name == "bump_stop")
+    stop = element_law("bump_stop")
     force = replace(stop, named=False)
-    state = SimpleNamespace(
+    state: Any = SimpleNamespace(
         options=Options(),
         problem=SimpleNamespace(rules=RULES, process_noise=False),
         fit=SimpleNamespace(reduced=2.0, count=10_000),
         system=quarter_car(),
     )
     leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
-    assert course._led_by(state, [leader, unnamed]) is {"force": unnamed, "stop": leader, None: None}[expected]
+    led: dict[str | None, Trial | None] = {"force": unnamed, "stop": leader, None: None}
+    assert course._led_by(state, [leader, unnamed]) is led[expected]
 
 
 def test_a_law_of_the_catalogue_stays_one() -> None:
@@ -124,7 +133,7 @@ def test_a_formula_becomes_a_law_of_ones_own(told: Report, tmp_path: Path) -> No
     path = tmp_path / "my_laws.py"
     assert write_laws(path, told) == 1
     (law,) = load_laws(path, tuple(one.name for one in CATALOGUE))
-    assert law.name == "secondary_law_1" and law.strength == 0 and law.listed
+    assert isinstance(law, ElementLaw) and law.name == "secondary_law_1" and law.strength == 0 and law.listed
     other = simulate(lambda d, v: 2e6 * d * abs(v), seconds=15.0, seed=6)
     catalogue = (*CATALOGUE, law)
     report = diagnose(quarter_car(), other, Options(catalogue=catalogue))

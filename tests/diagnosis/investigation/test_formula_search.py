@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from diagnosis_cases import DAMPING, STIFFNESS, quarter_car, simulate
 
 from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation, Options
@@ -19,6 +18,7 @@ from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.diagnosis.selection.compete import Trial, compete
 from sprung.model.diagnosis.selection.starts import start_of
 from sprung.model.laws.grammar import Factor, Shape, law_of
+from tests.diagnosis_cases import DAMPING, STIFFNESS, quarter_car, simulate
 
 RATE, STOP, GAP = 2e6, -4e5, 0.002
 

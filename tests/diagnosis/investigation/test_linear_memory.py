@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
 
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.laws import SpringDamper, find_law
+from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
+from tests.diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
+from tests.named_laws import element_law
 
 SIZE, ORDER = 6.0e4, 0.4
 K, C = STIFFNESS["secondary"], DAMPING["secondary"]
@@ -32,7 +33,7 @@ def ride(of: Callable[[np.ndarray], np.ndarray], seconds: float = 30.0, seed: in
 
 def test_the_branches_follow_the_power_beside_a_spring_and_a_damper() -> None:
     """Over the band of a suspension, what a spring and a damper take up apart."""
-    law, time = find_law("fractional_stiffness"), np.arange(0, 80, 0.002)
+    law, time = element_law("fractional_stiffness"), np.arange(0, 80, 0.002)
     frequency = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0])
     error = []
     for f in frequency:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.setup_changes import attached
@@ -31,7 +32,6 @@ from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.damping import COULOMB_FRICTION
 from sprung.model.system import System, load_system, parse_system
-from tests.diagnosis_cases import SYSTEM as QUARTER_CAR
 from tests.diagnosis_cases import quarter_car, simulate
 
 
@@ -61,7 +61,9 @@ def test_a_delay_is_taken_back_and_positions_move_in_the_file() -> None:
     lost = (signals.samples - early.samples) // 2
     middle = slice(50, 300)
     np.testing.assert_allclose(
-        early.sensors[middle, 0], signals.sensors[lost + 3 :, 0][middle], atol=0.1 * np.std(signals.sensors[:, 0])
+        early.sensors[middle, 0],
+        signals.sensors[lost + 3 :, 0][middle],
+        atol=0.1 * float(np.std(signals.sensors[:, 0])),
     )
     train = load_system()
     sensor, element = train.sensors[0], train.elements[0]

@@ -90,4 +90,5 @@ def test_a_small_second_law_counts_where_it_explains_most_of_what_is_no_noise(
 ) -> None:
     monkeypatch.setattr(diagnose, "leaves_more_than_noise", lambda state: noisy)
     state: Any = SimpleNamespace(options=Options(), fit=SimpleNamespace(chi_square=100.0))
-    assert diagnose._explains_the_rest(state, SimpleNamespace(worth=worth)) is counts
+    found: Any = SimpleNamespace(worth=worth)
+    assert diagnose._explains_the_rest(state, found) is counts

@@ -10,7 +10,7 @@ from sprung.model.diagnosis.report.report import Finding, FitFigures, Identified
 
 
 def test_numbers_that_are_not_finite_are_null() -> None:
-    figures = FitFigures(np.float64(0.5), {"car_1": float("nan"), "car_2": np.inf})  # type: ignore[arg-type]
+    figures = FitFigures(np.float64(0.5), {"car_1": float("nan"), "car_2": np.inf})
     assert plain(figures) == {"nrmse": 0.5, "per_sensor": {"car_1": None, "car_2": None}}
     assert json.dumps(plain(figures), allow_nan=False)
 

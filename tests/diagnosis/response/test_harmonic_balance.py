@@ -23,7 +23,9 @@ def solved(k3: float, warm: bool = False) -> LawForces:
     if warm:
         forces = PROBLEM.forward(point).law_forces(point.state)
         point = replace(point, warm_start=warm_start_of(forces))
-    return PROBLEM.forward(point).law_forces(point.state)
+    forces = PROBLEM.forward(point).law_forces(point.state)
+    assert forces is not None
+    return forces
 
 
 @pytest.mark.parametrize("k3", [1e8, 4e9])
@@ -39,9 +41,10 @@ def test_a_stop_that_is_hit_all_the_time_is_solved_by_newtons_steps() -> None:
     point = Point(np.zeros(len(PROBLEM.system.parameters)), (stop,), np.zeros(4))
     forward = PROBLEM.forward(point)
     loop = forward.loop(point.state)
-    assert not replace(forward, patient=False).law_forces(point.state).converged
+    hasty = replace(forward, patient=False).law_forces(point.state)
+    assert hasty is not None and not hasty.converged
     forces = forward.law_forces(point.state)
-    assert forces.converged
+    assert loop is not None and forces is not None and forces.converged
     expected = loop.law(forces.deflection, forces.rate)
     np.testing.assert_allclose(forces.force, expected, atol=1e-4 * np.max(np.abs(expected)))
 

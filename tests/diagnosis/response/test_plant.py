@@ -38,7 +38,7 @@ def test_branches_act_alike_in_frequency_and_in_free_motion(branch: Branch) -> N
     for j in (1, 20, 150):
         states = np.linalg.solve(1j * grid.omega[j] * np.eye(len(A)) - A, loads)
         np.testing.assert_allclose(states[:n], plant.receptance[j], rtol=1e-8, atol=1e-16)
-        force = structure.branch_forces(structure.H[None] @ states[:n, 0], grid.omega[j : j + 1])
+        force = structure.branch_forces((structure.H[None] @ states[:n, 0]).astype(complex), grid.omega[j : j + 1])
         np.testing.assert_allclose(states[2 * n, 0], force[0, 0], rtol=1e-8)
 
 

@@ -19,6 +19,7 @@ from sprung.model.diagnosis.screening.score import Candidate, Screening
 from sprung.model.laws import find_law
 from sprung.model.system import load_system
 from tests.diagnosis_cases import quarter_car
+from tests.named_laws import element_law
 
 
 def candidate(score: float, family: Family, law: str = "cubic_stiffness", count: int = 1) -> Candidate:
@@ -50,7 +51,7 @@ def test_chances_are_multiplied_by_what_was_tried() -> None:
 
 
 def test_an_anti_roll_bar_goes_between_left_and_right_and_nothing_is_a_pair_on_a_quarter_car() -> None:
-    bar = find_law("anti_roll_bar")
+    bar = element_law("anti_roll_bar")
     assert "secondary_1l|secondary_1r" in places(load_system(), bar)
     assert places(quarter_car(), bar) == []
     assert wheelsets(quarter_car()) == []

@@ -44,7 +44,8 @@ def test_what_could_lead_is_fitted_on_while_it_gets_further(
     monkeypatch.setattr(compete, "_finished", fitted_on)
     problem: Any = SimpleNamespace(process_noise=True, rules=RULES)
     base: Any = None
-    settled = replace(trial(100.0, 0.0), fit=replace(trial(100.0, 0.0).fit, converged=True))
+    done: Any = FallingFit(0.0, converged=True)
+    settled = replace(trial(100.0, 0.0), fit=done)
     order = compete._settled(problem, base, [settled, trial(60.0, 50.0)])
     assert len(tried) == calls
     assert order[0].evidence == leading

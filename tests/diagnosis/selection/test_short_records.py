@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.selection.compete import profile_gain
+from sprung.model.diagnosis.selection.evidence import profile_gain
 
 
 @pytest.mark.parametrize("bins", [2, 3, 19, 23, 24, 25, 100, 1000])

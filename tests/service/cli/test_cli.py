@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.identification.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
@@ -23,7 +24,7 @@ from sprung.service.cli.bench import parse
 from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
 from sprung.service.settings import Settings
-from tests.diagnosis_cases import SYSTEM, simulate
+from tests.diagnosis_cases import simulate
 from tests.service_fakes import START, FakeIdentifier
 
 SECONDS = 40

@@ -130,8 +130,10 @@ def test_times_in_ms_that_nobody_declared_are_an_error(tmp_path: Path, capfd: py
 
 def test_the_example_of_the_documents_works(tmp_path: Path) -> None:
     text = (DOCS / "own-data.md").read_text(encoding="utf-8")
-    head = re.search(r"```\n(# Versuch.*?)\.\.\.\n```", text, re.DOTALL)[1]
-    system = parse_system(re.search(r"```yaml\n(.*?)```", text, re.DOTALL)[1])
+    written = re.search(r"```\n(# Versuch.*?)\.\.\.\n```", text, re.DOTALL)
+    described = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert written and described
+    head, system = written[1], parse_system(described[1])
     time = np.arange(2, 2000) * 0.5
     rows = "".join(f"{t};{20 * np.sin(t / 100):.3f};{np.cos(t / 100):.3f}\n".replace(".", ",") for t in time[:-1])
     (tmp_path / "versuch7.csv").write_text(head + rows, encoding="utf-8")

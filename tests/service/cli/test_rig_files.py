@@ -16,7 +16,7 @@ nptdms = pytest.importorskip("nptdms")
 import pyarrow as pa  # noqa: E402
 import pyarrow.parquet as pq  # noqa: E402
 
-from tests.replay.test_series import uff58  # noqa: E402
+from tests.replay_files import uff58  # noqa: E402
 
 FRICTION, STEP = 60.0, 0.01  # N, s
 

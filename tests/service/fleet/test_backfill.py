@@ -20,7 +20,7 @@ from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
 from sprung.service.fleet.tasks import HereTasks, WorkLost
 from sprung.service.pipeline import Pipeline
-from sprung.service.reading import ReadRequest
+from sprung.service.reading import Here, ReadRequest
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, history, open_store, status
 from sprung.service.store.fleet import WantedAlarms
@@ -192,7 +192,7 @@ def test_a_copy_of_a_recording_adds_nothing_and_is_told(plan: BackfillPlan, plac
 def test_a_recording_that_breaks_a_reader_is_told_of_and_the_others_go_on(
     plan: BackfillPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    identify = module.Here
+    identify = Here
 
     def breaking(request: ReadRequest) -> object:
         if request.path.name == "b-north-1.mcap":

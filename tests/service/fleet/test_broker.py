@@ -20,7 +20,7 @@ from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet import broker as module
 from sprung.service.fleet.broker import Broker, BrokerMessage, ConsumerCounts, consume
-from sprung.service.fleet.ingest import Ingest
+from sprung.service.fleet.ingest import Ingest, read_messages
 from sprung.service.fleet.kafka_broker import KafkaBroker
 from sprung.service.fleet.message import encode
 from sprung.service.fleet.nats_broker import NatsBroker, NatsLink, ack_seconds
@@ -188,7 +188,7 @@ def test_nats_keeps_messages_over_kills_of_both_sides(
     async def dies() -> None:
         broker = await NatsBroker.open(address, ack_seconds=0.5)
         found: Sequence[BrokerMessage] = await broker.fetch(2, 5.0)
-        ingest.take(module.read_messages([one.body for one in found]))
+        ingest.take(read_messages([one.body for one in found]))
         await broker.close()
 
     asyncio.run(dies())

@@ -62,7 +62,7 @@ def test_a_name_that_is_no_vehicle_is_refused(client: TestClient, sent: Message)
 
 
 def test_a_token_of_another_fleet_or_without_the_scope_is_refused(client: TestClient, sent: Message) -> None:
-    made = {}
+    made: dict[str, str] = {}
     for name, scopes, fleet in (("admin", ["admin"], ""), ("south", ["ingest"], "south-"), ("reader", ["read"], "")):
         headers = {"authorization": f"Bearer {made['admin']}"} if made else {}
         answer = client.post("/tokens", json={"name": name, "scopes": scopes, "fleet": fleet}, headers=headers)

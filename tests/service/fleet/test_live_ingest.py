@@ -95,7 +95,7 @@ def test_several_windows_of_a_vehicle_travel_in_one_request(client: TestClient, 
 
 def test_what_is_wrong_with_several_windows_names_the_one(client: TestClient, system: System) -> None:
     good = {"start": "2026-09-21T14:13:20Z", "channels": window(system)["channels"]}
-    short = good | {"channels": good["channels"] | {system.channels[0].name: [0.0]}}  # type: ignore[dict-item]
+    short = good | {"channels": good["channels"] | {system.channels[0].name: [0.0]}}
     cases = {
         "windows.1.channels": [good, short],
         "windows.1.start is no": [good, good | {"start": "yesterday"}],
