@@ -6,7 +6,7 @@ TORCH_INDEX ?=
 VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
-SOURCES := sprung noxfile.py docs/imports.py model replay service benchmarks tests
+SOURCES := sprung noxfile.py docs/*.py deploy/grafana/*.py model replay service benchmarks tests
 # seconds of the demo's working day
 DAY ?= 1200
 DEMO := .demo/$(DAY)/day.blf

@@ -11,9 +11,14 @@ LOCK = Path(__file__).resolve().parents[1] / "requirements.lock"
 def licence(name: str) -> str:
     """The licence expression, else the classifier, else the first line of the licence field."""
     found = metadata(name)
-    classifiers = [line.rpartition(" :: ")[2] for line in found.get_all("Classifier", []) if line.startswith("License")]
-    said = found.get("License-Expression") or ", ".join(classifiers) or (found.get("License") or "not stated")
-    return said.strip().splitlines()[0][:80]
+
+    def stated(field: str) -> list[str]:
+        return [str(value) for value in found.get_all(field) or []]
+
+    classifiers = [line.rpartition(" :: ")[2] for line in stated("Classifier") if line.startswith("License")]
+    said = next((", ".join(x) for x in (stated("License-Expression"), classifiers, stated("License")) if any(x)), "")
+    said = said.strip() or "not stated"
+    return said.splitlines()[0][:80]
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ CHANNELS = [
     Channel("right", "m/s^2", 0.01, mcap="/body/acceleration.axes[1].right", can="Body.Right", csv="right"),
 ]
 NUMBERS = np.arange(ROWS)
-LEFT: FloatArray = np.round(np.sin(NUMBERS.astype(float) / 7.0), 3)
+LEFT: FloatArray = np.round(np.sin(NUMBERS / 7.0), 3).astype(np.float64)
 RIGHT: FloatArray = np.round(2.0 * np.cos(NUMBERS / 5.0), 3)
 VALUES = np.stack([LEFT, RIGHT], axis=1)
 TIMES = START + NUMBERS * STEP

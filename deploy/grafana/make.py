@@ -95,7 +95,7 @@ def health_mapping() -> list[dict[str, Any]]:
     return [{"type": "value", "options": options}]
 
 
-def annotations(where: str) -> dict[str, Any]:
+def alarm_marks(where: str) -> dict[str, Any]:
     """Alarms as they open."""
     opened = {
         "name": "Alarms",
@@ -111,7 +111,7 @@ def annotations(where: str) -> dict[str, Any]:
 
 def variable(name: str, label: str, query: str, every: bool = False) -> dict[str, Any]:
     """A drop-down of a label's values."""
-    found = {"name": name, "label": label, "type": "query", "datasource": SOURCE, "query": query}
+    found: dict[str, Any] = {"name": name, "label": label, "type": "query", "datasource": SOURCE, "query": query}
     found |= {"refresh": 2, "sort": 1}
     return found | ({"includeAll": True, "multi": True, "current": {"text": "All", "value": "$__all"}} if every else {})
 
@@ -140,7 +140,7 @@ def dashboard(
         "time": {"from": "now-1h", "to": "now"},
         "tags": ["sprung"],
         "links": links,
-        "annotations": annotations(where),
+        "annotations": alarm_marks(where),
         "templating": {"list": variables},
         "panels": [{"id": i + 1} | each for i, each in enumerate(panels)],
     }

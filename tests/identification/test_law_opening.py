@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from sprung.model.identification.identify import load_identifier
+from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.law_opening import opened
 from sprung.model.identification.law_point import WindowPoint
 from sprung.model.identification.law_window import LawWindows
@@ -110,6 +110,8 @@ def test_a_law_that_pushes_windows_away_is_no_end_of_the_batch() -> None:
     _, values = ride(CUBIC, 4.0)
     windows = windows_of(values)[:3]
     pushing = parse_system(VEHICLE.replace("LAWS", "[{formula: {formula: 'a * d * abs(v)', a: 3.0e+8}}]"))
-    found = load_identifier(pushing).examine(windows, np.ones(3, dtype=bool))
+    identifier = load_identifier(pushing)
+    assert isinstance(identifier, Identifier)
+    found = identifier.examine(windows, np.ones(3, dtype=bool))
     assert not any(estimate.adequate for estimate in found)
     assert all(np.isfinite(estimate.covariance).all() for estimate in found)

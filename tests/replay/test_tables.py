@@ -276,7 +276,7 @@ def test_a_ride_whose_times_begin_at_0_gets_a_start(tmp_path: Path) -> None:
     assert load_record(tmp_path / "a.csv", (X, F), 100.0).values.shape == (500, 2)
 
 
-def test_columns_are_called_as_channels_where_the_system_file_names_none(tmp_path):
+def test_columns_are_called_as_channels_where_the_system_file_names_none(tmp_path: Path) -> None:
     path = tmp_path / "simulated.csv"
     path.write_text(table())
     _, values, _ = read(path, (Channel("x", "m", 1e-6), Channel("F", "N", 1.0)))

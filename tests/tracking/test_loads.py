@@ -50,6 +50,10 @@ def ride(
     return state
 
 
+def constant(load: float) -> Callable[[int], float]:
+    return lambda k: load
+
+
 def worst(tracker: Tracker, state: TrackerState) -> float:
     mean, std = tracker.posterior(state)
     return float(np.abs(mean / std).max())
@@ -101,9 +105,6 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     tracker, state, at = follow(), None, 0
     state = tracker.initial_state()
 
-    def constant(load: float) -> Callable[[int], float]:
-        return lambda k: load
-
     def pressure(load: float) -> Callable[[int], Conditions]:
         return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
 
@@ -128,18 +129,18 @@ def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_believ
         return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
 
     for load in (0.0, 0.2, -0.1, 0.1):
-        state = ride(rng, tracker, state, 60, lambda k, load=load: load, at, pressure(load))
+        state = ride(rng, tracker, state, 60, constant(load), at, pressure(load))
         at += 100
     for load in (0.25, -0.2, 0.2, -0.25, 0.15):
         for k in range(at, at + 60):
-            state = ride(rng, tracker, state, 1, lambda k, load=load: load, k, pressure(0.1))
+            state = ride(rng, tracker, state, 1, constant(load), k, pressure(0.1))
             value, std = tracker.loads(state)["car"]
             wrong.append(abs(value - load) > 4 * std)
         at += 100
     assert sum(wrong[:60]) <= 5
     assert sum(wrong[60:]) == 0
     assert state.alarms == ()
-    assert state.cargo.scatter[0] > 0.05**2
+    assert state.cargo is not None and state.cargo.scatter[0] > 0.05**2
 
 
 def test_windows_that_do_not_fit_in_a_measured_curve_are_passed_over() -> None:

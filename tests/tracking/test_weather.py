@@ -115,7 +115,7 @@ def test_a_temperature_that_is_lost_on_a_cold_day_accuses_no_damper(lost: float)
         lambda k: system.conditions(np.array([20.0 - 45.0 * min(k / 100, 1) if k < 120 else lost])),
     )  # fmt: skip
     assert state.alarms == ()
-    assert state.weather.warmth[0] == pytest.approx(-2.5)
+    assert state.weather is not None and state.weather.warmth[0] == pytest.approx(-2.5)
 
 
 def test_oil_that_leaves_all_dampers_at_once_is_one_message() -> None:
