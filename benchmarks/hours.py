@@ -53,7 +53,7 @@ def _hour(number: int, seed: int) -> dict[str, Any]:
     unused = {RUNNING: 0, EXCITED: 0}  # windows at these speeds or more
     for moment in through(engine, vehicle, timetable):
         state = moment.state
-        speed = timetable.at(timetable.speed, moment.time)
+        speed = float(timetable.at(timetable.speed, moment.time))
         if speed < RUNNING:
             continue
         ran, fast = ran + 1, fast + (speed >= EXCITED)
