@@ -69,6 +69,8 @@ def simulated(system: System, run: MenuRun, seed: int = 0, noise: np.random.Gene
 def promise(truth: System, other: System, run: MenuRun, known: float = KNOWN, seed: int = 0) -> Promise:
     """What a run tells against `other` where `truth` is true."""
     values = simulated(truth, run, seed)
+    if not np.isfinite(values).all():  # too violent for the simulation itself
+        return Promise(0.0, 0.0)
     right = fitted(loaded(truth, run), values, known)
     sound = right.chi_square < _SOUND
     if not sound.any():

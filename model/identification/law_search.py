@@ -150,7 +150,8 @@ class LawSearch:
             )
         done = ((second.small(std) & held) | still) & ~worse
         _, astray = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
-        ripe = ((done | last) & (astray == 0) & self.wanted[rows]).nonzero().squeeze(1)
+        sane = (astray == 0) & second.there.isfinite()
+        ripe = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
         if len(ripe):
             weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)
             self._weigh(rows[ripe], columns.take(ripe), *weighed)

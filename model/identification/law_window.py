@@ -242,6 +242,8 @@ class LawWindows:
         whiten = self.model.whitening(carried)
         shown = self.shown(point, steps, motion, data, smooth, along, flow)
         white = as_rows(whiten @ self._by_bin(shown))
+        sound = white.isfinite().all(dim=2).all(dim=1)  # a motion that has run away, and its law's memory, tell nothing
+        white = torch.where(sound[:, None, None], white, 0.0)
         N = point.x0.shape[1]
         free, J = white[:, :N], white[:, N:]
         free_scale = free.square().sum(dim=2).sqrt().clamp_min(1e-300)
@@ -254,7 +256,7 @@ class LawWindows:
         precision = torch.full((len(J), self.unknowns), 1 / PRIOR_STD**2, dtype=torch.float64)
         precision[:, self.linear] = self.model.precision[: len(self.linear)]
         if self.memories:
-            precision[:, self.told :] = (_MEMORY_STD * flow.memory_size) ** -2.0
+            precision[:, self.told :] = (_MEMORY_STD * torch.where(sound[:, None], flow.memory_size, 1.0)) ** -2.0
         covariance = torch.linalg.inv(information + torch.diag_embed(precision))
         told = (information, covariance, precision)
         return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told), flow

@@ -86,6 +86,8 @@ def test_what_even_the_truth_leaves_unexplained_promises_nothing(monkeypatch: py
     values[-200:, 2:] += np.random.default_rng(0).normal(0, 30 * np.std(values[:, 2:]), values[-200:, 2:].shape)
     monkeypatch.setattr(evidence, "simulated", lambda *_: values)
     assert 0 < promise(cubic, bare, SWEEP).evidence < whole
+    monkeypatch.setattr(evidence, "simulated", lambda *_: np.where(values > np.median(values), np.nan, values))
+    assert promise(cubic, bare, SWEEP).evidence == 0  # a motion that the simulation has lost
 
 
 def test_a_model_promises_nothing_against_itself_and_more_on_a_rougher_run() -> None:

@@ -94,11 +94,11 @@ def _free(term: Term, parameters: tuple[LawParameter, ...]) -> tuple[LawParamete
 def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | None]:
     """The laws at the same place that the recording cannot tell from the chosen one, and what would.
 
-    One that is clearly likelier with values that it cannot have is among them: its values may be what is wrong.
+    One that is likelier with values that it cannot have is among them: its values may be what is wrong.
     """
     best = found.trial
     close = [t for t in found.trials if t.evidence > best.evidence - rules.naming_margin]
-    close += [t for t in found.disbelieved if t.evidence > best.evidence + rules.naming_margin]
+    close += found.disbelieved
     near = [
         t for t in close if t.named and t.term.location == best.term.location and t.term.law.name != best.term.law.name
     ]
