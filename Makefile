@@ -85,10 +85,11 @@ format: install-dev
 	$(BIN)/ruff format $(SOURCES)
 	$(BIN)/ruff check --fix $(SOURCES)
 
-# what is in the lock, with licences; what is known against it; what bandit finds in the source
-sbom: install-dev
-	$(BIN)/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
-	$(BIN)/cyclonedx-py requirements requirements.lock --of JSON -o sbom.json
+# what is installed, with licences; what is known against it; what bandit finds in the source
+sbom: install
+	$(PYTHON) -m venv .sbom
+	.sbom/bin/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
+	.sbom/bin/cyclonedx-py environment $(BIN)/python --of JSON -o sbom.json
 
 # the SHA-256 of every file of the packages in both locks; torch comes from an index of the user's choice
 # (needs only uv: works also before what was added to a lock is installed)

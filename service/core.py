@@ -129,8 +129,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         board.forget(vehicle)
         rides.forget(vehicle)
 
-    system = engine.system
-    rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(system.channels), system.sample_rate)
+    rings = Rings(settings.ring_vehicles, settings.ring_seconds, len(engine.system.channels), engine.system.sample_rate)
     hub = Hub()
     listeners: list[Callable[[Batch], None]] = [board.on_batch, lambda batch: metrics.observe(batch.seconds)]
     feeds: list[LiveFeed] = []
@@ -143,7 +142,6 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     diagnoses = Diagnoses(settings, store, rings, jobs)
     alarm_signals = AlarmSignals(settings, store, rings)
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
-    housekeeping = Housekeeping(settings, store)
     batcher = Batcher(pipeline, compute, settings.compute_queue, metrics.observe)
     core = Core(
         settings,
@@ -158,7 +156,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         diagnoses,
         diagnosis_jobs,
         alarm_signals,
-        housekeeping,
+        Housekeeping(settings, store),
         hub,
         Condition(settings, store),
         Operations(settings, pipeline, forget, archive),
@@ -173,10 +171,16 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         provider_of(settings),
         feeds,
     )
-    waiting = {"batches": lambda: compute.waiting, "windows": lambda: batcher.waiting, "jobs": lambda: jobs.waiting}
-    vitals = Vitals(__version__, engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
-    metrics.registry.register(vitals)
-    core.requests = request_histogram(metrics.registry)
+    return _observed(core)
+
+
+def _observed(core: Core) -> Core:
+    """With metrics of the whole."""
+    queues = {"batches": core.compute, "windows": core.batcher, "jobs": core.jobs}
+    waiting = {name: partial(getattr, queue, "waiting") for name, queue in queues.items()}
+    vitals = Vitals(__version__, core.engine.digest, lambda: [feed.status() for feed in core.feeds], waiting)
+    core.metrics.registry.register(vitals)
+    core.requests = request_histogram(core.metrics.registry)
     return core
 
 

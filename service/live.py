@@ -36,7 +36,8 @@ HUNG_SECONDS = 30.0  # without a sign of the reader; it looks at the bus twenty 
 WATCH_SECONDS = 1.0
 BEHIND_SECONDS = 5.0
 LATELY_SECONDS = 30.0  # for which windows that were given up show in the state
-PASSING = (SQLAlchemyError, OSError, Busy)  # what goes away by itself, so that the same windows are tried again
+FAILING_WINDOWS = 10  # in a row that the numerics could not take: no longer single ones
+PASSING = (SQLAlchemyError, OSError, Busy, MemoryError)  # what goes away by itself: the same windows are tried again
 
 
 class Source(Protocol):
@@ -110,6 +111,7 @@ class LiveFeed:
         self._ended = False
         self._last_block = self._dropped_at = -1e9  # monotonic s
         self._dropped = self._failed = self._restarts = 0
+        self._failed_in_a_row, self._failure = 0, ""
 
     def start(self) -> None:
         """Begin."""
@@ -146,6 +148,8 @@ class LiveFeed:
     def _state(self, now: float) -> tuple[str, str]:
         if self._refused:
             return "failing", f"windows cannot be stored: {self._refused}; {len(self._waiting)} wait"
+        if self._failed_in_a_row >= FAILING_WINDOWS:
+            return "failing", f"the last {self._failed_in_a_row} windows could not be identified: {self._failure}"
         if self._hung:
             return "hung", f"the reader gave no sign for {HUNG_SECONDS:.0f} s; another one was started"
         if self._trouble:
@@ -224,7 +228,7 @@ class LiveFeed:
         while True:
             try:
                 self._pipeline.process(self.vehicle, windows, None, Priority.LIVE)
-                self._refused = ""
+                self._refused, self._failed_in_a_row = "", 0
                 return
             except PASSING as error:
                 if not self._refused:
@@ -233,12 +237,14 @@ class LiveFeed:
                 if self._stopping.wait(retry):
                     return  # said above; the service may not wait for a store that is gone
                 retry = min(2.0 * retry, LAST_RETRY)
-            except Exception:
+            except Exception as error:
                 if len(windows) > 1:  # which of them?
                     for window in windows:
                         self._store([window])
                     return
                 self._failed += 1
+                self._failed_in_a_row += 1
+                self._failure = _line(error)
                 log.exception("%s: a window could not be identified and is left out", self.source.name)
                 return
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sprung.model.signals import Channel, TimeColumn
+from sprung.replay import open_recording
 from sprung.replay.inspection import Inspection, inspect
 from sprung.replay.record import Record, load_record
 from sprung.service.worker import Emit
@@ -51,3 +52,19 @@ def load_task(request: RecordRequest, _emit: Emit[None]) -> Record:
 def inspect_task(request: InspectionRequest, _emit: Emit[None]) -> Inspection:
     """In the other process."""
     return inspect(request.path, request.dbc, request.time)
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """Whose recording it is and when it began; None: not said, no sample."""
+
+    vehicle: str | None
+    first_ns: int | None
+
+
+def head_task(request: RecordRequest, _emit: Emit[None]) -> Beginning:
+    """In the other process."""
+    recording = open_recording(request.path, request.channels, dbc=request.dbc, time=request.time, start=request.start)
+    blocks = recording.at_rate(request.sample_rate)
+    first = next((int(block.time.min()) for block in blocks if len(block.time)), None)
+    return Beginning(recording.vehicle, first)

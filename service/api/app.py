@@ -47,6 +47,7 @@ DESCRIPTION = (
 )
 
 VALUE_BYTES = 40  # of one value of a window as JSON, generously: a minute of a vehicle without inputs is 1.5 MB
+OTHER_BYTES = 1 << 17  # of bodies that hold no samples: what is wrong in them is found in milliseconds
 
 
 _PARTS = (
@@ -118,10 +119,12 @@ def _guard(app: FastAPI, core: Core) -> None:
     """Put what every request passes first before the routes: access, HEAD, the size of bodies."""
     uploads = core.settings.max_upload_bytes
     system = core.engine.system
+    windows = max(core.settings.max_body_bytes, VALUE_BYTES * system.window * len(system.channels))
     app.add_middleware(
         BodyLimit,
-        limit=max(core.settings.max_body_bytes, VALUE_BYTES * system.window * len(system.channels)),
-        paths={"/recordings": uploads, "/diagnose": uploads},
+        limit=min(windows, OTHER_BYTES),
+        paths={"/recordings": uploads, "/diagnose": uploads}
+        | dict.fromkeys(("/identify", "/ingest/estimates", "/ingest/windows"), windows),
     )
     app.add_middleware(HeadAsGet)
     app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests, oidc=core.oidc)

@@ -29,6 +29,7 @@ from sprung.service.store.work import JobRow, RecordingRow, ReportRow
 from sprung.service.tokens import Actor
 
 router = APIRouter(tags=["diagnosis"])
+MOST_REFERENCE_BYTES = 4096
 PAGE = "report.html"
 
 BODY = {
@@ -113,8 +114,11 @@ async def _of_upload(request: Request, core: Core, actor: Actor, once: Once) -> 
 
 
 async def _of_reference(request: Request, core: Core, actor: Actor) -> JobRow:
+    raw = await request.body()
+    if len(raw) > MOST_REFERENCE_BYTES:
+        raise ApiProblem(413, f"what names a recording or a vehicle has at most {MOST_REFERENCE_BYTES} bytes")
     try:
-        body = DiagnoseBody.model_validate_json(await request.body())
+        body = DiagnoseBody.model_validate_json(raw)
     except ValidationError as error:
         raise from_validation(error) from None
     if (body.recording is None) == (body.vehicle is None):

@@ -41,11 +41,15 @@ def look(request: InspectionRequest) -> Inspection:
 
 def windows(request: ReadRequest) -> Iterator[ReadWindows]:
     """The windows of a recording.  Raises as `load`."""
+    return reading(request).pieces(lambda: None)
+
+
+def reading(request: ReadRequest) -> Reading:
+    """A recording that is about to be read.  Raises OSError where there is none."""
     with open(request.path, "rb"):  # an absent file is told without a process
         pass
     limits = own_limits(settings_with({}), request.path)
-    reading: Reading = Here(request) if limits is None else Apart(request, limits)
-    return reading.pieces(lambda: None)
+    return Here(request) if limits is None else Apart(request, limits)
 
 
 def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:

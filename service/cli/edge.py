@@ -16,6 +16,7 @@ from typing import Any
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
+from sprung.service.cli import apart
 from sprung.service.cli.replay import readable
 from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
@@ -26,7 +27,7 @@ from sprung.service.fleet.sending import HttpLink, Link, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool
 from sprung.service.live import LiveFeed
 from sprung.service.logs import set_up
-from sprung.service.reading import Here, ReadRequest
+from sprung.service.reading import ReadRequest
 from sprung.service.settings import Settings, settings_with
 
 log = logging.getLogger("sprung.edge")
@@ -130,7 +131,7 @@ def _line(told: dict[str, Any]) -> str:
 
 def _from_files(onboard: Onboard, engine: Engine, files: list[Path], name: str, speed: float, sending: Sending) -> None:
     for path in files:
-        reading = Here(ReadRequest(path, engine.system, engine.dbc, 32, speed))
+        reading = apart.reading(ReadRequest(path, engine.system, engine.dbc, 32, speed))
         for piece in reading.pieces(lambda: None):
             onboard.process(name, piece.windows)
             sending.wake()

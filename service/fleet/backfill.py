@@ -20,21 +20,23 @@ from typing import Any
 import numpy as np
 
 from sprung.model.signals import Window
-from sprung.replay import open_recording
 from sprung.service.compute import Compute
 from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
 from sprung.service.feed import vehicle_of
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.fleet.tasks import Tasks, WorkLost
+from sprung.service.loading import Beginning, RecordRequest, head_task
 from sprung.service.pipeline import Pipeline
-from sprung.service.reading import Here, ReadRequest
+from sprung.service.reading import Apart, Here, Reading, ReadRequest
+from sprung.service.recordings import reading_limits
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status, work
 from sprung.service.store.partitions import prepare
 from sprung.service.store.staging import staging_digest, swap
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
+from sprung.service.worker import Worker
 
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
 AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk
@@ -199,17 +201,19 @@ def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
     try:
         with local_copy(file) as path:
             system = engine.system
-            recording = open_recording(
-                path, system.channels, dbc=engine.dbc, time=system.time, start=file.modified_ns or None
-            )
-            first = None
-            for block in recording.at_rate(system.sample_rate):
-                if len(block.time):
-                    first = int(block.time.min())
-                    break
-        if first is None:
+            start = file.modified_ns or None
+            request = RecordRequest(path, system.channels, system.sample_rate, engine.dbc, system.time, start)
+            if plan.settings.isolate_reading:
+                limits = reading_limits(plan.settings, path)
+                worker: Worker[None, Beginning] = Worker(head_task, request, limits, f"the reading of {path.name}")
+                for _ in worker.messages():
+                    pass
+                head = worker.result
+            else:
+                head = head_task(request, lambda _message: None)
+        if head.first_ns is None:
             return replace(file, problem="no samples of the system's channels")
-        return replace(file, vehicle=vehicle_of(None, recording.vehicle, Path(file.path).name), first_ns=first)
+        return replace(file, vehicle=vehicle_of(None, head.vehicle, Path(file.path).name), first_ns=head.first_ns)
     except Exception as error:  # the others go on
         return replace(file, problem=told_of(error))
 
@@ -234,7 +238,9 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
         with local_copy(file) as path, ExitStack() as stack:
             together = plan.settings.batch_windows  # as when it is replayed, so that estimates are the same bit by bit
             request = ReadRequest(path, engine.system, engine.dbc, together, start=file.modified_ns or None)
-            reading = Here(request)
+            reading: Reading = (
+                Apart(request, reading_limits(plan.settings, path)) if plan.settings.isolate_reading else Here(request)
+            )
             stack.callback(reading.close)
             for piece in reading.pieces(lambda: None):
                 add(piece.windows)

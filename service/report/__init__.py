@@ -25,7 +25,7 @@ class ReportFiles:
 
 def draw_pictures(report: Report, system: System, folder: Path) -> dict[str, Path]:
     """Every picture for which the report has the arrays, as PNG files in `folder`."""
-    findings = {f.location: words.finding_words(f) for f in report.findings}
+    findings = {f.location: words.finding_words(f, system.catalogue) for f in report.findings}
     units = {channel.name: channel.unit for channel in system.channels}
     figures: dict[str, Figure | None] = {
         "system": drawing.draw_system(system, findings, report.localization),
@@ -53,7 +53,7 @@ def write_report(report: Report, system: System, folder: Path) -> ReportFiles:
     folder.mkdir(parents=True, exist_ok=True)
     pictures = draw_pictures(report, system, folder)
     page, data = folder / "report.html", folder / "report.json"
-    page.write_text(render(report, pictures), encoding="utf-8")
+    page.write_text(render(report, pictures, system.catalogue), encoding="utf-8")
     data.write_text(json.dumps(report.to_dict(), indent=1, allow_nan=False), encoding="utf-8")
     return ReportFiles(page, data, pictures)
 

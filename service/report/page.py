@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,34 +24,34 @@ def inline(path: Path) -> str:
     return "data:image/png;base64," + base64.b64encode(path.read_bytes()).decode("ascii")
 
 
-def render(report: Report, pictures: Mapping[str, Path]) -> str:
-    """The page; pictures are keyed as `service.report.draw_pictures` names them."""
+def render(report: Report, pictures: Mapping[str, Path], laws: words.Laws) -> str:
+    """The page; pictures are keyed as `service.report.draw_pictures` names them, laws are those that were tried."""
     inside = {key: inline(path) for key, path in pictures.items()}
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=False)
     return environment.from_string((TEMPLATES / "report.html").read_text("utf-8")).render(
         report=report,
         title=words.VERDICTS[report.verdict],
-        headline=words.headline(report),
+        headline=words.headline(report, laws),
         style=Markup((TEMPLATES / "report.css").read_text("utf-8")),  # nosec B704: our own file
         back=Markup(BACK),  # nosec B704: a constant
         pictures=inside,
-        groups=_groups(report, inside),
+        groups=_groups(report, inside, laws),
         rows=rows(report),
         named={(f.location, f.effect) for f in report.findings},
-        effect=words.effect_words,
+        effect=partial(words.effect_words, laws=laws),
         quantity=words.quantity,
         probability=words.probability,
         number=words.number,
     )
 
 
-def _groups(report: Report, inside: Mapping[str, str]) -> list[dict[str, Any]]:
+def _groups(report: Report, inside: Mapping[str, str], laws: words.Laws) -> list[dict[str, Any]]:
     """The pictures of each finding, then the fit in time and frequency."""
     groups = []
     for number, finding in enumerate(report.findings):
         own = [inside[key] for key in (f"force_{number}", f"residual_{number}") if key in inside]
         if own:
-            title = f"{finding.location}: {words.finding_words(finding)}"
+            title = f"{finding.location}: {words.finding_words(finding, laws)}"
             groups.append({"title": title, "pictures": own, "note": ""})
     if "fit" in inside:
         groups.append(

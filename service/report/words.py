@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from sprung.model.diagnosis.report.report import Finding, LawParameter, Report
 from sprung.model.laws import CATALOGUE, Law
@@ -17,20 +18,24 @@ VERDICTS = {
     "unknown_physics": "The vehicle does something that no known law explains",
 }
 
-_LAWS: dict[str, Law] = {law.name: law for law in CATALOGUE}
+Laws = Sequence[Law]  # of which a report may speak
 
 
-def effect_words(effect: str) -> str:
+def effect_words(effect: str, laws: Laws = CATALOGUE) -> str:
     """An effect's name as words: a law's title, else `exchanged_sensors` as "exchanged sensors"."""
     if effect == UNKNOWN:
         return "an unknown law"
-    law = _LAWS.get(effect)
+    law = _called(effect, laws)
     return effect.replace("_", " ") if law is None else law.title
 
 
-def _minor(effect: str) -> set[str]:
-    """Parameters of a law of the catalogue, or of its wider form, that say nothing about how strong it is."""
-    law = _LAWS.get(effect)
+def _called(effect: str, laws: Laws) -> Law | None:
+    return next((law for law in laws if law.name == effect), None)
+
+
+def _minor(effect: str, laws: Laws) -> set[str]:
+    """Parameters of a law, or of its wider form, that say nothing about how strong it is."""
+    law = _called(effect, laws)
     forms = [form for form in (law, getattr(law, "wider", None)) if form is not None]
     return {spec.name for form in forms for spec in form.parameters if spec.minor}
 
@@ -53,24 +58,24 @@ def quantity(p: LawParameter) -> str:
     return (f"({text})e{power} {unit}" if power else f"{text} {unit}").rstrip()
 
 
-def finding_words(finding: Finding) -> str:
+def finding_words(finding: Finding, laws: Laws = CATALOGUE) -> str:
     """One finding: place, law, numbers."""
-    name = effect_words(finding.family or finding.effect)
-    main = [p for p in finding.parameters if p.name not in _minor(finding.effect)]
+    name, minor = effect_words(finding.family or finding.effect, laws), _minor(finding.effect, laws)
+    main = [p for p in finding.parameters if p.name not in minor]
     if len(main) == 1 and main[0].determined:
         return f"{name} of {quantity(main[0])}"
     numbers = ", ".join(f"{p.name} {quantity(p)}" for p in main)
     return f"{name}, {numbers}" if numbers else name
 
 
-def headline(report: Report) -> str:
+def headline(report: Report, laws: Laws = CATALOGUE) -> str:
     """One sentence: what is where, how much it explains, and what it had falsified."""
     if report.summary:
         return report.summary.replace("+-", "±")
     if not report.findings:
         fit = report.baseline_validation.nrmse
         return f"Nothing is missing: the re-identified structure simulates the held-out part to {fit:.1%} of its rms."
-    parts = ["; ".join(f"{f.location}: {finding_words(f)}" for f in report.findings)]
+    parts = ["; ".join(f"{f.location}: {finding_words(f, laws)}" for f in report.findings)]
     if report.explained is not None:
         parts.append(f"explains {100 * report.explained:.0f} % of the excess error")
     bias = largest_bias(report)

@@ -258,6 +258,7 @@ def test_history_by_parameter_range_and_resolution(client: TestClient, core: Cor
         ("parameter=primary_11l.stiffness&resolution=fast", "resolution"),
         ("parameter=primary_11l.stiffness&resolution=-5", "resolution"),
         ("parameter=primary_11l.stiffness&resolution=nan", "resolution"),
+        ("parameter=primary_11l.stiffness&resolution=1e-300", "resolution"),
         ("parameter=primary_11l.stiffness&until=1e999", "until"),
     ],
 )

@@ -152,6 +152,25 @@ def test_a_window_that_the_numerics_cannot_take_costs_itself_only(
     assert feed.status().state == "receiving"
 
 
+def test_a_feed_whose_every_window_fails_is_not_ready(
+    core: Core, feed: LiveFeed, identifier: FakeIdentifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, broken = identifier.identify, True
+
+    def fragile(*arguments: Any, **named: Any) -> Any:
+        if broken:
+            raise np.linalg.LinAlgError("singular")
+        return real(*arguments, **named)
+
+    monkeypatch.setattr("sprung.service.live.FAILING_WINDOWS", 3)
+    monkeypatch.setattr(identifier, "identify", fragile)
+    feed.start()
+    eventually(lambda: feed.status().state == "failing")
+    assert "singular" in feed.status().detail and not feed.status().works
+    broken = False
+    eventually(lambda: feed.status().state == "receiving")
+
+
 def test_a_reader_that_hangs_is_replaced(
     core: Core, feed: LiveFeed, source: RowSource, monkeypatch: pytest.MonkeyPatch
 ) -> None:

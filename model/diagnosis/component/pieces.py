@@ -14,8 +14,6 @@ from sprung.model.diagnosis.component.piece import (
     FRICTION,
     HYSTERESIS,
     FittedPiece,
-    Following,
-    LawPiece,
     Piece,
     Seen,
     Shape,
@@ -25,7 +23,6 @@ from sprung.model.diagnosis.component.piece import (
 from sprung.model.laws import ElementLaw, SpringDamper, grid
 from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_ASYMMETRY, DAMPER_BLOWOFF, QUADRATIC_DAMPING
 from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
-from sprung.model.laws.following import Covariate, following_law
 from sprung.model.laws.friction import DAHL, LUGRE, STRIBECK
 from sprung.model.laws.gas import GAS_SPRING
 from sprung.model.laws.hysteresis import AIR_SPRING, BOUC_WEN, SERIES_STIFFNESS
@@ -442,24 +439,3 @@ PIECES: tuple[Piece, ...] = (
     _drift(TIME_VARYING_STIFFNESS, "stiffness"),
     _drift(TIME_VARYING_DAMPING, "damping"),
 )
-
-# --- what follows a measured signal -----------------------------------------------------------------------------
-
-_STRONG = (_COULOMB, _BOUC_WEN, _BACKLASH, _QUADRATIC)  # laws that a valve or a temperature makes stronger
-
-
-def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
-    """Spring, damper and laws as they may follow a signal."""
-
-    def linear(quantity: str) -> Piece:
-        return Piece(
-            following_law(quantity, signal),
-            (),
-            _none,
-            lambda seen: [],
-            (0,),
-            lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),
-            lambda p: (),
-        )
-
-    return (linear("stiffness"), linear("damping"), *(Following(piece, signal) for piece in _STRONG))

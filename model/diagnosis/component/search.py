@@ -23,7 +23,8 @@ from sprung.model.diagnosis.component.fit import (
     refined,
 )
 from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Following, Lag, LawPiece, Part
-from sprung.model.diagnosis.component.pieces import PIECES, pieces_following
+from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.component.pieces_following import pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
 

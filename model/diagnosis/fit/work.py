@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 
 class WorkBudget:
     """Samples of all models that were linearised, and how many may be.  May be shared among threads.
@@ -12,10 +14,12 @@ class WorkBudget:
     def __init__(self, most: float) -> None:
         self.most = most
         self.done = 0.0
+        self._lock = threading.Lock()
 
     def add(self, samples: float) -> None:
         """One more linearisation, or as much of one as a loop takes."""
-        self.done += samples
+        with self._lock:
+            self.done += samples
 
     @property
     def ended(self) -> bool:

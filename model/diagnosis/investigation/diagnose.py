@@ -194,23 +194,11 @@ def _on_everything(state: Investigation) -> Fit:
 def _next_finding(state: Investigation, number: int, tell: Progress) -> Investigation:
     """Find, fit and accept one more finding; none more when the rest is noise."""
     options = state.options
-
     plausible = options.rules.plausible
-
-    def new(hits: Iterable[Candidate]) -> list[Candidate]:
-        return [
-            h
-            for h in hits
-            if h.family is not INPUT
-            and (options.unnamed or h.term.law.named)
-            and not _repeats(state, h)
-            and not _hopeless(state, h)
-            and harmonic(state.problem.part, h.term, plausible) is None
-        ]
-
     error = float(np.sqrt(np.mean(misfit(state.fit))))
     gross = not state.problem.process_noise and error > options.rules.selection.gross
-    hits = new(shortlist(state.last, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross))
+    listed = shortlist(state.last, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross)
+    hits = _new(state, listed)
     if hits or act_together(state):
         state = tried_wider(state)
     wide = widest(state)
@@ -243,7 +231,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.rules.acceptance.alpha:
         return state
-    second = runner_up(state.problem, state.fit, new(state.last.candidates), chosen, believed)
+    second = runner_up(state.problem, state.fit, _new(state, state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
@@ -256,6 +244,19 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         last=screen(problem, fit, options.catalogue, options.project),
         notes=(*state.notes, *note),
     )
+
+
+def _new(state: Investigation, hits: Iterable[Candidate]) -> list[Candidate]:
+    """Candidates that may be tried: not of the inputs, not found before, and no harmonics of the excitation."""
+    return [
+        h
+        for h in hits
+        if h.family is not INPUT
+        and (state.options.unnamed or h.term.law.named)
+        and not _repeats(state, h)
+        and not _hopeless(state, h)
+        and harmonic(state.problem.part, h.term, state.options.rules.plausible) is None
+    ]
 
 
 def _disbelieved(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> tuple[Trial, ...]:

@@ -45,22 +45,23 @@ def compensate(
     rivals = [h for h in present.screening.candidates if h.family is INPUT and h.term.key != hit.term.key]
     rivals.sort(key=lambda h: -h.score)
     candidates = [hit, *[h for h in rivals if h.score > rules.input_rival * hit.score][: rules.input_rivals]]
-    tried = [_estimated(system, present, candidate.term, declared, options) for candidate in candidates]
+    tried = [_estimated(system, present, one, declared, options) for one in candidates]
     _, term, std = min(tried, key=lambda one: one[0])
     fault = InputFault(term, std, hit.score, present.screening.p_value(hit), None)
     return fault, compensated(present.signals, term)
 
 
 def _estimated(
-    system: System, present: Nominal, term: Term, declared: Noise, options: Options
+    system: System, present: Nominal, hit: Candidate, declared: Noise, options: Options
 ) -> tuple[float, Term, float]:
     """Estimate an input fault by compensating, screening again and compensating the rest.
 
     Chi-square of sensors and redundant inputs without the fault, the fault, and its standard deviation.
     """
-    value, std = term.parameters[0], 0.0
-    law = term.law
+    term, law = hit.term, hit.term.law
     assert isinstance(law, SensorLaw)
+    value = term.parameters[0]
+    std = abs(value - law.absent[0]) / np.sqrt(max(hit.score, options.rules.acceptance.input_done))
     for _ in range(options.rules.acceptance.input_rounds):
         signals = compensated(present.signals, term.at(np.array([value])))
         rest = nominal(system, signals, declared, present.split, options, (law,))
@@ -68,7 +69,7 @@ def _estimated(
         if again is None or again.score < options.rules.acceptance.input_done:
             break
         change = again.term.parameters[0]
-        std = abs(change - law.absent[0]) / max(np.sqrt(again.score), 1e-12)
+        std = abs(change - law.absent[0]) / np.sqrt(again.score)
         value = law.combined(value, change)
     total = rest.fit.chi_square + _redundant(present.problem.noise, rest.problem)
     return total, term.at(np.array([value])), float(std)

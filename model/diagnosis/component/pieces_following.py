@@ -1,0 +1,35 @@
+"""Spring, damper and laws of a component that follow a measured signal: a current, a temperature."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece
+from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.laws.damping import COULOMB_FRICTION, QUADRATIC_DAMPING
+from sprung.model.laws.following import Covariate, following_law
+from sprung.model.laws.hysteresis import BOUC_WEN
+from sprung.model.laws.lost_motion import FRICTION_BACKLASH
+
+_STRENGTHENED = (COULOMB_FRICTION, BOUC_WEN, FRICTION_BACKLASH.wider, QUADRATIC_DAMPING)  # by a valve or a temperature
+
+
+def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
+    """Spring, damper and laws as they may follow a signal."""
+
+    def linear(quantity: str) -> Piece:
+        return Piece(
+            following_law(quantity, signal),
+            (),
+            lambda seen: np.zeros((1, 0)),
+            lambda seen: [],
+            (0,),
+            lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),
+            lambda p: (),
+        )
+
+    return (
+        linear("stiffness"),
+        linear("damping"),
+        *(Following(piece, signal) for piece in PIECES if piece.law in _STRENGTHENED),
+    )
