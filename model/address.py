@@ -68,6 +68,11 @@ class Address(Strict):
     gain_std: float | None = Field(
         default=None, ge=0, description="what the data sheet leaves to the gain, relative; default 0.015"
     )
+    offset_std: float | None = Field(
+        default=None,
+        ge=0,
+        description="what it leaves to the zero, SI; default by the kind of quantity",
+    )
     delay_std: float | None = Field(
         default=None, ge=0, description="what it leaves to the delay against the other signals, s; default 0.002"
     )

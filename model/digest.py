@@ -11,7 +11,7 @@ from sprung.model.schema import RUNNING, SystemFile
 # An address without its noise, which the mechanics does not see.
 _WHERE = (
     *("mcap", "can", "csv", "column", "scale", "offset", "sign", "unit", "range"),
-    *("gain_std", "delay_std"),
+    *("gain_std", "delay_std", "offset_std"),
 )
 
 

@@ -35,3 +35,4 @@ class Tolerance:
 
     gain: float  # relative
     delay: float  # s
+    zero: float = 0.0  # in the unit of the channel

@@ -19,15 +19,17 @@ class SensorKind:
     noise: float  # standard deviation of one sample of an ordinary instrument, in that unit
     shows: Shown
     axis: Literal["", "roll", "pitch"] = ""  # about which the body turns; empty: vertically, of a point of it
+    zero: float = 0.0  # standard deviation of an ordinary instrument's zero, in that unit
 
 
 KINDS: dict[Kind, SensorKind] = {
-    "acceleration": SensorKind("m/s^2", 0.01, "acceleration"),
-    "velocity": SensorKind("m/s", 1e-3, "velocity"),
-    "displacement": SensorKind("m", 1e-5, "displacement"),
-    "roll_rate": SensorKind("rad/s", 1e-4, "velocity", "roll"),
-    "pitch_rate": SensorKind("rad/s", 1e-4, "velocity", "pitch"),
-    "deflection": SensorKind("m", 1e-5, "deflection"),
+    "acceleration": SensorKind("m/s^2", 0.01, "acceleration", zero=0.015),
+    "velocity": SensorKind("m/s", 1e-3, "velocity", zero=1e-3),
+    "displacement": SensorKind("m", 1e-5, "displacement", zero=1e-3),
+    "roll_rate": SensorKind("rad/s", 1e-4, "velocity", "roll", zero=1e-3),
+    "pitch_rate": SensorKind("rad/s", 1e-4, "velocity", "pitch", zero=1e-3),
+    "deflection": SensorKind("m", 1e-5, "deflection", zero=1e-3),
     "force": SensorKind("N", 1.0, "force"),
 }
 USUAL_NOISE = {kind.unit: kind.noise for kind in KINDS.values()}  # by unit, of inputs too
+USUAL_ZERO = {kind.unit: kind.zero for kind in KINDS.values()}

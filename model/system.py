@@ -28,7 +28,7 @@ from sprung.model.schema import (
     SystemFileError,
     TrackInput,
 )
-from sprung.model.sensor_kinds import USUAL_NOISE
+from sprung.model.sensor_kinds import USUAL_NOISE, USUAL_ZERO
 from sprung.model.signals import Channel, Conditions, FloatArray, TimeColumn
 from sprung.model.systemfile import parse_system_file, read_system_file
 
@@ -311,18 +311,20 @@ class System:
     @cached_property
     def tolerances(self) -> tuple[Tolerance, ...]:
         """What the data sheet of every channel leaves open."""
-        addresses: list[Address] = []
+        addresses: list[tuple[str, Address]] = []  # with the quantity
         for source in self.file.inputs.values():
             if isinstance(source, ForceInput):
-                addresses.append(source)
+                addresses.append(("force", source))
             elif isinstance(source, SupportInput):
-                addresses += source.measured.values()
-        addresses += self.file.sensors.values()
+                addresses += source.measured.items()
+        addresses += [(sensor.kind, sensor) for sensor in self.file.sensors.values()]
         return tuple(
             Tolerance(
-                GAIN_STD if at.gain_std is None else at.gain_std, DELAY_STD if at.delay_std is None else at.delay_std
+                GAIN_STD if at.gain_std is None else at.gain_std,
+                DELAY_STD if at.delay_std is None else at.delay_std,
+                USUAL_ZERO[SI[quantity]] if at.offset_std is None else at.offset_std,
             )
-            for at in addresses
+            for quantity, at in addresses
         )
 
     @cached_property

@@ -152,6 +152,9 @@ class PlausibleRules:
     bins: int = rule(2, "on either side of a line; derived: they hold 92 % of a sine between two bins", 1, 4)
     harmonics: int = rule(30, "of a line that a non-linear answer may have; chosen", 15, 60)
     apart: float = rule(3.0, "deviations from what it is without, of a gain or a mass; derived: one in 400", 2.0, 4.0)
+    calibration: float = rule(
+        1.5, "deviations of a data sheet, up to which a gain or zero is in order; chosen: 2.2 % by default", 1.0, 2.0
+    )
     close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
 
 

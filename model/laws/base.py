@@ -373,6 +373,9 @@ class SensorLaw(Parametrised):
     stuck: bool = False  # the channel repeats its first value
     prior_cost: float = 0.0
     fault: bool = True
+    # Deviation of the only parameter in an instrument in order: of what its data sheet leaves to gain and zero, and of
+    # the size of the signal; None: no instrument has the fault
+    of_instrument: Callable[[float, float, float], float] | None = None
 
     def distort(self, truth: FloatArray, p: Values, sample_rate: float) -> FloatArray:
         """What is shown of the truth (..., T) along the last axis."""

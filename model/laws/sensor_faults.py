@@ -26,6 +26,7 @@ SENSOR_GAIN = SensorLaw(
     response=lambda p: SensorResponse(gain=p[0]),
     at=("sensor", "support", "force"),
     scale=lambda step, amplitude: 0.1,
+    of_instrument=lambda gain, zero, size: gain,
 )
 _LATE = SensorLaw(
     name="sensor_lag",
@@ -68,6 +69,7 @@ SENSOR_BIAS = SensorLaw(
     sentence="the sensor is off by {offset}",
     response=lambda p: SensorResponse(offset=p[0]),
     at=("sensor", "force"),
+    of_instrument=lambda gain, zero, size: max(zero, gain * size),  # in small signals the zero, in large ones the gain
 )
 SENSOR_NOISE = SensorLaw(
     name="sensor_noise",

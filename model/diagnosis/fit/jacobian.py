@@ -18,6 +18,7 @@ from sprung.model.diagnosis.response.harmonic_balance import LawForces, warm_sta
 from sprung.model.diagnosis.response.motion import Motions, motions_of
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import is_waveform
+from sprung.model.laws import SensorLaw
 from sprung.model.signals import FloatArray
 
 
@@ -148,6 +149,9 @@ def _add_terms(
             if forward.faulty_force(term) is not None:
                 known.loads[at] = measured.fault_load(term)
                 known.packed.add_load(at, known.loads[at])
+                if problem.process_noise:
+                    change = forward.inputs_by_force_fault(term)[forward.part.grid.band]
+                    known.log_det[at] = working.whitener.log_det_slope(change)
             elif forces is not None and is_waveform(term):
                 port, change = law_change(forward, forces, term, j)
                 known.law_forces[:, at - P, port] = change
@@ -215,9 +219,12 @@ def _difference(
     step = step_of(term, parameter)
     moved = term.moved(parameter, step)
     terms = tuple(moved if k == index else t for k, t in enumerate(point.terms))
-    other, other_forward, other_forces = problem.predict(
-        replace(point, terms=terms, warm_start=warm_start_of(forces)), working.inputs, forward.plant
-    )
+    elsewhere = replace(point, terms=terms, warm_start=warm_start_of(forces))
+    if term.location in problem.system.sensors and isinstance(term.law, SensorLaw):  # what it shows moves nothing
+        other_forward, other_forces = problem.forward(elsewhere, working.inputs, forward.plant), forces
+        other = problem.shown(other_forward, forces)
+    else:
+        other, other_forward, other_forces = problem.predict(elsewhere, working.inputs, forward.plant)
     free = (problem.free_columns(other_forward) - problem.free_columns(forward)) @ point.state
     change = (other - shown + free) / step
     if not problem.process_noise:

@@ -41,6 +41,6 @@ def key_of(system: System, part: Part, noise: Noise, start: Point, *others: obje
     for array in arrays:
         digest.update(np.ascontiguousarray(array).tobytes())
     for term in start.terms:
-        digest.update(repr((term.key, term.parameters, term.equivalent, term.scales, term.fixed)).encode())
+        digest.update(repr((term.key, term.parameters, term.equivalent, term.scales, term.fixed, term.known)).encode())
     digest.update(repr([one for one in others if not isinstance(one, np.ndarray)]).encode())
     return digest.digest()

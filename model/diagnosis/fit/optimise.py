@@ -233,7 +233,17 @@ def _begun_anew(problem: Problem, state: _State) -> _State:
 
 
 def _value(problem: Problem, residual: FloatArray, log_det: float, point: Point) -> float:
-    return float(residual @ residual + log_det + np.sum((point.theta / problem.rules.fit.prior) ** 2))
+    return float(residual @ residual + log_det + np.sum(_strayed(problem, point)[0] ** 2))
+
+
+def _strayed(problem: Problem, point: Point) -> tuple[FloatArray, FloatArray]:
+    """Distance of theta and the terms' parameters from what is expected, in deviations, and one over these."""
+    prior = problem.rules.fit.prior
+    away, sharp = [point.theta / prior], [np.full(len(point.theta), 1 / prior)]
+    for term in point.terms:
+        away.append(term.strayed)
+        sharp.append(1 / np.array(term.known) if term.known else np.zeros(len(term.parameters)))
+    return np.concatenate(away), np.concatenate(sharp)
 
 
 def _value_under(problem: Problem, state: _State, working: Working) -> float:
@@ -248,22 +258,32 @@ def _value_under(problem: Problem, state: _State, working: Working) -> float:
     return _value(problem, residual, state.lin.log_det, point)
 
 
+def information(problem: Problem, fit: Fit) -> FloatArray:
+    """What a fit tells of theta, the terms' parameters (internal scale) and the state, with what is expected."""
+    return _with_expected(problem, fit.point, fit.jacobian.T @ fit.jacobian)
+
+
+def _with_expected(problem: Problem, point: Point, gram: FloatArray) -> FloatArray:
+    sharp = _strayed(problem, point)[1]
+    normal = gram.copy()
+    normal[np.arange(len(sharp)), np.arange(len(sharp))] += sharp**2
+    return normal
+
+
 def _normal(problem: Problem, lin: Linearised, point: Point) -> tuple[FloatArray, FloatArray]:
-    """Matrix of the normal equations with the prior of theta, columns scaled, and the scales."""
-    P = len(point.theta)
-    normal = lin.gram.copy()
-    normal[np.arange(P), np.arange(P)] += 1 / problem.rules.fit.prior**2
+    """Matrix of the normal equations with what is expected, columns scaled, and the scales."""
+    normal = _with_expected(problem, point, lin.gram)
     scale = scale_of(normal, len(point.state))
     return normal * scale * scale[:, None], scale
 
 
 def _step(problem: Problem, lin: Linearised, point: Point, damping: float) -> tuple[FloatArray, FloatArray, float]:
     """Gauss-Newton step, standard deviations of theta and term parameters, and the fall that a full step promises."""
-    P = len(point.theta)
     scaled, scale = _normal(problem, lin, point)
     gradient = lin.jacobian.T @ lin.residual
     gradient[: len(lin.log_det_slope)] -= lin.log_det_slope / 2
-    gradient[:P] -= point.theta / problem.rules.fit.prior**2
+    away, sharp = _strayed(problem, point)
+    gradient[: len(sharp)] -= away * sharp
     step, variance, promised = _solved(scaled, scale, gradient, damping)
     held = held_back(point, step)
     if held.any():  # the others go on as if it were given

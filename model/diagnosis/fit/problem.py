@@ -99,7 +99,8 @@ class Problem:
         part, smoothed = self.part, forward.part
         forces = part.force - smoothed.force
         forces[0] += (part.force_polynomial - smoothed.force_polynomial)[0] * np.sqrt(part.grid.samples)
-        return forward.plant.sensors(part.support - smoothed.support, forces / forward.force_faults[0])
+        motion = (part.support - smoothed.support) / forward.support_gain
+        return forward.plant.sensors(motion, forces / forward.force_faults[0])
 
     def free_columns(self, forward: Forward) -> ComplexArray:
         """Transforms of what the sensors show of the free motion per state at the first sample, (F, S, 2n)."""

@@ -27,7 +27,7 @@ def by_names(
         return unnamed
     tell(0.3 + 0.17 * len(before.found), "laws with names in the place of a force without")
     named = search(replace(before, options=replace(before.options, unnamed=False)))
-    if len(named.found) == len(before.found) or not _says_as_much(before, unnamed, named):
+    if len(named.found) <= len(before.found) or not _says_as_much(before, unnamed, named):
         return unnamed
     if _is_formula(unnamed.found[-1]):
         unnamed = search(unnamed)  # what else there is beside a formula counts as what is beside names does

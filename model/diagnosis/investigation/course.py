@@ -140,6 +140,7 @@ class Investigation:
     setup_faults: tuple[SetupFault, ...] = ()
     notes: tuple[str, ...] = ()
     wider: TriedWider | None = None  # of the present fit or an earlier one; None: not tried yet
+    calibrations: int | None = None  # how many of the given terms are gains and zeros in order; None: none has shown
 
     @property
     def given(self) -> int:

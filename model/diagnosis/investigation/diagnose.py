@@ -11,6 +11,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.by_names import by_names
+from sprung.model.diagnosis.investigation.calibration import calibrated, in_order, of_others
 from sprung.model.diagnosis.investigation.course import (
     Found,
     InputFault,
@@ -21,6 +22,7 @@ from sprung.model.diagnosis.investigation.course import (
     Progress,
     Recorded,
 )
+from sprung.model.diagnosis.investigation.doubt import by_what_is_left
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of, left
 from sprung.model.diagnosis.investigation.formula_doubt import missing
@@ -70,12 +72,14 @@ def investigate(system: System, record: Recorded, options: Options, tell: Progre
 def with_findings(state: Investigation, tell: Progress) -> Investigation:
     """Finding after finding until the rest is noise."""
     # what a delay, scale or position leaves, estimated as it is, is no physics
-    uncertain = any(fault.value is not None for fault in state.setup_faults)
+    uncertain, notes = any(fault.value is not None for fault in state.setup_faults), state.notes
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
         state = _next_finding(state, number, tell)
         if state.problem.worked_out:
             tell(0.92, "the budget of work is spent: no further candidate is fitted")
+        if state.calibrations != before.calibrations:
+            return with_findings(replace(state, notes=notes), tell)
         if len(state.found) == len(before.found):
             break
         state = by_names(before, state, lambda plain: with_findings(plain, tell), tell)
@@ -104,7 +108,10 @@ def concluded(state: Investigation, tell: Progress) -> Outcome:
     final = replace(final, covariance=final.covariance + left_open(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
-    return Outcome(state, final, before, after, noisy, judged(state, before, after, noisy))
+    said = judged(state, before, after, noisy)
+    if np.any(said.errors.unexplained(state.options.rules.verdict) > 0):
+        final = replace(final, covariance=final.covariance + by_what_is_left(state.problem, state.fit))
+    return Outcome(state, final, before, after, noisy, said)
 
 
 def under(state: Investigation, rules: Rules) -> Investigation:
@@ -197,7 +204,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     plausible = options.rules.plausible
     error = float(np.sqrt(np.mean(misfit(state.fit))))
     gross = not state.problem.process_noise and error > options.rules.selection.gross
-    listed = shortlist(state.last, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross)
+    told = of_others(state)
+    listed = shortlist(told, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross)
     hits = _new(state, listed)
     if hits or act_together(state):
         state = tried_wider(state)
@@ -231,6 +239,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.rules.acceptance.alpha:
         return state
+    if state.calibrations is None and in_order(state, chosen.term):
+        return calibrated(state)
     second = runner_up(state.problem, state.fit, _new(state, state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)

@@ -7,15 +7,17 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.investigation.calibration import faulty, in_order
 from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, bounded_noise, kind_of, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
+from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws import StructureLaw
+from sprung.model.laws import Law, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
@@ -42,14 +44,17 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     if state.setup_faults and not lost:  # they were undone before anything was fitted
         worst = np.sqrt(state.setup_faults[0].before / len(size))
         deciding = replace(errors, before=np.maximum(errors.before, worst))
-    physics = [kind_of(found.trial.term.law) for found in state.found]
+    terms = state.fit.point.terms[state.given :]
+    physics = [_kind(state, term, found.trial.term.law) for found, term in zip(state.found, terms, strict=True)]
     kinds = [kind_of(fault.effect) for fault in state.setup_faults]
-    kinds += [kind_of(fault.term.law) for fault in state.input_faults]
+    kinds += [_kind(state, fault.term, fault.term.law) for fault in state.input_faults]
+    kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
     kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
     other = another_structure(state, deciding)
     ended = state.problem.worked_out
     verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=ended)
     strange = float(np.sqrt(np.mean(deciding.after**2)))
+    physics = [kind for kind in physics if kind is not EffectKind.NUISANCE]
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
         errors=errors,
@@ -63,6 +68,11 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
         place=_place(state),
         where=_words(state, errors, after),
     )
+
+
+def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:
+    """The kind of a finding, by its value, too: instruments are as far off as their data sheets leave them."""
+    return EffectKind.NUISANCE if in_order(state, term) else kind_of(law)
 
 
 def leaves_more_than_noise(state: Investigation) -> bool:

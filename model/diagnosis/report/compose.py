@@ -6,9 +6,11 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.calibration import channels
 from sprung.model.diagnosis.investigation.course import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
+from sprung.model.diagnosis.report.calibration import calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plots_data import evidence_arrays
 from sprung.model.diagnosis.report.report import (
@@ -27,7 +29,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
     course, before, after = outcome.investigation, outcome.before, outcome.after
     said, names = outcome.judgement, course.signals.sensor_names
-    findings = findings_of(outcome)
+    findings, calibration = findings_of(outcome), calibration_of(outcome)
     advice = [*course.prepared.notes, *course.notes, *undecided(course)]
     if said.strange is not None:
         advice.insert(0, nothing_fits(outcome, said.strange))
@@ -60,24 +62,27 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         changes=_changes(outcome),
         explained=explained,
         unexplained=unexplained,
-        laws=_laws(outcome),
+        laws=_laws(outcome, calibration),
+        calibration=calibration,
         noise=_noise(course),
-        summary=_summary(outcome, findings, explained),
+        summary=_summary(outcome, findings, explained, in_words(calibration)),
         advice=tuple(advice),
         evidence=evidence_arrays(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
     )
 
 
-def _laws(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
+def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[IdentifiedLaw, ...]:
     """Every law of the final model that has a name and values: those of the file, then those that were found.
 
     Among them are places of elements that were put right before anything was fitted.
     """
+    told = {(one.location, one.effect) for one in calibration}
     fit, course = outcome.final, outcome.investigation
     count = course.given + (len(course.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        if term.law.named:
+        moot = index in channels(course) and (term.location, term.law.name) not in told
+        if term.law.named and not moot:
             values, texts = law_parameters(fit, index), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
     for fault in course.input_faults:
@@ -149,10 +154,11 @@ def _candidates(course: Investigation) -> tuple[CandidateRow, ...]:
     return tuple([*fitted, *screened][:20])
 
 
-def _summary(outcome: Outcome, findings: list[Finding], explained: float | None) -> str:
+def _summary(outcome: Outcome, findings: list[Finding], explained: float | None, calibration: str) -> str:
     said = outcome.judgement
+    beside = f"; {calibration}" if calibration and said.strange is None else ""
     if said.verdict == "consistent":
-        return "The nominal structure explains the recording down to the noise."
+        return f"The nominal structure explains the recording down to the noise{beside}."
     where = f": {said.where}" if said.where else ""
     text = "; ".join(f.sentence for f in findings) or f"Nothing in the system file fits this recording{where}"
     if said.carried and said.strange is None and explained is not None and explained > 0:
@@ -162,4 +168,4 @@ def _summary(outcome: Outcome, findings: list[Finding], explained: float | None)
             text += f"; still unexplained: {said.where}"
     if said.ended:
         text += "; the search ended at its budget of work"
-    return text + "."
+    return f"{text}{beside}."

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.calibration import faulty, in_order
 from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
@@ -26,7 +27,8 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in course.setup_faults]
-    ranked += [(f.score, _input_finding(f)) for f in course.input_faults]
+    ranked += [(f.score, _input_finding(f)) for f in course.input_faults if not in_order(course, f.term)]
+    ranked += [_out_of_order(outcome, index) for index in faulty(course)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if said.carried:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
@@ -63,6 +65,8 @@ def _physics(outcome: Outcome) -> list[Finding]:
     course, findings = outcome.investigation, []
     for index, found in enumerate(course.found):
         term = course.fit.point.terms[course.given + index]
+        if in_order(course, term):
+            continue
         parameters = _free(term, law_parameters(outcome.final, course.given + index))
         rival = found.runner_up
         family, advice = _look_alikes(found, course.options.rules.report)
@@ -124,6 +128,16 @@ def _experiment(term: Term) -> str:
     if isinstance(term.law, SensorLaw):
         return "a calibration of the sensor"
     return "a longer recording, or one at a higher level (worse track, more speed or load),"
+
+
+def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:
+    """A gain or zero that is beyond its tolerance only beside everything that was found, and its rank."""
+    term = outcome.investigation.fit.point.terms[index]
+    parameters = law_parameters(outcome.final, index)
+    score = float(((term.parameters[0] - term.law.absent[0]) / parameters[0].std) ** 2)
+    words = term.law.sentence.format(**{p.name: p.words() for p in parameters})
+    sentence = f"{term.location}: {words}"
+    return score, Finding(term.location, term.law.name, parameters, p_value=None, delta_bic=None, sentence=sentence)
 
 
 def _input_finding(fault: InputFault) -> Finding:

@@ -191,6 +191,7 @@ class Report:
     explained: float | None = None  # share of the excess error that the findings explain, held-out part
     unexplained: Unexplained = Unexplained()
     laws: tuple[IdentifiedLaw, ...] = ()  # of the final model, those of the system file first
+    calibration: tuple[IdentifiedLaw, ...] = ()  # gains and zeros that data sheets leave: no findings
     noise: Mapping[str, float] = field(default_factory=dict)  # channel -> deviation of one sample, as found
     summary: str = ""
     advice: tuple[str, ...] = ()  # what could not be decided and why
@@ -206,6 +207,7 @@ class Report:
         }
         rest = ("noise_floor", "localization", "candidates", "changes", "explained", "unexplained")
         more = {"laws": [law.to_dict() for law in self.laws]}
+        more["calibration"] = [law.to_dict() for law in self.calibration]
         more |= {name: getattr(self, name) for name in ("noise", "summary", "advice")}
         if self.track:
             more["track"] = [point.to_dict() for point in self.track]

@@ -131,12 +131,24 @@ class Forward:
     @cached_property
     def support(self) -> ComplexArray:
         """Displacement of the supports, periodic part, (F, supports)."""
-        return self.part.support + self._unmeasured[0]
+        return self.part.support / self.support_gain + self._unmeasured[0]
 
     @property
     def support_polynomial(self) -> FloatArray:
         """The same, polynomial part, (DEGREE + 1, supports)."""
-        return self.part.support_polynomial + self._unmeasured[1]
+        return self.part.support_polynomial / self.support_gain + self._unmeasured[1]
+
+    @cached_property
+    def support_gain(self) -> FloatArray:
+        """Gain of every support's measured motion, (supports,)."""
+        names = supports(self.system)
+        gain = np.ones(len(names))
+        for term in self.terms:
+            name, _, quantity = term.location.partition(".")
+            response = response_of(term)
+            if response is not None and quantity and name in names:
+                gain[names.index(name)] *= response.gain
+        return gain
 
     @cached_property
     def force_faults(self) -> tuple[FloatArray, FloatArray]:
@@ -166,11 +178,22 @@ class Forward:
         found: ComplexArray = change[:, None] * self.plant.structure.F[:, i]
         return found
 
+    def inputs_by_force_fault(self, term: Term) -> ComplexArray:
+        """Change of `of_inputs` with the first parameter of a measured force's fault, (F, S, inputs)."""
+        i, law = self.faulty_force(term), term.law
+        if i is None or not isinstance(law, SensorLaw):
+            raise TypeError(f"{law.name} at {term.location} is no fault of a measured force")
+        at = len(self.support_gain) + i
+        change = np.zeros_like(self.of_inputs)
+        change[:, :, at] = -law.slope().gain * self.of_inputs[:, :, at] / self.force_faults[0][i]
+        return change
+
     @property
     def of_inputs(self) -> ComplexArray:
-        """What the sensors show of supports and measured forces, (F, S, inputs)."""
+        """What the sensors show of measured supports and forces, (F, S, inputs)."""
         both = np.concatenate([self.plant.sensor_of_support, self.plant.sensor_of_measured_force], axis=2)
-        return both * self.sensor_factor[:, :, None]
+        gains = np.concatenate([self.support_gain, self.force_faults[0]])
+        return both * self.sensor_factor[:, :, None] / gains
 
     def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
         """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""

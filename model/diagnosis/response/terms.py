@@ -26,6 +26,7 @@ class Term:
 
     scales: tuple[float, ...] = ()  # sizes at which the parameters matter, for steps and bounds; as `parameters`
     fixed: tuple[bool, ...] = ()  # parameters that the system file holds; as `parameters`, none if left out
+    known: tuple[float, ...] = ()  # deviations from absence that are expected; as `parameters`, any if left out
 
     def at(self, parameters: FloatArray) -> Term:
         return replace(self, parameters=tuple(float(v) for v in parameters))
@@ -67,6 +68,14 @@ class Term:
         """Derivative of each parameter with respect to its internal form."""
         pairs = zip(self.law.parameters, self.parameters, strict=True)
         return np.array([value if spec.log else 1.0 for spec, value in pairs])
+
+    @property
+    def strayed(self) -> FloatArray:
+        """Distance of each parameter from absence in expected deviations; 0 where none is expected."""
+        away = np.zeros(len(self.parameters))
+        for i, spread in enumerate(self.known):
+            away[i] = (self.parameters[i] - self.law.absent[i]) / spread
+        return away
 
     @property
     def bounded(self) -> bool:

@@ -135,7 +135,8 @@ def _of_forces(projector: Projector, laws: list[SensorLaw]) -> Iterator[tuple[Ca
         for law in laws:
             slope = law.slope()
             column = projector.pack(slope.gain * of_gain + slope.offset * of_offset)
-            yield _candidate(projector, law, name, *projector.score(column), FORCE), 1
+            spread = projector.spread(column, fit.forward.inputs_by_force_fault(Term(law, name, law.absent))[band])
+            yield _candidate(projector, law, name, *projector.score(column, (spread, 0.0)), FORCE), 1
 
 
 def _pack(spectrum: ComplexArray, weight: FloatArray) -> FloatArray:

@@ -1,0 +1,125 @@
+"""Gains and zeros of instruments in order: as far off as data sheets leave them, they are part of the model, no fault.
+
+No rig has gains of one and zeros of nothing.  A recording of little noise shows a gain of one per cent at once, and
+names for whatever else fits a little better beside it: a mass that hangs, an elastic mode.  So once one shows, the
+gains and zeros of all sensors and measured forces are fitted beside the structure, expected to be as far off as data
+sheets leave them (`gain_std`, `offset_std` of an address), and findings are sought anew.  Within the tolerance they are
+told and decide nothing; the deviations of all other values contain theirs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.baseline import refreshed
+from sprung.model.diagnosis.fit.optimise import try_optimise
+from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.record.signals import Signals
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.screening.score import Screening
+from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.laws import Law, SensorLaw
+from sprung.model.schema import SupportInput
+from sprung.model.system import System
+
+_STEPS = 12, 6  # of a fit of the structure beside the calibration, and of one that begins near
+
+
+def expected(system: System, signals: Signals, law: Law, location: str) -> float:
+    """Standard deviation of a fault's parameter at a channel in order; 0: no instrument in order has it."""
+    names = [channel.name for channel in system.channels][-len(system.tolerances) :]
+    if not isinstance(law, SensorLaw) or law.of_instrument is None or location not in names:
+        return 0.0
+    sheet = system.tolerances[names.index(location)]
+    return law.of_instrument(sheet.gain, sheet.zero, _size(signals, location))
+
+
+def _size(signals: Signals, location: str) -> float:
+    """Standard deviation of what a channel shows."""
+    if location in signals.sensor_names:
+        series = signals.sensors[:, signals.sensor_names.index(location)]
+    elif location in signals.force_names:
+        series = signals.force[:, signals.force_names.index(location)]
+    else:
+        return 0.0  # of motions that are measured, nothing but the gain is asked
+    return float(np.std(series))
+
+
+def in_order(state: Investigation, term: Term) -> bool:
+    """Whether a fault is no more than the data sheet of its channel leaves."""
+    spread = expected(state.system, state.signals, term.law, term.location)
+    off = abs(term.parameters[0] - term.law.absent[0]) if spread > 0 else np.inf
+    return bool(off <= state.options.rules.plausible.calibration * spread)
+
+
+def calibrated(state: Investigation) -> Investigation:
+    """The investigation with the gains and zeros of all channels in its model, at the beginning of its search.
+
+    What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.
+    """
+    file, terms, fit = state.fit.point.terms[: state.given], _of_all_channels(state), None
+    keys = {term.key for term in terms}
+    found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
+    for _ in range(2):
+        fit = try_optimise(state.problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS[1])
+        if fit is None:
+            return replace(state, calibrations=0)
+        fitted = fit.point.terms[len(file) : len(file) + len(terms)]
+        terms = tuple(term for term in fitted if in_order(state, term))
+        if len(terms) == len(fitted):
+            break
+    held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they take up part of what a law leaves out
+    problem = replace(state.problem, noise=state.base.noise)
+    base = try_optimise(problem, replace(state.base.point, terms=(*state.base.point.terms, *held)), _STEPS[0])
+    if base is None:
+        return replace(state, calibrations=0)
+    problem, base = refreshed(problem, base)
+    base = replace(base, point=replace(base.point, terms=(*base.point.terms[: len(file)], *terms)))
+    screening = screen(problem, base, state.options.catalogue, state.options.project)
+    begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)
+    return replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
+
+
+def channels(state: Investigation) -> range:
+    """Which terms of the investigation's fits are gains and zeros: the last that are given."""
+    return range(state.given - (state.calibrations or 0), state.given)
+
+
+def of_others(state: Investigation) -> Screening:
+    """What was screened last, without gains and zeros that are in the model: of these no more than rounding is left."""
+    among = {state.fit.point.terms[index].key[:2] for index in channels(state)}
+    kept = tuple(hit for hit in state.last.candidates if hit.term.key[:2] not in among)
+    return replace(state.last, candidates=kept)
+
+
+def faulty(state: Investigation) -> list[int]:
+    """Those of them that are beyond the tolerance beside everything that was found."""
+    return [index for index in channels(state) if not in_order(state, state.fit.point.terms[index])]
+
+
+def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
+    """Gain and zero of every sensor and measured force, gain of every support; off where that was found."""
+    signals, part = state.signals, state.problem.part
+    laws = [law for law in state.options.catalogue if isinstance(law, SensorLaw)]
+    rates = {name for name, rate in zip(signals.sensor_names, part.differentiated, strict=True) if rate}
+    given = {term.key[:2] for term in state.fit.point.terms[: state.given]}
+    values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}
+    found = []
+    measured = tuple(
+        f"{name}.{next(iter(source.measured))}"
+        for name, source in state.system.file.inputs.items()
+        if isinstance(source, SupportInput)
+    )
+    groups = (("sensor", signals.sensor_names), ("force", signals.force_names), ("support", measured))
+    for channel, names in groups:
+        for name in names:
+            for law in laws:
+                spread = expected(state.system, signals, law, name)
+                if not spread or channel not in law.at or (name, law.name) in given:
+                    continue
+                if name not in rates or law.slope().gain:  # a rate shows no offset
+                    nothing = Term(law, str(name), law.absent, scales=(spread,), known=(spread,))
+                    found.append(replace(nothing, parameters=values.get(nothing.key, law.absent)))
+    return tuple(found)

@@ -1,0 +1,41 @@
+"""Gains and zeros within what data sheets leave: told beside the findings, for whoever keeps the instruments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sprung.model.diagnosis.investigation.calibration import channels, in_order
+from sprung.model.diagnosis.investigation.course import Outcome
+from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
+from sprung.model.diagnosis.report.values import law_parameters
+
+_SHOWN = 4  # in the summary
+
+
+def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
+    """Those off by more than their deviation, the surest first; a gain that all channels share is told by none."""
+    course, final = outcome.investigation, outcome.final
+    indices = [*channels(course), *range(course.given, course.given + len(course.found))]
+    found = []
+    for index in indices:
+        term = course.fit.point.terms[index]
+        if in_order(course, term):
+            (parameter,) = law_parameters(final, index)
+            found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
+    for fault in course.input_faults:
+        if in_order(course, fault.term):
+            spec, (value,) = fault.term.law.parameters[0], fault.term.parameters
+            parameter = LawParameter(spec.name, value, fault.std, spec.unit)
+            found.append((abs(value - fault.term.law.absent[0]) / max(fault.std, 1e-300), fault.term, parameter))
+    told = [one for one in found if one[0] > 1]
+    told.sort(key=lambda one: -one[0])
+    return tuple(IdentifiedLaw(term.location, term.law.name, (parameter,)) for _, term, parameter in told)
+
+
+def in_words(calibration: Sequence[IdentifiedLaw]) -> str:
+    """In short; empty where there is nothing to tell."""
+    if not calibration:
+        return ""
+    shown = [f"{one.location} {p.name} {p.words()}" for one in calibration[:_SHOWN] for p in one.parameters]
+    more = f" and {len(calibration) - _SHOWN} more" if len(calibration) > _SHOWN else ""
+    return f"within calibration: {', '.join(shown)}{more}"

@@ -1,0 +1,55 @@
+"""Gains and zeros that are as far off as data sheets leave them are told, and decide nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sprung.model.diagnosis.api import diagnose
+from sprung.model.diagnosis.report.report import Report
+from sprung.model.system import parse_system
+from tests.diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
+
+
+def _of_ordinary_instruments(record: MadeRecord) -> MadeRecord:
+    """car_a 1.2 % too high, bogie_a 1 % too low, car_b off by 0.012 m/s^2."""
+    record.values[:, 2] *= 1.012
+    record.values[:, 4] *= 0.99
+    record.values[:, 3] += 0.012
+    return record
+
+
+def _told(report: Report) -> dict[tuple[str, str], tuple[float, float]]:
+    return {(one.location, one.effect): (p.value, p.std) for one in report.calibration for p in one.parameters}
+
+
+def test_a_rig_with_ordinary_instruments_is_consistent() -> None:
+    report = diagnose(quarter_car(), _of_ordinary_instruments(simulate(seed=41)))
+    assert (report.verdict, report.findings) == ("consistent", ())
+    told = _told(report)  # how gains differ is surer than what they are: the road's own is one of them
+    for key, truth in {("car_a", "sensor_gain"): 1.012, ("bogie_a", "sensor_gain"): 0.99}.items():
+        assert abs(told[key][0] - truth) < 3 * told[key][1] < 0.03
+    assert told["car_b", "sensor_bias"][0] == pytest.approx(0.012, abs=1e-3)
+    assert "within calibration: " in report.summary
+
+
+@pytest.mark.slow
+def test_beside_ordinary_instruments_a_law_is_the_only_finding() -> None:
+    record = _of_ordinary_instruments(simulate(lambda d, v: 300 * np.tanh(v / 0.002), seed=42))
+    report = diagnose(quarter_car(), record)
+    assert report.verdict == "missing_physics"
+    assert [(f.location, f.effect) for f in report.findings] == [("secondary", "coulomb_friction")]
+    force = report.findings[0].parameters[0]
+    assert abs(force.value - 300) < 3 * force.std
+    assert ("car_b", "sensor_bias") in _told(report)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sheet", "gain"), [("gain_std: 0.002", 1.012), ("gain_std: 0.015", 1.04)])
+def test_what_a_data_sheet_does_not_leave_is_a_fault(sheet: str, gain: float) -> None:
+    system = parse_system(SYSTEM.replace("noise: 0.004, csv: a}", f"noise: 0.004, {sheet}, csv: a}}"))
+    record = simulate(seed=43)
+    record.values[:, 2] *= gain
+    report = diagnose(system, record)
+    assert report.verdict == "sensor_fault"
+    assert [(f.location, f.effect) for f in report.findings] == [("car_a", "sensor_gain")]
