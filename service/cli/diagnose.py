@@ -76,7 +76,7 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
         print(json.dumps(report.to_dict(), allow_nan=False), flush=True)
     else:
         print(text(report))
-    return 0 if report.verdict == "consistent" and not report.advice else 1
+    return 0 if report.verdict == "consistent" and not report.recording.lost else 1
 
 
 def _check_targets(asked: Asked) -> None:

@@ -57,7 +57,8 @@ def in_order(state: Investigation, term: Term) -> bool:
 def calibrated(state: Investigation) -> Investigation:
     """The investigation with the gains and zeros of all channels in its model, at the beginning of its search.
 
-    What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.
+    What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.  Gains of
+    what drives everything are kept as they are from now on: their common part shows in a law's curvature alone.
     """
     file, terms, fit = state.fit.point.terms[: state.given], _of_all_channels(state), None
     keys = {term.key for term in terms}
@@ -76,6 +77,9 @@ def calibrated(state: Investigation) -> Investigation:
     if base is None:
         return replace(state, calibrations=0)
     problem, base = refreshed(problem, base)
+    terms = tuple(
+        one if term.location in state.signals.sensor_names else term for one, term in zip(terms, held, strict=True)
+    )
     base = replace(base, point=replace(base.point, terms=(*base.point.terms[: len(file)], *terms)))
     screening = screen(problem, base, state.options.catalogue, state.options.project)
     begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)

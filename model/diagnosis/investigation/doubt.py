@@ -36,7 +36,9 @@ def by_what_is_left(problem: Problem, fit: Fit) -> FloatArray:
     sandwich = inverse @ _of_stretches(fit) @ inverse
     grow = np.sqrt(np.maximum(np.diag(sandwich)[:free] / np.maximum(np.diag(own), 1e-300), 1.0))
     slopes = np.concatenate([np.ones(len(fit.point.theta)), *[term.slopes for term in fit.point.terms]])
-    added = own * np.outer(grow, grow) - inverse[:free, :free] + _of_forces(problem, fit, inverse)[:free, :free]
+    added = own * np.outer(grow, grow) - inverse[:free, :free]
+    if not problem.process_noise:  # there, forces that nobody measured have taken the part of it that is seen
+        added = added + _of_forces(problem, fit, inverse)[:free, :free]
     return np.asarray(added * np.outer(slopes, slopes))
 
 

@@ -31,6 +31,12 @@ def advance(point: Point, step: FloatArray) -> Point:
     return Point(theta, tuple(terms), point.state + step[at:], point.warm_start)
 
 
+def fixed(point: Point) -> np.ndarray:
+    """Which of theta and the terms' parameters no step may move, (P + p,)."""
+    found = [term.fixed or (False,) * len(term.parameters) for term in point.terms]
+    return np.concatenate([np.zeros(len(point.theta), dtype=bool), *(np.array(one, dtype=bool) for one in found)])
+
+
 def held_back(point: Point, step: FloatArray) -> np.ndarray:
     """Which entries of a step would take a law's parameter over a bound that it stands at, as the step."""
     held = np.zeros(len(step), dtype=bool)

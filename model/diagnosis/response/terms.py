@@ -45,16 +45,17 @@ class Term:
         return replace(self, parameters=tuple(values))
 
     def advanced(self, step: FloatArray) -> Term:
-        """All internal parameters moved, values kept within the law's bounds.
+        """All internal parameters moved but those that are held, values kept within the law's bounds.
 
         Steps are limited in their direction: a yield deflection that stays as its exponent moves takes both.
         """
         values = []
         largest = max((abs(x) for spec, x in zip(self.law.parameters, step, strict=True) if spec.log), default=0.0)
         step = step / max(1.0, largest)
-        for spec, value, change in zip(self.law.parameters, self.parameters, step, strict=True):
+        fixed = self.fixed or (False,) * len(self.parameters)
+        for spec, value, change, held in zip(self.law.parameters, self.parameters, step, fixed, strict=True):
             new = value * np.exp(change) if spec.log else value + change
-            values.append(float(min(max(new, spec.low), spec.high)))
+            values.append(value if held else float(min(max(new, spec.low), spec.high)))
         return replace(self, parameters=tuple(values))
 
     def held_back(self, step: FloatArray) -> list[bool]:

@@ -10,7 +10,7 @@ from sprung.model.diagnosis.fit.jacobian import linearise
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
-from sprung.model.diagnosis.response.point import Point, advance
+from sprung.model.diagnosis.response.point import Point, advance, fixed
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
@@ -138,6 +138,8 @@ def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> 
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
     kept[first : first + count] = np.isin(np.arange(count), _strengths(hit.term.law))
+    held = fixed(faint)
+    kept[: len(held)] &= ~held
     columns = lin.jacobian[:, kept]
     scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     step = np.zeros(lin.jacobian.shape[1])
