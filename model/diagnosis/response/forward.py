@@ -193,7 +193,8 @@ class Forward:
         """What the sensors show of measured supports and forces, (F, S, inputs)."""
         both = np.concatenate([self.plant.sensor_of_support, self.plant.sensor_of_measured_force], axis=2)
         gains = np.concatenate([self.support_gain, self.force_faults[0]])
-        return both * self.sensor_factor[:, :, None] / gains
+        found: ComplexArray = both * self.sensor_factor[:, :, None] / gains
+        return found
 
     def inputs_by_mass(self, dofs: np.ndarray) -> ComplexArray:
         """Change of `of_inputs` with the log of the mass at degrees of freedom (n,), (F, S, inputs)."""
