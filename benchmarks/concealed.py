@@ -20,7 +20,6 @@ from typing import Any
 
 from sprung import model
 from sprung.benchmarks.concealed_score import Score, explained, rate, score, summary
-from sprung.benchmarks.exact_instruments import exact_instruments
 from sprung.benchmarks.generator import draw_cases, read_vehicle, write_set
 from sprung.benchmarks.generator.laws import LAWS
 from sprung.model.diagnosis.api import Options, diagnose
@@ -57,7 +56,7 @@ def run(
     `count` recordings in each set with effects, `clean` without; `ablate` and `pysindy` say on how many of each set
     those run.
     """
-    system = exact_instruments(load_system(MANCHESTER))
+    system = load_system(MANCHESTER)
     sets = {
         "strong": _recordings(out / "strong", count, seed, None, 0.0, seconds),
         "effects": _recordings(out / "effects", count, seed + 1, None, 1.0, seconds),

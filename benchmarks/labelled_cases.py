@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 
-from sprung.benchmarks.exact_instruments import exact_instruments
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
 from sprung.model.diagnosis.report.report import Report
@@ -28,7 +27,7 @@ from sprung.replay.record import load_record
 def run(folder: Path, files: list[str]) -> Iterator[dict[str, Any]]:
     """Diagnose every labelled recording of a folder (or those named) and compare."""
     labels = json.loads((folder / "labels.json").read_text())
-    system = exact_instruments(load_system())
+    system = load_system()
     for name in files or sorted(n for n in labels if "verdict" in labels[n]):
         record = load_record(folder / name, system.channels, system.sample_rate, dbc=MANCHESTER_DBC)
         start = time.process_time()

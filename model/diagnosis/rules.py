@@ -155,6 +155,9 @@ class PlausibleRules:
     calibration: float = rule(
         1.5, "deviations of a data sheet, up to which a gain or zero is in order; chosen: 2.2 % by default", 1.0, 2.0
     )
+    alone: float = rule(
+        3.0, "times the next largest, that one gain or zero is off alone; derived: of 8, one rig in 90", 2.0, 5.0
+    )
     close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
 
 

@@ -5,10 +5,14 @@ names for whatever else fits a little better beside it: a mass that hangs, an el
 gains and zeros of all sensors and measured forces are fitted beside the structure, expected to be as far off as data
 sheets leave them (`gain_std`, `offset_std` of an address), and findings are sought anew.  Within the tolerance they are
 told and decide nothing; the deviations of all other values contain theirs.
+
+Where many channels tell, it is by them that one is judged: a gain or zero that is off by far more than any other is a
+fault, however small, since the instruments of one rig are of one kind.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -24,6 +28,7 @@ from sprung.model.laws import Law, SensorLaw
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
+_FEW = 3  # gains and zeros, among which the largest may well be three times the next
 _STEPS = 12, 6  # of a fit of the structure beside the calibration, and of one that begins near
 
 
@@ -48,15 +53,39 @@ def _size(signals: Signals, location: str) -> float:
 
 
 def in_order(state: Investigation, term: Term) -> bool:
+    """Whether a fault is no more than the data sheet of its channel leaves, on a rig where that shows."""
+    return bool(state.calibrations) and within_sheet(state, term)
+
+
+def within_sheet(state: Investigation, term: Term) -> bool:
     """Whether a fault is no more than the data sheet of its channel leaves."""
     spread = expected(state.system, state.signals, term.law, term.location)
     off = abs(term.parameters[0] - term.law.absent[0]) if spread > 0 else np.inf
     return bool(off <= state.options.rules.plausible.calibration * spread)
 
 
-def calibrated(state: Investigation) -> Investigation:
+def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], times: float) -> bool:
+    """Whether a fault is off by `times` as much as any other gain or zero, if there are enough of them.
+
+    In units of what data sheets leave, and from the median of its kind: all may share what the file has too large.
+    """
+    if len(terms) <= _FEW or all(term.key != key for term in terms):
+        return False
+    kinds = {term.law.name for term in terms}
+    middles = {kind: float(np.median([_off(term) for term in terms if term.law.name == kind])) for kind in kinds}
+    away = {term.key: abs(_off(term) - middles[term.law.name]) for term in terms}
+    own = away.pop(key)
+    return own > times * max(away.values())
+
+
+def _off(term: Term) -> float:
+    return (term.parameters[0] - term.law.absent[0]) / term.known[0]
+
+
+def calibrated(state: Investigation, shown: Term) -> Investigation:
     """The investigation with the gains and zeros of all channels in its model, at the beginning of its search.
 
+    shown: the first that was found; where it stands alone it is a fault, and nothing of this is done.
     What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.  Gains of
     what drives everything are kept as they are from now on: their common part shows in a law's curvature alone.
     """
@@ -68,7 +97,9 @@ def calibrated(state: Investigation) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = fit.point.terms[len(file) : len(file) + len(terms)]
-        terms = tuple(term for term in fitted if in_order(state, term))
+        if stands_alone(fitted, shown.key, state.options.rules.plausible.alone):
+            return replace(state, calibrations=0)
+        terms = tuple(term for term in fitted if within_sheet(state, term))
         if len(terms) == len(fitted):
             break
     held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they take up part of what a law leaves out

@@ -11,7 +11,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.by_names import by_names
-from sprung.model.diagnosis.investigation.calibration import calibrated, in_order, of_others
+from sprung.model.diagnosis.investigation.calibration import calibrated, of_others, within_sheet
 from sprung.model.diagnosis.investigation.course import (
     Found,
     InputFault,
@@ -239,8 +239,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
     if p_value > options.rules.acceptance.alpha:
         return state
-    if state.calibrations is None and in_order(state, chosen.term):
-        return calibrated(state)
+    if state.calibrations is None and within_sheet(state, chosen.term):
+        return calibrated(state, chosen.term)
     second = runner_up(state.problem, state.fit, _new(state, state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import parse_system
-from tests.diagnosis_cases import SYSTEM, MadeRecord, quarter_car, simulate
+from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
 
 
 def _of_ordinary_instruments(record: MadeRecord) -> MadeRecord:
@@ -51,5 +52,14 @@ def test_what_a_data_sheet_does_not_leave_is_a_fault(sheet: str, gain: float) ->
     record = simulate(seed=43)
     record.values[:, 2] *= gain
     report = diagnose(system, record)
+    assert report.verdict == "sensor_fault"
+    assert [(f.location, f.effect) for f in report.findings] == [("car_a", "sensor_gain")]
+
+
+@pytest.mark.slow
+def test_one_gain_that_stands_alone_is_a_fault_within_what_its_data_sheet_leaves() -> None:
+    record = simulate(seed=44)
+    record.values[:, 2] *= 1.012
+    report = diagnose(quarter_car(), record)
     assert report.verdict == "sensor_fault"
     assert [(f.location, f.effect) for f in report.findings] == [("car_a", "sensor_gain")]
