@@ -119,7 +119,7 @@ class SelectionRules:
     near: float = rule(45.0, "score or evidence to the best one that is close in any case; chosen", 25.0, 90.0)
     near_share: float = rule(0.3, "of the best evidence, the same; chosen", 0.15, 0.5)
     again: float = rule(0.8, "of the best score, from which a law that leaves much starts once more; chosen", 0.6, 1.0)
-    astray: float = rule(
+    far: float = rule(
         1.0, "log-ratio to nominal of a parameter, from which a part is tried from nominal, too; chosen", 0.5, 1.5
     )
     most: int = rule(9, "candidates that are fitted; chosen", 6, 14)
@@ -173,7 +173,7 @@ class AcceptanceRules:
     idle: float = rule(0.05, "of what a finding explained at first, beside later ones; chosen", 0.01, 0.2)
     better_than_promised: float = rule(4.0, "times that a fit may exceed its first step's promise; chosen", 2.0, 8.0)
     most_left: float = rule(0.5, "of the unmeasured forces that earlier findings left; chosen", 0.3, 0.8)
-    astray: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)
+    diverged: float = rule(1.5, "rise of the reduced chi-square on the whole recording; chosen", 1.2, 3.0)
     input_faults: int = rule(2, "of input channels that are looked for; chosen", 1, 4)
     input_rounds: int = rule(3, "of estimating and compensating an input fault; chosen", 2, 5)
     input_rival: float = rule(0.3, "of the leading input fault's score, from which others are tried; chosen", 0.15, 0.6)
@@ -223,7 +223,7 @@ class NoiseRules:
 class SetupRules:
     """Deciding constants of the search for wrong set-ups."""
 
-    strange: float = rule(4e-3, "misfit of a sensor; chosen: vehicles fitted well have 1e-3", 2e-3, 8e-3)
+    misfit: float = rule(4e-3, "misfit of a sensor; chosen: vehicles fitted well have 1e-3", 2e-3, 8e-3)
     promising: float = rule(0.85, "of the misfit that one may leave by spectra, to be fitted; chosen", 0.7, 0.95)
     tried: int = rule(5, "hypotheses that are fitted; chosen", 3, 8)
     beside: int = rule(2, "faults of single sensors that are fitted beside them; chosen", 1, 4)
@@ -260,7 +260,7 @@ class VerdictRules:
     clear: float = rule(1.5, "error over the floor, pooled, up to which nothing is left; chosen", 1.25, 2.0)
     clear_sensor: float = rule(2.0, "the same of a single sensor; chosen", 1.6, 3.0)
     carried: float = rule(0.5, "of the excess error; derived: findings explain more than they leave", 0.3, 0.7)
-    strange: float = rule(0.6, "error over the signal, of another vehicle than the file's; chosen", 0.45, 0.8)
+    rejected: float = rule(0.6, "error over the signal, of another vehicle than the file's; chosen", 0.45, 0.8)
     least: float = rule(2e-3, "error over the signal that sampling leaves of a perfect model; derived", 1e-3, 4e-3)
     spread: float = rule(4.0, "standard deviations of a level; derived: one in 16 000 leaves them", 3.0, 6.0)
     parts: int = rule(2, "changes of the structure that are named; chosen: more of them imitate any other", 1, 3)
@@ -364,7 +364,7 @@ class AmbientRules:
     sure: float = rule(0.03, "deviation of a window that stands for the lowest or highest value; chosen", 0.015, 0.06)
     told: float = rule(0.3, "deviation of a log-ratio above which a window tells nothing of it; chosen", 0.15, 0.5)
     coarse: float = rule(0.15, "of the power that chance puts elsewhere: little is told; chosen", 0.08, 0.3)
-    strange: float = rule(0.35, "of the power at other frequencies: another structure; chosen", 0.2, 0.6)
+    rejected: float = rule(0.35, "of the power at other frequencies: another structure; chosen", 0.2, 0.6)
     blocks: int = rule(12, "of a recording, whose levels tell a free decay; chosen", 8, 20)
     rise: float = rule(1.15, "of a level over the one before, up to which it still falls; chosen", 1.05, 1.3)
     fallen: float = rule(0.5, "of the first level that the last may have; chosen", 0.3, 0.7)

@@ -149,8 +149,8 @@ class LawSearch:
                 going, second, columns.take(going), near.take(going), data.take(going), smooth[:, going.numpy()]
             )
         done = ((second.small(std) & held) | still) & ~worse
-        _, astray = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
-        sane = (astray == 0) & second.there.isfinite()
+        _, diverged = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
+        sane = (diverged == 0) & second.there.isfinite()
         ripe = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
         if len(ripe):
             weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)

@@ -139,7 +139,7 @@ def _report(
     verdict = verdict_of([kind_named(f.effect) for f in findings], errors, options.rules.verdict)
     left = errors.unexplained(options.rules.verdict)
     adequate = float(np.mean([w.adequate for w in windows]))
-    strange = verdict == "unknown_physics" and float(np.mean(errors.after**2)) > rules.strange
+    rejected = verdict == "unknown_physics" and float(np.mean(errors.after**2)) > rules.rejected
     where = ""
     if np.any(left > 0):
         worst = int(np.argmax(left))
@@ -177,7 +177,7 @@ def _report(
         explained=share,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
         summary=_summary(system, verdict, findings, track, where),
-        advice=tuple(_advice(system, pooled, errors, adequate, strange, rules)),
+        advice=tuple(_advice(system, pooled, errors, adequate, rejected, rules)),
         track=track,
         evidence=_arrays(track),
     )
@@ -251,10 +251,10 @@ def _summary(system: System, verdict: str, findings: list[Finding], track: tuple
 
 
 def _advice(
-    system: System, pooled: Pooled, errors: HeldOutErrors, adequate: float, strange: bool, rules: AmbientRules
+    system: System, pooled: Pooled, errors: HeldOutErrors, adequate: float, rejected: bool, rules: AmbientRules
 ) -> list[str]:
     words = []
-    if strange:
+    if rejected:
         words.append(
             "nothing fits: the structure of the system file does not have these spectra. Likeliest: bodies or modes "
             "that the file does not have; masses or stiffnesses far from nominal; an excitation with lines of its own "

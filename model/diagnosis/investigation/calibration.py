@@ -125,7 +125,7 @@ def channels(state: Investigation) -> range:
 def of_others(state: Investigation) -> Screening:
     """What was screened last, without gains and zeros that are in the model: of these no more than rounding is left."""
     among = {state.fit.point.terms[index].key[:2] for index in channels(state)}
-    kept = tuple(hit for hit in state.last.candidates if hit.term.key[:2] not in among)
+    kept = tuple(candidate for candidate in state.last.candidates if candidate.term.key[:2] not in among)
     return replace(state.last, candidates=kept)
 
 

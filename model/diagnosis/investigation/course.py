@@ -155,7 +155,7 @@ class Judgement:
     errors: HeldOutErrors  # of the held-out part, per sensor
     verdict: Verdict
     floor: FloatArray  # bounded noise, in the sensors' units, (S,)
-    strange: float | None  # error over the signal of a model that does not describe the recording
+    rejected: float | None  # error over the signal of a model that does not describe the recording
     lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
     parts: int  # changes of the structure that were needed, where they are too many to be believed; else 0
     ended: bool  # the search ended at its budget of work

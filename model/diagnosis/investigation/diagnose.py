@@ -84,12 +84,12 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
             break
         state = by_names(before, state, lambda plain: with_findings(plain, tell), tell)
         state = without_idle(state)
-        if _still_strange(state, before.fit) or another_structure(state):
+        if _still_rejected(state, before.fit) or another_structure(state):
             break  # what comes next would be names for what another structure does
     return state
 
 
-def _still_strange(state: Investigation, before: Fit) -> bool:
+def _still_rejected(state: Investigation, before: Fit) -> bool:
     """Whether the last finding leaves most of what was missing, and a model that does not describe the recording."""
     rules, fit = state.options.rules.verdict, state.fit
     if state.problem.process_noise:
@@ -98,7 +98,7 @@ def _still_strange(state: Investigation, before: Fit) -> bool:
     else:
         left = fit.chi_square / before.chi_square
         error = float(np.sqrt(np.mean(misfit(fit))))
-    return left > 1 - rules.carried and error > rules.strange
+    return left > 1 - rules.carried and error > rules.rejected
 
 
 def concluded(state: Investigation, tell: Progress) -> Outcome:
@@ -173,11 +173,11 @@ def _without_input_faults(
     faults: list[InputFault] = []
     doubts: list[str] = []
     for _ in range(options.rules.acceptance.input_faults):
-        hit = best_input_fault(start.screening, options.rules.acceptance.alpha)
-        if hit is None:
+        candidate = best_input_fault(start.screening, options.rules.acceptance.alpha)
+        if candidate is None:
             break
-        tell(0.25, f"input channel {hit.location}")
-        fault, signals = compensate(system, start, hit, declared, options)
+        tell(0.25, f"input channel {candidate.location}")
+        fault, signals = compensate(system, start, candidate, declared, options)
         reason = out_of_range(fault.term)
         if reason is not None:
             name = fault.term.law.name.replace("_", " ")
@@ -194,7 +194,7 @@ def _on_everything(state: Investigation) -> Fit:
     part = transform(state.signals, state.problem.noise, differentiated=differentiated)
     problem = replace(state.problem, part=part, work=None)
     fit = try_optimise(problem, state.held.run(state.fit.point).point, 4)
-    most = state.options.rules.acceptance.astray * state.fit.reduced
+    most = state.options.rules.acceptance.diverged * state.fit.reduced
     return fit if fit is not None and fit.reduced < most else state.fit
 
 
@@ -206,24 +206,24 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     gross = not state.problem.process_noise and error > options.rules.selection.gross
     told = of_others(state)
     listed = shortlist(told, options.rules.acceptance.alpha, options.multiplicity, options.rules, gross=gross)
-    hits = _new(state, listed)
-    if hits or act_together(state):
+    candidates = _new(state, listed)
+    if candidates or act_together(state):
         state = tried_wider(state)
     wide = widest(state)
-    promised = max((hit.score for hit in hits), default=0.0)
+    promised = max((candidate.score for candidate in candidates), default=0.0)
     if wide is not None and wide.fall > promised and outdoes(state, wide, []):
         return _next_finding(with_wider(state, wide), number, tell)
-    if not hits:
+    if not candidates:
         return state
     share = 0.25 + 0.17 * number
-    tried = compete(state.problem, state.fit, hits, lambda text: tell(share, text))
+    tried = compete(state.problem, state.fit, candidates, lambda text: tell(share, text))
     tried = with_wider_rivals(state, tried)
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
     there = [t for t in tried if not hardly_there(t.fit, t.term, plausible)]
     worthy = [t for t in there if t.finished and t.evidence > 0 and not _minor(state, t)]
     plain = [t for t in worthy if any(t is one for one in believed)]
     trials = preferred(plain, options.rules.selection)
-    trials.sort(key=lambda t: t.hit.family.rank)  # faults of the inputs first, of forces as of motions
+    trials.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
     disbelieved = _disbelieved(worthy, trials, plausible)
     state = replace(state, notes=(*state.notes, *(_words_of(one, plausible) for one in disbelieved)))
     if wide is not None and outdoes(state, wide, trials):
@@ -235,8 +235,8 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     chosen = trials[0]
     if options.held_out and not state.held.still and state.held.compare(state.fit, chosen.fit).refuted:
         return state
-    tests = state.last.tried(chosen.hit.family) if options.multiplicity else 1
-    p_value = max(chosen.p_value(tests), min(1.0, chosen.hit.p_single * tests))
+    tests = state.last.tried(chosen.candidate.family) if options.multiplicity else 1
+    p_value = max(chosen.p_value(tests), min(1.0, chosen.candidate.p_single * tests))
     if p_value > options.rules.acceptance.alpha:
         return state
     if state.calibrations is None and within_sheet(state, chosen.term):
@@ -256,11 +256,11 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     )
 
 
-def _new(state: Investigation, hits: Iterable[Candidate]) -> list[Candidate]:
+def _new(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
     """Candidates that may be tried: not of the inputs, not found before, and no harmonics of the excitation."""
     return [
         h
-        for h in hits
+        for h in candidates
         if h.family is not INPUT
         and (state.options.unnamed or h.term.law.named)
         and not _repeats(state, h)
@@ -350,29 +350,29 @@ def _smoother(state: Investigation, fit: Fit) -> Fit:
     return surface if state.held.compare(fit, surface).gain > 0 else fit
 
 
-def _repeats(state: Investigation, hit: Candidate) -> bool:
+def _repeats(state: Investigation, candidate: Candidate) -> bool:
     """The same law at the same place, or physics at a place that is unknown already."""
     for term in state.fit.point.terms:
-        if hit.term.key[:2] == term.key[:2]:
+        if candidate.term.key[:2] == term.key[:2]:
             return True
-        if hit.location == term.location and not term.law.listed:
+        if candidate.location == term.location and not term.law.listed:
             return True
     return False
 
 
-def _hopeless(state: Investigation, hit: Candidate) -> bool:
+def _hopeless(state: Investigation, candidate: Candidate) -> bool:
     """Whether a candidate beside a finding, where laws follow the sensors' motion, would be minor however well it fits.
 
     Its score is the fall of chi-square that its first step promises, and so the share of the unmeasured forces.
     """
     if not state.problem.process_noise:
         return False
-    beside = [found.trial for found in state.found if found.trial.term.location == hit.location]
-    if beside and not hit.term.law.named:
+    beside = [found.trial for found in state.found if found.trial.term.location == candidate.location]
+    if beside and not candidate.term.law.named:
         return True
     rules = state.options.rules.acceptance
     left = float(np.sum(state.fit.noise.force**2))
-    promised = rules.better_than_promised * left * hit.score / state.fit.chi_square
+    promised = rules.better_than_promised * left * candidate.score / state.fit.chi_square
     return any(promised < min(rules.minor_beside * trial.worth, rules.most_left * left) for trial in beside)
 
 

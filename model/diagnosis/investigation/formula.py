@@ -71,10 +71,10 @@ def _believed(problem: Problem, base: Fit, trials: list[Trial], unnamed: Trial, 
     return None
 
 
-def _hopeful(problem: Problem, base: Fit, search: FormulaSearch, hits: list[Candidate]) -> bool:
+def _hopeful(problem: Problem, base: Fit, search: FormulaSearch, candidates: list[Candidate]) -> bool:
     """Whether the best score promises to leave little enough to be worth fits."""
     residual = search.motion.projector.residual
-    most = max((hit.score for hit in hits), default=0.0)
+    most = max((candidate.score for candidate in candidates), default=0.0)
     promised = (float(residual @ residual) - most) / max(1, base.count - base.jacobian.shape[1])
     most_left = problem.rules.formula.hopeful * left(problem, base)
     return bool(promised - noise_bound(problem, base) < most_left)

@@ -147,20 +147,20 @@ class FormulaSearch:
         law = law_of(one.parts)
         scales = tuple(max(abs(spec.typical(self.motion.seen)), 1e-12) for spec in law.parameters)
         variant = " + ".join(form.text for form in one.parts)
-        hit = Candidate(Term(law, self.motion.location, one.values, variant, scales=scales), one.score, ELEMENT)
-        return replace(hit, start=self._start(one, hit))
+        candidate = Candidate(Term(law, self.motion.location, one.values, variant, scales=scales), one.score, ELEMENT)
+        return replace(candidate, start=self._start(one, candidate))
 
-    def _start(self, one: Scored, hit: Candidate) -> Point:
+    def _start(self, one: Scored, candidate: Candidate) -> Point:
         """Where a fit of the formula begins: everything else moved as its score has it."""
         projector = self.motion.projector
-        fit, port = projector.fit, hit.term.port(projector.problem.system)
+        fit, port = projector.fit, candidate.term.port(projector.problem.system)
         parts = zip(one.amplitudes, one.parts, one.inner, strict=True)
         force = sum(amplitude * self.spectrum(form, own) for amplitude, form, own in parts)
         left = fit.residual - projector.seen_of(port, np.asarray(force))
         scale = np.maximum(np.linalg.norm(fit.jacobian, axis=0), 1e-300)
         step = np.linalg.lstsq(fit.jacobian / scale, left, rcond=_RIDGE)[0] / scale
         first = len(step) - len(fit.point.state)
-        return advance(start_of(fit, hit), np.insert(step, first, np.zeros(len(hit.term.parameters))))
+        return advance(start_of(fit, candidate), np.insert(step, first, np.zeros(len(candidate.term.parameters))))
 
 
 def _moved(one: Scored, part: int, at: int, factor: float) -> tuple[_Inner, ...]:

@@ -56,5 +56,5 @@ def _afresh(state: Investigation, terms: tuple[Term, ...]) -> list[Point]:
     """
     if len(terms) != state.given + 1 or not isinstance(terms[-1].law, StructureLaw):
         return []
-    hits = [hit for hit in state.first.candidates if hit.term.key == terms[-1].key]
-    return [start for hit in hits for start in structure_starts(state.problem, state.base, hit)]
+    candidates = [candidate for candidate in state.first.candidates if candidate.term.key == terms[-1].key]
+    return [start for candidate in candidates for start in structure_starts(state.problem, state.base, candidate)]

@@ -38,30 +38,33 @@ def best_input_fault(screening: Screening, alpha: float) -> Candidate | None:
 
 
 def compensate(
-    system: System, present: Nominal, hit: Candidate, declared: Noise, options: Options
+    system: System, present: Nominal, candidate: Candidate, declared: Noise, options: Options
 ) -> tuple[InputFault, Signals]:
     """The leading input fault, chosen among its rivals and estimated, and the signals without it."""
     rules = options.rules.acceptance
-    rivals = [h for h in present.screening.candidates if h.family is INPUT and h.term.key != hit.term.key]
+    rivals = [h for h in present.screening.candidates if h.family is INPUT and h.term.key != candidate.term.key]
     rivals.sort(key=lambda h: -h.score)
-    candidates = [hit, *[h for h in rivals if h.score > rules.input_rival * hit.score][: rules.input_rivals]]
+    candidates = [
+        candidate,
+        *[h for h in rivals if h.score > rules.input_rival * candidate.score][: rules.input_rivals],
+    ]
     tried = [_estimated(system, present, one, declared, options) for one in candidates]
     _, term, std = min(tried, key=lambda one: one[0])
-    fault = InputFault(term, std, hit.score, present.screening.p_value(hit), None)
+    fault = InputFault(term, std, candidate.score, present.screening.p_value(candidate), None)
     return fault, compensated(present.signals, term)
 
 
 def _estimated(
-    system: System, present: Nominal, hit: Candidate, declared: Noise, options: Options
+    system: System, present: Nominal, candidate: Candidate, declared: Noise, options: Options
 ) -> tuple[float, Term, float]:
     """Estimate an input fault by compensating, screening again and compensating the rest.
 
     Chi-square of sensors and redundant inputs without the fault, the fault, and its standard deviation.
     """
-    term, law = hit.term, hit.term.law
+    term, law = candidate.term, candidate.term.law
     assert isinstance(law, SensorLaw)
     value = term.parameters[0]
-    std = abs(value - law.absent[0]) / np.sqrt(max(hit.score, options.rules.acceptance.input_done))
+    std = abs(value - law.absent[0]) / np.sqrt(max(candidate.score, options.rules.acceptance.input_done))
     for _ in range(options.rules.acceptance.input_rounds):
         signals = compensated(present.signals, term.at(np.array([value])))
         rest = nominal(system, signals, declared, present.split, options, (law,))
@@ -75,8 +78,8 @@ def _estimated(
     return total, term.at(np.array([value])), float(std)
 
 
-def _of_key(hits: Iterable[Candidate], term: Term) -> Candidate | None:
-    return next((h for h in hits if h.term.key == term.key), None)
+def _of_key(candidates: Iterable[Candidate], term: Term) -> Candidate | None:
+    return next((h for h in candidates if h.term.key == term.key), None)
 
 
 def _redundant(noise: Noise, problem: Problem) -> float:

@@ -36,7 +36,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     size = np.sqrt(np.mean(before.measured**2, axis=0))
     expected = floor / np.where(size > 0, size, 1.0)
     errors = HeldOutErrors(before.per_sensor, after.per_sensor, realised_floor(expected, after, rules))
-    lost = state.problem.process_noise and after.nrmse > rules.strange
+    lost = state.problem.process_noise and after.nrmse > rules.rejected
     deciding = errors
     if lost:
         shares = [unmeasured_share(fit, level.force) for fit, level in _compared(state, noise)]
@@ -53,14 +53,14 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     other = another_structure(state, deciding)
     ended = state.problem.worked_out
     verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=ended)
-    strange = float(np.sqrt(np.mean(deciding.after**2)))
+    rejected = float(np.sqrt(np.mean(deciding.after**2)))
     physics = [kind for kind in physics if kind is not EffectKind.NUISANCE]
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED
     return Judgement(
         errors=errors,
         verdict=verdict,
         floor=floor,
-        strange=strange if other or (verdict == "unknown_physics" and strange > rules.strange) else None,
+        rejected=rejected if other or (verdict == "unknown_physics" and rejected > rules.rejected) else None,
         parts=changed_parts(state) if other else 0,
         lost_phase=lost,
         carried=carried,
@@ -141,8 +141,10 @@ def unmeasured_share(fit: Fit, force: FloatArray) -> float:
 
 def _place(state: Investigation) -> str:
     """Where the screening sees most of what is left."""
-    here = [hit for hit in state.last.candidates if hit.family in (ELEMENT, UNNAMED)] or list(state.last.candidates)
-    return max(here, key=lambda hit: hit.score).location if here else next(iter(state.system.elements), "")
+    here = [candidate for candidate in state.last.candidates if candidate.family in (ELEMENT, UNNAMED)] or list(
+        state.last.candidates
+    )
+    return max(here, key=lambda candidate: candidate.score).location if here else next(iter(state.system.elements), "")
 
 
 def _words(state: Investigation, errors: HeldOutErrors, after: FreeRun) -> str:

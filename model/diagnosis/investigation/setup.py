@@ -58,7 +58,7 @@ def without_setup_faults(
         return system, signals, ()  # nothing was measured of what drives it: nothing to hold the sensors against
     present = misfit(fit)
     rules = problem.rules.setup
-    while len(found) < rules.most and float(np.max(present)) > rules.strange:
+    while len(found) < rules.most and float(np.max(present)) > rules.misfit:
         best = _best(system, signals, declared, split, problem, fit, present)
         if best is None or _left_beside_a_part(problem, fit, best[0].after) < rules.outdone * best[0].after:
             break
@@ -79,13 +79,13 @@ def _left_beside_a_part(problem: Problem, fit: Fit, rival: float) -> float:
     """
     rules, projector = problem.rules.setup, Projector(problem, fit)
     structures = tuple(law for law in problem.system.catalogue if isinstance(law, StructureLaw) and not law.fault)
-    hits = [hit for hit, _ in structure_candidates(projector, structures)]
-    best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
-    starts = [start for hit in best for start in structure_starts(problem, fit, hit)]
+    candidates = [candidate for candidate, _ in structure_candidates(projector, structures)]
+    best = sorted(candidates, key=lambda candidate: -candidate.score)[: rules.parts]
+    starts = [start for candidate in best for start in structure_starts(problem, fit, candidate)]
     fits = [try_optimise(problem, start, rules.part_steps) for start in starts]
     series = tuple(law for law in problem.system.catalogue if isinstance(law, ElementLaw) and law.memory_decay)
-    hits = [hit for hit, _ in element_candidates(projector, series) if hit.term.law in series]
-    best = sorted(hits, key=lambda hit: -hit.score)[: rules.parts]
+    candidates = [candidate for candidate, _ in element_candidates(projector, series) if candidate.term.law in series]
+    best = sorted(candidates, key=lambda candidate: -candidate.score)[: rules.parts]
     fits += [trial.fit for trial in compete(problem, fit, best)]
     good = [one for one in fits if one is not None]
     if not good:

@@ -101,7 +101,7 @@ def verdict_of(
     left = bool(np.any(errors.unexplained(rules) > 0))
     named = [kind for kind in kinds if kind is not EffectKind.NUISANCE]
     faults_only = bool(named) and all(kind is EffectKind.FAULT for kind in named)
-    if float(np.sqrt(np.mean(errors.after**2))) > rules.strange and (left or not faults_only):
+    if float(np.sqrt(np.mean(errors.after**2))) > rules.rejected and (left or not faults_only):
         return "unknown_physics"  # no model of the vehicle, whatever the noise
     if not named:
         return "unknown_physics" if left or ended else "consistent"

@@ -110,14 +110,14 @@ def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
     """
     taken = {found.trial.term.location for found in state.found}
     beside = [trial for trial in trials if trial.finished and trial.evidence > 0 and trial.term.location in taken]
-    hits: list[Candidate] = []
+    candidates: list[Candidate] = []
     for trial in beside:
         starts = list(_starts(trial.fit, len(trial.fit.point.terms) - 1))
-        if starts and len({hit.effect for hit in hits}) < state.options.rules.selection.wider:
-            hits += [replace(trial.hit, term=start.terms[-1], start=start) for start in starts]
-    if not hits or state.problem.process_noise:
+        if starts and len({candidate.effect for candidate in candidates}) < state.options.rules.selection.wider:
+            candidates += [replace(trial.candidate, term=start.terms[-1], start=start) for start in starts]
+    if not candidates or state.problem.process_noise:
         return trials
-    return graded(state.problem, state.fit, [*trials, *compete(state.problem, state.fit, hits)])
+    return graded(state.problem, state.fit, [*trials, *compete(state.problem, state.fit, candidates)])
 
 
 def _widened(state: Investigation, index: int) -> Fit | None:

@@ -13,17 +13,17 @@ ENDED = (
 )
 
 
-def nothing_fits(outcome: Outcome, strange: float) -> str:
+def nothing_fits(outcome: Outcome, rejected: float) -> str:
     """That the system file does not describe the recording, and the likeliest reasons."""
     parts = outcome.judgement.parts
     if parts:
         return (
             f"the structure is another one than the file's: {parts} changes of it (connections, masses, elements "
-            f"elsewhere) were found, which together imitate any other, and still err by {100 * strange:.0f} % of the "
+            f"elsewhere) were found, which together imitate any other, and still err by {100 * rejected:.0f} % of the "
             "signal; bodies, their degrees of freedom and what joins them should be stated anew"
         )
     return (
-        f"nothing fits: the best model still errs by {100 * strange:.0f} % of the signal; the system file does not "
+        f"nothing fits: the best model still errs by {100 * rejected:.0f} % of the signal; the system file does not "
         f"seem to belong to this recording. Likeliest: {'; '.join(likely_reasons(outcome))}"
     )
 

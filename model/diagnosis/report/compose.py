@@ -31,8 +31,8 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     said, names = outcome.judgement, course.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
     advice = [*course.prepared.notes, *course.notes, *undecided(course)]
-    if said.strange is not None:
-        advice.insert(0, nothing_fits(outcome, said.strange))
+    if said.rejected is not None:
+        advice.insert(0, nothing_fits(outcome, said.rejected))
     elif said.lost_phase and not course.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     if said.ended:
@@ -140,13 +140,14 @@ def _candidates(course: Investigation) -> tuple[CandidateRow, ...]:
         for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:
             key = (trial.term.location, trial.term.law.name)
             if key not in rows:
-                p = course.first.p_value(trial.hit)
-                rows[key] = CandidateRow(*key, trial.hit.score, p, trial.delta_bic())
-    for hit in course.first.candidates:
+                p = course.first.p_value(trial.candidate)
+                rows[key] = CandidateRow(*key, trial.candidate.score, p, trial.delta_bic())
+    for candidate in course.first.candidates:
         if len(rows) >= 20:
             break
         rows.setdefault(
-            (hit.location, hit.effect), CandidateRow(hit.location, hit.effect, hit.score, course.first.p_value(hit))
+            (candidate.location, candidate.effect),
+            CandidateRow(candidate.location, candidate.effect, candidate.score, course.first.p_value(candidate)),
         )
     fitted = [c for c in rows.values() if c.delta_bic is not None]
     screened = [c for c in rows.values() if c.delta_bic is None]
@@ -156,12 +157,12 @@ def _candidates(course: Investigation) -> tuple[CandidateRow, ...]:
 
 def _summary(outcome: Outcome, findings: list[Finding], explained: float | None, calibration: str) -> str:
     said = outcome.judgement
-    beside = f"; {calibration}" if calibration and said.strange is None else ""
+    beside = f"; {calibration}" if calibration and said.rejected is None else ""
     if said.verdict == "consistent":
         return f"The nominal structure explains the recording down to the noise{beside}."
     where = f": {said.where}" if said.where else ""
     text = "; ".join(f.sentence for f in findings) or f"Nothing in the system file fits this recording{where}"
-    if said.carried and said.strange is None and explained is not None and explained > 0:
+    if said.carried and said.rejected is None and explained is not None and explained > 0:
         share = "100" if not said.where else f"{min(100 * explained, 99):.0f}"
         text += f"; explains {share} % of the excess error"
         if said.where:

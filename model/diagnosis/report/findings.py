@@ -23,7 +23,7 @@ from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 def findings_of(outcome: Outcome) -> list[Finding]:
     """Findings, the strongest first: a channel that is dead, then by what each explains of chi-square."""
     course, said = outcome.investigation, outcome.judgement
-    if said.strange is not None:
+    if said.rejected is not None:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in course.setup_faults]
@@ -43,8 +43,8 @@ def findings_of(outcome: Outcome) -> list[Finding]:
 def _unknown_finding(outcome: Outcome) -> Finding:
     """What is left above the noise, at the place where it is seen best, without a name."""
     course, said = outcome.investigation, outcome.judgement
-    here = [hit for hit in course.last.candidates if hit.location == said.place]
-    best = max(here, key=lambda hit: hit.score, default=None)
+    here = [candidate for candidate in course.last.candidates if candidate.location == said.place]
+    best = max(here, key=lambda candidate: candidate.score, default=None)
     tried = ""
     if course.found:
         names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in course.found)

@@ -25,7 +25,7 @@ class Family:
 
 ELEMENT = Family("law")
 UNNAMED = Family("unnamed", freedom=None, look_elsewhere=lambda rules: rules.of_shapes)
-HARMONIC = Family("comb", look_elsewhere=lambda rules: rules.of_lines)
+HARMONIC = Family("harmonics", look_elsewhere=lambda rules: rules.of_lines)
 LINE = Family("line", freedom=2, look_elsewhere=lambda rules: rules.of_lines)
 MODE = Family("mode")
 MASS = Family("mass")

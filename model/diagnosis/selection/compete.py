@@ -34,7 +34,7 @@ from sprung.model.diagnosis.selection.starts import alike_starts, starts_of
 class Trial:
     """A candidate with everything refitted around it."""
 
-    hit: Candidate
+    candidate: Candidate
     fit: Fit
     gain: float  # twice the log-likelihood ratio against the model without it
     worth: float  # of what was missing: its fall of chi-square, or of the power of forces that nobody measured
@@ -72,7 +72,7 @@ def shortlist(
     *,
     gross: bool = False,
 ) -> list[Candidate]:
-    """Significant hits that could be the best, one per law, place and variant; input channels are judged elsewhere.
+    """Significant candidates that could be the best, one per law, place and variant; none of input channels.
 
     gross: whether the motion that they were scored along is far from the measured one.  Then scores tell the place, but
     not which of an element's laws acts there: what yields all the time is hardly seen along a motion that does not.
@@ -85,17 +85,17 @@ def shortlist(
     place = good[0].location
     chosen: list[Candidate] = []
     unnamed: dict[str, int] = {}
-    for hit in good:
-        s = hit.strength(screened)
-        share = chosen_by.close if hit.location == place else chosen_by.close_elsewhere
-        known = gross and hit.location == place and hit.term.law.named and is_waveform(hit.term)
+    for candidate in good:
+        s = candidate.strength(screened)
+        share = chosen_by.close if candidate.location == place else chosen_by.close_elsewhere
+        known = gross and candidate.location == place and candidate.term.law.named and is_waveform(candidate.term)
         if s < share * top and s < top - chosen_by.near and not known:
             continue
-        if not hit.term.law.named:
-            unnamed[hit.location] = unnamed.get(hit.location, 0) + 1
-            if unnamed[hit.location] > chosen_by.unnamed:
+        if not candidate.term.law.named:
+            unnamed[candidate.location] = unnamed.get(candidate.location, 0) + 1
+            if unnamed[candidate.location] > chosen_by.unnamed:
                 continue
-        chosen.append(hit)
+        chosen.append(candidate)
         if len(chosen) >= (chosen_by.most_gross if gross else chosen_by.most):
             break
     return chosen
@@ -104,26 +104,34 @@ def shortlist(
 def compete(
     problem: Problem,
     base: Fit,
-    hits: list[Candidate],
+    candidates: list[Candidate],
     progress: Callable[[str], None] = lambda text: None,
 ) -> list[Trial]:
-    """Fits of the hits around the present model, best evidence first."""
+    """Fits of the candidates around the present model, best evidence first."""
     rules = problem.rules.selection
-    places = sorted({hit.location for hit in hits})
-    progress(f"fitting {len(hits)} candidates at {', '.join(places)}")
+    places = sorted({candidate.location for candidate in candidates})
+    progress(f"fitting {len(candidates)} candidates at {', '.join(places)}")
 
     screened = problem.rules.screening
-    again = rules.again * max((hit.strength(screened) for hit in hits), default=0.0)
+    again = rules.again * max((candidate.strength(screened) for candidate in candidates), default=0.0)
 
     def begun(chosen: list[Candidate]) -> list[Trial]:
-        tried = share(lambda hit: _begun(problem, base, hit, hit.strength(screened) > again), chosen, WORKERS)
+        tried = share(
+            lambda candidate: _begun(problem, base, candidate, candidate.strength(screened) > again), chosen, WORKERS
+        )
         return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
         return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
 
-    trials = begun([hit for hit in hits if hit.term.law.named])
-    trials += begun([hit for hit in hits if not hit.term.law.named and _may_lead(problem, hit, trials)])
+    trials = begun([candidate for candidate in candidates if candidate.term.law.named])
+    trials += begun(
+        [
+            candidate
+            for candidate in candidates
+            if not candidate.term.law.named and _may_lead(problem, candidate, trials)
+        ]
+    )
     trials = graded(problem, base, trials)
     if not trials:
         return []
@@ -137,7 +145,7 @@ def compete(
     behind = [replace(trial, finished=False) for rank, trial in enumerate(trials) if not close(rank, trial)]
     named = finished([trial for trial in leading if trial.named])
     unnamed = [trial for trial in leading if not trial.named]
-    if not any(_may_lead(problem, trial.hit, named) for trial in unnamed):
+    if not any(_may_lead(problem, trial.candidate, named) for trial in unnamed):
         all_trials = [*named, *(replace(trial, finished=False) for trial in unnamed), *behind]
     else:
         all_trials = [*named, *finished(unnamed), *behind]
@@ -160,32 +168,34 @@ def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     return trials
 
 
-def runner_up(problem: Problem, base: Fit, hits: list[Candidate], chosen: Trial, tried: list[Trial]) -> Trial | None:
-    """The best candidate with another law, at the same place before others; a hit is fitted where none was."""
+def runner_up(
+    problem: Problem, base: Fit, candidates: list[Candidate], chosen: Trial, tried: list[Trial]
+) -> Trial | None:
+    """The best candidate with another law, at the same place before others; a candidate is fitted where none was."""
     rivals = [t for t in tried if t.term.law.name != chosen.term.law.name and t.gain > 0]
     if rivals:
         return max(rivals, key=lambda t: (t.term.location == chosen.term.location, t.evidence))
-    fitted = {t.hit.term.key for t in tried}
+    fitted = {t.candidate.term.key for t in tried}
     rules = problem.rules
-    others = [h for h in hits if h.effect != chosen.hit.effect and h.score > 0 and h.term.key not in fitted]
-    for hit in sorted(others, key=lambda h: h.strength(rules.screening), reverse=True)[: rules.selection.further]:
-        trial = _begun(problem, base, hit)
+    others = [h for h in candidates if h.effect != chosen.candidate.effect and h.score > 0 and h.term.key not in fitted]
+    for candidate in sorted(others, key=lambda h: h.strength(rules.screening), reverse=True)[: rules.selection.further]:
+        trial = _begun(problem, base, candidate)
         if trial is not None and trial.gain > 0:
             return replace(trial, finished=False)
     return None
 
 
-def _begun(problem: Problem, base: Fit, hit: Candidate, again: bool = False) -> Trial | None:
-    """A hit fitted far enough to see what it is worth, from the best of several starts.
+def _begun(problem: Problem, base: Fit, candidate: Candidate, again: bool = False) -> Trial | None:
+    """A candidate fitted far enough to see what it is worth, from the best of several starts.
 
     again: whether a law with look-alikes of its own starts from those too, where its first fits leave much.
     """
     problem = replace(problem, patient=False)
-    starts = starts_of(problem, base, hit)
-    tried = [t for t in (_try(problem, base, hit, start, 3) for start in starts) if t is not None]
+    starts = starts_of(problem, base, candidate)
+    tried = [t for t in (_try(problem, base, candidate, start, 3) for start in starts) if t is not None]
     best = max(tried, key=lambda t: t.evidence, default=None)
     if again and (best is None or _leaves_much(problem, best)):
-        others = (_try(problem, base, hit, start, 3) for start in alike_starts(base, hit))
+        others = (_try(problem, base, candidate, start, 3) for start in alike_starts(base, candidate))
         best = max((t for t in (best, *others) if t is not None), key=lambda t: t.evidence, default=None)
     return best
 
@@ -217,7 +227,7 @@ def graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     rules = problem.rules.evidence
     least = min((t.fit.reduced for t in trials), default=1.0)
     if least < rules.quiet and not problem.process_noise:
-        again = [_judged(problem, base, t.hit, t.fit, rules.quiet * least) for t in trials]
+        again = [_judged(problem, base, t.candidate, t.fit, rules.quiet * least) for t in trials]
         trials = [replace(new, finished=t.finished) for new, t in zip(again, trials, strict=True)]
     if not problem.process_noise:
         gains = monotone_gains([t.gain for t in trials], [t.fit.chi_square for t in trials], rules)
@@ -227,23 +237,23 @@ def graded(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
     return sorted(trials, key=lambda t: -t.evidence)
 
 
-def _try(problem: Problem, base: Fit, hit: Candidate, start: Point, iterations: int) -> Trial | None:
+def _try(problem: Problem, base: Fit, candidate: Candidate, start: Point, iterations: int) -> Trial | None:
     fit = try_optimise(problem, start, iterations, base.whitener)
-    return None if fit is None else _judged(problem, base, hit, fit)
+    return None if fit is None else _judged(problem, base, candidate, fit)
 
 
 def _finished(problem: Problem, base: Fit, trial: Trial) -> Trial:
     """A trial fitted to the end, measured forces with their noise beside it: without the law that stood for it."""
     if trial.fit.converged and not problem.process_noise:
         return trial
-    finished = _try(problem, base, trial.hit, trial.fit.point, 10) or trial
+    finished = _try(problem, base, trial.candidate, trial.fit.point, 10) or trial
     if not problem.process_noise or finished.fit.deviance > base.deviance:
         return finished
     _, fit = refreshed(problem, finished.fit)
-    return _judged(problem, base, trial.hit, fit)
+    return _judged(problem, base, trial.candidate, fit)
 
 
-def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
+def _judged(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: float | None = None) -> Trial:
     rules = problem.rules.evidence
     quiet = rules.quiet if quiet is None else quiet
     sensors = len(problem.sensors)
@@ -253,9 +263,9 @@ def _judged(problem: Problem, base: Fit, hit: Candidate, fit: Fit, quiet: float 
     else:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
-    dear = cost(fit, len(hit.term.parameters), rules) + rules.rarity * hit.term.law.prior_cost
-    freedom = len(hit.term.parameters) + len(fit.point.state) - len(base.point.state)
-    return Trial(hit, fit, gain, worth, gain - dear, freedom)
+    dear = cost(fit, len(candidate.term.parameters), rules) + rules.rarity * candidate.term.law.prior_cost
+    freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
+    return Trial(candidate, fit, gain, worth, gain - dear, freedom)
 
 
 def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> list[Trial]:

@@ -17,73 +17,73 @@ from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.laws.base import FittedElement, Restart
 
 
-def starts_of(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+def starts_of(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     """Starts of a candidate beside the present model, the first one the likeliest."""
-    if hit.start is not None:
-        return [hit.start]
-    if isinstance(hit.term.law, StructureLaw):
-        return structure_starts(problem, base, hit)
-    starts = [joint_start(problem, base, hit), *_further_starts(problem, base, hit)]
-    if _astray(problem, base) and _strengths(hit.term.law):  # what a gross law drove the parameters to
-        starts.append(joint_start(problem, base, hit, nominal=True))
+    if candidate.start is not None:
+        return [candidate.start]
+    if isinstance(candidate.term.law, StructureLaw):
+        return structure_starts(problem, base, candidate)
+    starts = [joint_start(problem, base, candidate), *_further_starts(problem, base, candidate)]
+    if _astray(problem, base) and _strengths(candidate.term.law):  # what a gross law drove the parameters to
+        starts.append(joint_start(problem, base, candidate, nominal=True))
     return starts
 
 
 def _astray(problem: Problem, base: Fit) -> bool:
     """Whether parameters are far off nominal."""
     far: float = np.max(np.abs(base.point.theta), initial=0.0)
-    return far > problem.rules.selection.astray
+    return far > problem.rules.selection.far
 
 
-def start_of(base: Fit, hit: Candidate) -> Point:
-    """The present model with the hit's term; the first Gauss-Newton step moves the rest."""
+def start_of(base: Fit, candidate: Candidate) -> Point:
+    """The present model with the candidate's term; the first Gauss-Newton step moves the rest."""
     point = base.point
     state = point.state
-    law = hit.term.law
+    law = candidate.term.law
     if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
         n = (len(state) - len(base.forward.plant.structure.branches)) // 2
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
-    if isinstance(hit.term.law, ElementLaw) and not is_waveform(hit.term):  # the force of one more branch
+    if isinstance(candidate.term.law, ElementLaw) and not is_waveform(candidate.term):  # the force of one more branch
         state = np.append(state, 0.0)
     near = point.warm_start
-    if is_waveform(hit.term):
-        near = (*near, base.force_along(hit.term))
-    return Point(point.theta, (*point.terms, hit.term), state, near)
+    if is_waveform(candidate.term):
+        near = (*near, base.force_along(candidate.term))
+    return Point(point.theta, (*point.terms, candidate.term), state, near)
 
 
-def structure_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+def structure_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     """Starts of a part of the structure: as screened, and as everything moving along has it.
 
     The same at nominal parameters, where the present ones are far off: what a gross part drove them to.
     """
     starts = []
     for nominal in (False, True)[: 2 if _astray(problem, base) else 1]:
-        start = start_of(base, hit)
+        start = start_of(base, candidate)
         start = replace(start, theta=np.zeros_like(start.theta)) if nominal else start
-        beside = joint_start(problem, base, hit, nominal)
-        starts += [start] if beside.terms[-1] is hit.term else [start, beside]
+        beside = joint_start(problem, base, candidate, nominal)
+        starts += [start] if beside.terms[-1] is candidate.term else [start, beside]
     return starts
 
 
-def _further_starts(problem: Problem, base: Fit, hit: Candidate) -> list[Point]:
+def _further_starts(problem: Problem, base: Fit, candidate: Candidate) -> list[Point]:
     """Starts at other values of the element than those that were read without the law."""
-    law, names = hit.term.law, [p.name for p in problem.system.parameters]
-    at = {quantity: f"{hit.location}.{quantity}" for quantity in ("stiffness", "damping")}
+    law, names = candidate.term.law, [p.name for p in problem.system.parameters]
+    at = {quantity: f"{candidate.location}.{quantity}" for quantity in ("stiffness", "damping")}
     if not isinstance(law, ElementLaw) or at["damping"] not in names:
         return []
-    start = start_of(base, hit)
-    restarts = () if law.restarts is None else law.restarts(_reading(problem, base, hit.location))
-    if hit.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
+    start = start_of(base, candidate)
+    restarts = () if law.restarts is None else law.restarts(_reading(problem, base, candidate.location))
+    if candidate.beyond > 1.0:  # a law in shares of the damper asks for more than all of it: the damper is stronger
         stronger = problem.rules.selection.stronger
-        values = law.scaled(hit.term.parameters, 1 / stronger)
-        restarts += (Restart(1.0, stronger * hit.beyond, tuple(values)),)
+        values = law.scaled(candidate.term.parameters, 1 / stronger)
+        restarts += (Restart(1.0, stronger * candidate.beyond, tuple(values)),)
     points = []
     for restart in restarts:
         theta = start.theta.copy()
         for quantity, factor in (("stiffness", restart.stiffness), ("damping", restart.damping)):
             if at[quantity] in names:
                 theta[names.index(at[quantity])] += np.log(factor)
-        term = hit.term.at(np.array(restart.parameters))
+        term = candidate.term.at(np.array(restart.parameters))
         points.append(replace(start, theta=theta, terms=(*base.point.terms, term)))
     return points
 
@@ -97,34 +97,34 @@ def _reading(problem: Problem, base: Fit, location: str) -> FittedElement:
     return FittedElement(k, c, nominal, speed / float(np.std(deflection)), speed)
 
 
-def alike_starts(base: Fit, hit: Candidate) -> list[Point]:
+def alike_starts(base: Fit, candidate: Candidate) -> list[Point]:
     """Starts at other parameters of the same law that look alike on the whole."""
-    law = hit.term.law
+    law = candidate.term.law
     if not isinstance(law, ElementLaw) or law.alike is None:
         return []
-    terms = [hit.term.at(law.clip(list(values))) for values in law.alike(hit.term.parameters)]
-    return [start_of(base, replace(hit, term=term)) for term in terms]
+    terms = [candidate.term.at(law.clip(list(values))) for values in law.alike(candidate.term.parameters)]
+    return [start_of(base, replace(candidate, term=term)) for term in terms]
 
 
-def joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool = False) -> Point:
+def joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: bool = False) -> Point:
     """The term at the strength that, with everything else moving along, the base's residual asks for.
 
     The strength of a law is found from a hint of it, its shape kept: at its full strength beside unmoved parameters,
     which have absorbed much of it, the model may be too far away for a first step.  nominal: from nominal parameters.
     """
     if problem.memory is None:
-        return _joint_start(problem, base, hit, nominal)
-    term = hit.term
+        return _joint_start(problem, base, candidate, nominal)
+    term = candidate.term
     key = "start", id(base), nominal, term.key, term.parameters, term.scales, problem.rules.selection.hint
-    return problem.memory.recall(key, lambda: _joint_start(problem, base, hit, nominal))
+    return problem.memory.recall(key, lambda: _joint_start(problem, base, candidate, nominal))
 
 
-def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> Point:
-    start = start_of(base, hit)
-    hint = _hint(hit.term, problem.rules.selection.hint)
+def _joint_start(problem: Problem, base: Fit, candidate: Candidate, nominal: bool) -> Point:
+    start = start_of(base, candidate)
+    hint = _hint(candidate.term, problem.rules.selection.hint)
     if hint is None:
         return start
-    faint = start_of(base, replace(hit, term=hint))
+    faint = start_of(base, replace(candidate, term=hint))
     faint = replace(faint, theta=np.zeros_like(faint.theta)) if nominal else faint
     try:
         with np.errstate(all="ignore"):
@@ -134,10 +134,10 @@ def _joint_start(problem: Problem, base: Fit, hit: Candidate, nominal: bool) -> 
         return start
     if not np.all(np.isfinite(lin.residual)) or not np.all(np.isfinite(lin.jacobian)):
         return start
-    count = len(hit.term.parameters)
+    count = len(candidate.term.parameters)
     first = lin.jacobian.shape[1] - len(faint.state) - count
     kept = np.ones(lin.jacobian.shape[1], dtype=bool)
-    kept[first : first + count] = np.isin(np.arange(count), _strengths(hit.term.law))
+    kept[first : first + count] = np.isin(np.arange(count), _strengths(candidate.term.law))
     held = fixed(faint)
     kept[: len(held)] &= ~held
     columns = lin.jacobian[:, kept]

@@ -28,8 +28,12 @@ def unnamed() -> tuple[Investigation, Trial]:
     """An investigation that has begun, and its best unnamed force: a spring that stiffens with the rate, and a stop."""
     record = simulate(lambda d, v: RATE * d * abs(v) + STOP * max(-d - GAP, 0.0), seconds=12.0, seed=3)
     state = begun(quarter_car(), record, Options(), lambda share, text: None)
-    hits = [hit for hit in state.last.candidates if hit.family is UNNAMED and hit.location == "secondary"]
-    return state, compete(state.problem, state.fit, hits)[0]
+    candidates = [
+        candidate
+        for candidate in state.last.candidates
+        if candidate.family is UNNAMED and candidate.location == "secondary"
+    ]
+    return state, compete(state.problem, state.fit, candidates)[0]
 
 
 def test_the_residual_without_a_force_is_that_force_and_noise(unnamed: tuple[Investigation, Trial]) -> None:
@@ -54,10 +58,12 @@ def test_no_pair_at_random_scores_more_than_the_pairs_that_are_found(unnamed: tu
 
 def test_a_fit_of_a_formula_begins_where_everything_has_moved_along(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
-    hit = FormulaSearch.along(state.problem, trial.fit).best()[1][0]
-    assert hit.start is not None and hit.start.terms[-1].parameters == pytest.approx(hit.term.parameters)
-    moved = try_optimise(state.problem, hit.start, 1, trial.fit.whitener)
-    plain = try_optimise(state.problem, start_of(state.fit, hit), 1, trial.fit.whitener)
+    candidate = FormulaSearch.along(state.problem, trial.fit).best()[1][0]
+    assert candidate.start is not None and candidate.start.terms[-1].parameters == pytest.approx(
+        candidate.term.parameters
+    )
+    moved = try_optimise(state.problem, candidate.start, 1, trial.fit.whitener)
+    plain = try_optimise(state.problem, start_of(state.fit, candidate), 1, trial.fit.whitener)
     assert moved is not None and (plain is None or moved.chi_square < plain.chi_square)
 
 

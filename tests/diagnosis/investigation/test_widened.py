@@ -37,8 +37,8 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> 
     state = begun(quarter_car(), simulate(_damped(together), seconds=8, seed=3), Options(), lambda share, text: None)
     fit = state.fit
     for name, values in (("damper_blowoff", (KNEE, RATIO)), ("damper_asymmetry", (A,))):
-        hit: Any = SimpleNamespace(term=Term(find_law(name), "secondary", values, scales=tuple(map(abs, values))))
-        fit = optimise(state.problem, start_of(fit, hit), 6)
+        candidate: Any = SimpleNamespace(term=Term(find_law(name), "secondary", values, scales=tuple(map(abs, values))))
+        fit = optimise(state.problem, start_of(fit, candidate), 6)
     found: Any = tuple(SimpleNamespace(trial=SimpleNamespace(term=term)) for term in fit.point.terms)
     state = replace(state, fit=fit, found=found)
     assert act_together(state)

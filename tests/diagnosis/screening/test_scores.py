@@ -16,7 +16,7 @@ def test_scores_on_a_clean_recording_are_chi_square() -> None:
     for seed in range(6):
         problem = problem_of(simulate(seed=10 + seed, seconds=12))
         fit = optimise(problem, Point(np.zeros(4), (), np.zeros(4)))
-        hits = screen(problem, fit, laws).candidates
-        scores += [h.score for h in hits if h.family is ELEMENT]
+        candidates = screen(problem, fit, laws).candidates
+        scores += [h.score for h in candidates if h.family is ELEMENT]
     assert np.mean(scores) < 2.5  # one-sided laws drop out when their sign is wrong
     assert np.max(scores) < 20

@@ -56,7 +56,10 @@ def test_scores_in_closed_form_promise_what_a_fit_gains(kind: str, share: float)
     problem, fit = baseline(SYSTEM, signals, declared_noise(SYSTEM, signals), signals.samples)
     law = find_law(kind)
     assert isinstance(law, StructureLaw)
-    best = max((hit for hit, _ in structure_candidates(Projector(problem, fit), (law,))), key=lambda hit: hit.score)
+    best = max(
+        (candidate for candidate, _ in structure_candidates(Projector(problem, fit), (law,))),
+        key=lambda candidate: candidate.score,
+    )
     assert best.location == part.location and best.score > 30
     again = optimise(problem, start_of(fit, best), whitener=fit.whitener)
     assert fit.chi_square - again.chi_square == pytest.approx(best.score, rel=0.2)

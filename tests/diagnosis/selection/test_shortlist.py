@@ -18,7 +18,9 @@ SCORES = {
 
 @pytest.mark.parametrize("gross", [True, False])
 def test_all_laws_of_the_leading_element_are_fitted_where_little_is_explained(gross: bool) -> None:
-    hits = [Candidate(Term(law := find_law(name), at, law.absent), s, ELEMENT) for (at, name), s in SCORES.items()]
-    chosen = shortlist(Screening(tuple(hits), {ELEMENT: 100}), alpha=1e-3, gross=gross)
+    candidates = [
+        Candidate(Term(law := find_law(name), at, law.absent), s, ELEMENT) for (at, name), s in SCORES.items()
+    ]
+    chosen = shortlist(Screening(tuple(candidates), {ELEMENT: 100}), alpha=1e-3, gross=gross)
     plain = [("storey", "cubic_stiffness"), ("storey", "air_spring")]
     assert [(one.location, one.effect) for one in chosen] == plain + [("storey", "bouc_wen")] * gross

@@ -35,6 +35,6 @@ def test_a_law_also_starts_from_nominal_values_where_the_present_ones_are_far_of
     monkeypatch.setattr(starts, "joint_start", lambda p, b, h, nominal=False: asked.append(nominal))
     monkeypatch.setattr(starts, "_further_starts", lambda *anything: [])
     found = find_law(law)
-    hit: Any = SimpleNamespace(start=None, term=Term(found, "strut", (1.0,) * len(found.parameters)))
-    starts.starts_of(PROBLEM, fitted(theta), hit)
+    candidate: Any = SimpleNamespace(start=None, term=Term(found, "strut", (1.0,) * len(found.parameters)))
+    starts.starts_of(PROBLEM, fitted(theta), candidate)
     assert asked == nominal

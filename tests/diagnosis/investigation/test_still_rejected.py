@@ -13,11 +13,11 @@ from sprung.model.diagnosis.rules import RULES
 
 
 @pytest.mark.parametrize(
-    ("left", "error", "strange"),
+    ("left", "error", "rejected"),
     [(0.9, 0.8, True), (0.3, 0.8, False), (0.9, 0.3, False)],  # of chi-square; of the sensors
 )
 def test_a_finding_that_hardly_helps_a_strange_model_is_the_last(
-    left: float, error: float, strange: bool, monkeypatch: pytest.MonkeyPatch
+    left: float, error: float, rejected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(diagnose, "misfit", lambda fit: np.full(3, error**2))
     state: Any = SimpleNamespace(
@@ -26,4 +26,4 @@ def test_a_finding_that_hardly_helps_a_strange_model_is_the_last(
         fit=SimpleNamespace(chi_square=left * 1e4),
     )
     before: Any = SimpleNamespace(chi_square=1e4)
-    assert diagnose._still_strange(state, before) is strange
+    assert diagnose._still_rejected(state, before) is rejected
