@@ -43,7 +43,9 @@ def ask(port: int, path: str = "/health/live", seconds: float = 10.0, headers: s
 def closed_within(connection: socket.socket, seconds: float) -> bool:
     connection.settimeout(seconds)
     try:
-        return connection.recv(65536) == b"" or connection.recv(65536) == b""
+        while connection.recv(65536):
+            pass  # an answer, in one piece or several
+        return True
     except TimeoutError:
         return False
     except ConnectionError:
@@ -81,7 +83,8 @@ def test_nothing_at_all_is_not_waited_for_either(engine: Engine, tmp_path: Path)
 def test_a_body_that_stops_coming_is_given_up(engine: Engine, tmp_path: Path) -> None:
     core = build_core(settings(tmp_path, body_idle_seconds=0.5), engine)
     with served(core) as port, socket.create_connection(("127.0.0.1", port)) as slow:
-        slow.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5000\r\n\r\n{")
+        kind = b"Content-Type: application/json\r\n"
+        slow.sendall(b"POST /identify HTTP/1.1\r\nHost: localhost\r\n" + kind + b"Content-Length: 5000\r\n\r\n{")
         assert closed_within(slow, 10)
         assert b"200 OK" in ask(port)
 
