@@ -6,6 +6,7 @@ import http.client
 import json
 import threading
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -63,18 +64,18 @@ class RestlessClient(threading.Thread):
         self, method: str, path: str, body: bytes = b"", kind: str = "application/json", identity: str = ""
     ) -> tuple[int, Any]:
         """Status and JSON of an answer."""
-        port = self.port
-        if port is None:
+        if self.port is None:
             raise ConnectionError("the service is gone")
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=TIMEOUT)
-        try:
-            connection.request(
-                method, path, body, {"content-type": kind} | ({"x-request-id": identity} if identity else {})
-            )
-            answer = connection.getresponse()
-            return answer.status, json.loads(answer.read())
-        finally:
-            connection.close()
+        headers = {"content-type": kind} | ({"x-request-id": identity} if identity else {})
+        return ask(self.port, method, path, body, headers, TIMEOUT)
+
+
+def ask(port: int, method: str, path: str, body: bytes, headers: dict[str, str], seconds: float) -> tuple[int, Any]:
+    """Status and JSON of an answer of the service at a port of this machine."""
+    with closing(http.client.HTTPConnection("127.0.0.1", port, timeout=seconds)) as connection:
+        connection.request(method, path, body, headers)
+        answer = connection.getresponse()
+        return answer.status, json.loads(answer.read())
 
 
 class Windows(RestlessClient):

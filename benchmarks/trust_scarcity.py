@@ -22,11 +22,13 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from sprung.benchmarks.trust_clients import ask
 from sprung.benchmarks.trust_ride import RestlessRide
 from sprung.benchmarks.trust_service import Served
 
 DISK_MB = 96
 BACK_SECONDS = 120.0  # within which it has to be ready again
+PATIENCE = 60.0  # s
 TURN = 0.25  # s between two rounds of requests
 SPARE_FILES = 4  # descriptors that are left: enough to answer, too few to work
 BALLAST, CROWD = 1_500_000, 16  # bytes of bodies that are sent at once when memory is short, and how many of them
@@ -95,17 +97,10 @@ class ScarceService:
         return sent == listed == ready == 200
 
     def _ask(self, method: str, path: str, body: bytes = b"") -> tuple[int | str, dict[str, Any]]:
-        connection = http.client.HTTPConnection("127.0.0.1", self.served.port, timeout=60)
         try:
-            connection.request(method, path, body, {"content-type": "application/json"} if body else {})
-            answer = connection.getresponse()
-            text = answer.read()
-            found = json.loads(text) if text.startswith(b"{") else {}
-            return answer.status, found
+            return ask(self.served.port, method, path, body, {"content-type": "application/json"}, PATIENCE)
         except (OSError, http.client.HTTPException):
             return "unanswered", {}
-        finally:
-            connection.close()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import shutil
 import tempfile
@@ -62,9 +63,9 @@ class Condition:
 
 
 def _memory_trouble() -> str:
-    try:
-        bytearray(MEMORY_BYTES)
-    except MemoryError:
+    try:  # asked for and not touched
+        mmap.mmap(-1, MEMORY_BYTES, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+    except OSError:
         return f"{MEMORY_BYTES >> 20} MB of memory are not to be had"
     return ""
 

@@ -17,7 +17,7 @@ from sprung.service import rides
 from sprung.service.compute import Priority
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch, Identified
-from sprung.service.reading import Apart, Ending, Here, Reading, ReadRequest, prefetched
+from sprung.service.reading import Ending, ReadRequest, prefetched, reading_of
 from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
 from sprung.service.worker import ProcessLimits
 
@@ -117,7 +117,7 @@ def feed_file(
     """
     system = pipeline.engine.system
     request = ReadRequest(path, system, pipeline.engine.dbc, 1 if speed else batch_windows, speed, start)
-    reading: Reading = Here(request) if limits is None else Apart(request, limits)
+    reading = reading_of(request, limits)
     started = time.perf_counter()
     ride = comfort.RideQuality(system)
     fed = Fed("", ride=ride)

@@ -203,6 +203,11 @@ class Apart:
         self._worker.kill()
 
 
+def reading_of(request: ReadRequest, limits: ProcessLimits | None) -> Reading:
+    """A recording that is about to be read: in a process of its own, or here where limits are None."""
+    return Here(request) if limits is None else Apart(request, limits)
+
+
 class _Abandoned(Exception):
     """Raised where items are produced when nobody wants them any more."""
 

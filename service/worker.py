@@ -229,6 +229,19 @@ def _end_with_pipe(lifeline: Connection) -> None:
     threading.Thread(target=watch, name="sprung-lifeline", daemon=True).start()
 
 
+def carried_out(task: Task[Request, None, Result], request: Request, limits: ProcessLimits | None, what: str) -> Result:
+    """What a task returns that tells nothing on its way: done in a process of its own, or here where limits are None.
+
+    Raises as `Worker.messages`, or as the task itself.
+    """
+    if limits is None:
+        return task(request, lambda _message: None)
+    worker: Worker[None, Result] = Worker(task, request, limits, what)
+    for _ in worker.messages():
+        pass
+    return worker.result
+
+
 def be_modest(limits: ProcessLimits) -> None:
     """Low priority, first to go when memory runs out, and bounds of the kernel's where the platform has them."""
     with suppress(OSError, AttributeError):

@@ -10,9 +10,9 @@ from typing import TypeVar
 from sprung.replay.inspection import Inspection
 from sprung.replay.record import Record
 from sprung.service.loading import InspectionRequest, RecordRequest, inspect_task, load_task
-from sprung.service.reading import SLOWEST_BYTES_PER_SECOND, Apart, Here, Reading, ReadRequest, ReadWindows
+from sprung.service.reading import SLOWEST_BYTES_PER_SECOND, Reading, ReadRequest, ReadWindows, reading_of
 from sprung.service.settings import Settings, settings_with
-from sprung.service.worker import ProcessLimits, Task, Worker
+from sprung.service.worker import ProcessLimits, Task, carried_out
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")
@@ -48,17 +48,10 @@ def reading(request: ReadRequest) -> Reading:
     """A recording that is about to be read.  Raises OSError where there is none."""
     with open(request.path, "rb"):  # an absent file is told without a process
         pass
-    limits = own_limits(settings_with({}), request.path)
-    return Here(request) if limits is None else Apart(request, limits)
+    return reading_of(request, own_limits(settings_with({}), request.path))
 
 
 def _apart(task: Task[Request, None, Result], request: Request, path: Path) -> Result:
     with open(path, "rb"):  # an absent file is told without a process
         pass
-    limits = own_limits(settings_with({}), path)
-    if limits is None:
-        return task(request, lambda _message: None)
-    worker: Worker[None, Result] = Worker(task, request, limits, f"the reading of {path.name}")
-    for _ in worker.messages():
-        pass
-    return worker.result
+    return carried_out(task, request, own_limits(settings_with({}), path), f"the reading of {path.name}")

@@ -26,9 +26,9 @@ from sprung.service.errors import UserError
 from sprung.service.feed import vehicle_of
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.fleet.tasks import Tasks, WorkLost
-from sprung.service.loading import Beginning, RecordRequest, head_task
+from sprung.service.loading import RecordRequest, head_task
 from sprung.service.pipeline import Pipeline
-from sprung.service.reading import Apart, Here, Reading, ReadRequest
+from sprung.service.reading import ReadRequest, reading_of
 from sprung.service.recordings import reading_limits
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, open_store, status, work
@@ -36,7 +36,7 @@ from sprung.service.store.partitions import prepare
 from sprung.service.store.staging import staging_digest, swap
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
-from sprung.service.worker import Worker
+from sprung.service.worker import ProcessLimits, carried_out
 
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
 AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk
@@ -195,6 +195,10 @@ def _list_files(place: str) -> list[FoundFile]:
     )
 
 
+def _limits(plan: BackfillPlan, path: Path) -> ProcessLimits | None:
+    return reading_limits(plan.settings, path) if plan.settings.isolate_reading else None
+
+
 def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
     """Whose recording it is and when it began: its head is read, no more."""
     engine = engine_of(plan.settings)
@@ -203,14 +207,7 @@ def look(plan: BackfillPlan, file: FoundFile) -> FoundFile:
             system = engine.system
             start = file.modified_ns or None
             request = RecordRequest(path, system.channels, system.sample_rate, engine.dbc, system.time, start)
-            if plan.settings.isolate_reading:
-                limits = reading_limits(plan.settings, path)
-                worker: Worker[None, Beginning] = Worker(head_task, request, limits, f"the reading of {path.name}")
-                for _ in worker.messages():
-                    pass
-                head = worker.result
-            else:
-                head = head_task(request, lambda _message: None)
+            head = carried_out(head_task, request, _limits(plan, path), f"the reading of {path.name}")
         if head.first_ns is None:
             return replace(file, problem="no samples of the system's channels")
         return replace(file, vehicle=vehicle_of(None, head.vehicle, Path(file.path).name), first_ns=head.first_ns)
@@ -238,9 +235,7 @@ def identify_file(plan: BackfillPlan, file: FoundFile) -> IdentifiedFile:
         with local_copy(file) as path, ExitStack() as stack:
             together = plan.settings.batch_windows  # as when it is replayed, so that estimates are the same bit by bit
             request = ReadRequest(path, engine.system, engine.dbc, together, start=file.modified_ns or None)
-            reading: Reading = (
-                Apart(request, reading_limits(plan.settings, path)) if plan.settings.isolate_reading else Here(request)
-            )
+            reading = reading_of(request, _limits(plan, path))
             stack.callback(reading.close)
             for piece in reading.pieces(lambda: None):
                 add(piece.windows)

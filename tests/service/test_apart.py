@@ -10,7 +10,7 @@ import pytest
 
 from sprung.model.system import MANCHESTER, System
 from sprung.replay import UnreadableRecording
-from sprung.service import reading
+from sprung.service import reading, worker
 from sprung.service.cli import apart, main
 from sprung.service.errors import UserError
 from sprung.service.loading import RecordRequest
@@ -68,7 +68,7 @@ def test_no_command_reads_a_recording_in_its_own_process(
     def refused(*_: object) -> None:
         raise UserError("read apart")
 
-    monkeypatch.setattr(apart, "Worker", refused)
+    monkeypatch.setattr(worker, "Worker", refused)
     monkeypatch.setattr(reading, "Worker", refused)
     (tmp_path / "a.csv").write_text("time,acc\n0,1\n")
     given = command.replace("FILE", str(tmp_path / "a.csv")).replace("OUT", str(tmp_path / "out"))

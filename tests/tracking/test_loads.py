@@ -54,6 +54,19 @@ def constant(load: float) -> Callable[[int], float]:
     return lambda k: load
 
 
+def pressure(load: float) -> Callable[[int], Conditions]:
+    return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
+
+
+def with_its_gauge_known(rng: np.random.Generator, tracker: Tracker) -> tuple[TrackerState, int]:
+    """After four rides of a minute with a gauge in order, and when the next begins."""
+    state, at = tracker.initial_state(), 0
+    for load in (0.0, 0.2, -0.1, 0.1):
+        state = ride(rng, tracker, state, 60, constant(load), at, pressure(load))
+        at += 100
+    return state, at
+
+
 def worst(tracker: Tracker, state: TrackerState) -> float:
     mean, std = tracker.posterior(state)
     return float(np.abs(mean / std).max())
@@ -102,15 +115,8 @@ def test_less_than_the_least_is_an_alarm_too() -> None:
 
 def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
     rng = np.random.default_rng(4)
-    tracker, state, at = follow(), None, 0
-    state = tracker.initial_state()
-
-    def pressure(load: float) -> Callable[[int], Conditions]:
-        return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
-
-    for load in (0.0, 0.2, -0.1, 0.1):
-        state = ride(rng, tracker, state, 60, constant(load), at, pressure(load))
-        at += 100
+    tracker = follow()
+    state, at = with_its_gauge_known(rng, tracker)
     assert state.cargo is not None and state.cargo.constant[0] == pytest.approx(np.log(4.2e5), abs=0.02)
     state = ride(rng, tracker, state, 1, lambda k: 0.25, at, pressure(0.25))
     value, std = tracker.loads(state)["car"]
@@ -121,16 +127,9 @@ def test_pressure_tells_the_load_at_once_when_its_constant_is_known() -> None:
 
 def test_a_gauge_that_is_stuck_falsifies_no_load_for_long_and_is_soon_not_believed() -> None:
     rng = np.random.default_rng(6)
-    tracker, at = follow(), 0
+    tracker = follow()
     wrong: list[bool] = []
-    state = tracker.initial_state()
-
-    def pressure(load: float) -> Callable[[int], Conditions]:
-        return lambda k: Conditions(pressure=(4.2e5 * float(np.exp(load)),))
-
-    for load in (0.0, 0.2, -0.1, 0.1):
-        state = ride(rng, tracker, state, 60, constant(load), at, pressure(load))
-        at += 100
+    state, at = with_its_gauge_known(rng, tracker)
     for load in (0.25, -0.2, 0.2, -0.25, 0.15):
         for k in range(at, at + 60):
             state = ride(rng, tracker, state, 1, constant(load), k, pressure(0.1))

@@ -307,5 +307,10 @@ LawPiece = Piece | Following | Lag  # what is searched among
 Part = LawPiece | SliderSurface
 
 
+def no_shapes(seen: Seen) -> FloatArray:
+    """The grid of a piece whose columns depend on nothing."""
+    return np.zeros((1, 0))
+
+
 def rates_at(seen: Seen, shares: Sequence[float]) -> FloatArray:
     return np.interp(shares, np.linspace(0, 1, 101), seen.rate)

@@ -18,6 +18,7 @@ from sprung.model.diagnosis.component.piece import (
     Seen,
     Shape,
     Values,
+    no_shapes,
     rates_at,
 )
 from sprung.model.laws import ElementLaw, SpringDamper, grid
@@ -47,10 +48,6 @@ def _yield_limits(seen: Seen) -> tuple[float, float]:
 
 def _knee_limits(seen: Seen) -> tuple[float, float]:
     return (seen.lowest_knee, float(seen.rate[97]))
-
-
-def _none(seen: Seen) -> FloatArray:
-    return np.zeros((1, 0))
 
 
 def _damping(element: SpringDamper) -> float:
@@ -243,7 +240,7 @@ _BACKLASH = Piece(
 
 # --- dampers ----------------------------------------------------------------------------------------------------
 
-_QUADRATIC = Piece(QUADRATIC_DAMPING, (), _none, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
+_QUADRATIC = Piece(QUADRATIC_DAMPING, (), no_shapes, lambda seen: [], (1,), lambda a, s, e: (a[0],), lambda p: ())
 _BLOWOFF = Piece(
     DAMPER_BLOWOFF,
     ("knee",),
@@ -269,7 +266,7 @@ _TWO_KNEES = Piece(
 _ASYMMETRY = Piece(
     DAMPER_ASYMMETRY,
     (),
-    _none,
+    no_shapes,
     lambda seen: [],
     (0,),
     lambda a, s, e: (a[0] / _damping(e),),
@@ -305,7 +302,7 @@ _SERIES = Piece(
 _CUBIC = Piece(
     CUBIC_STIFFNESS,
     (),
-    _none,
+    no_shapes,
     lambda seen: [],
     (0,),
     lambda a, s, e: (a[0],),
@@ -315,7 +312,7 @@ _CUBIC = Piece(
 _CUBIC_OFF_CENTRE = Piece(
     _wider(CUBIC_STIFFNESS),
     (),
-    _none,
+    no_shapes,
     lambda seen: [],
     (0, 0),
     lambda a, s, e: (a[0], a[1]),

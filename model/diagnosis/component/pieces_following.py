@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
-from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece
+from sprung.model.diagnosis.component.piece import Following, LawPiece, Piece, no_shapes
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.laws.damping import COULOMB_FRICTION, QUADRATIC_DAMPING
 from sprung.model.laws.following import Covariate, following_law
@@ -21,7 +19,7 @@ def pieces_following(signal: Covariate) -> tuple[LawPiece, ...]:
         return Piece(
             following_law(quantity, signal),
             (),
-            lambda seen: np.zeros((1, 0)),
+            no_shapes,
             lambda seen: [],
             (0,),
             lambda a, s, e: (a[0] / max(float(getattr(e, quantity)), 1e-300),),

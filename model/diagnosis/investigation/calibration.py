@@ -89,7 +89,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
     What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.  Gains of
     what drives everything are kept as they are from now on: their common part shows in a law's curvature alone.
     """
-    file, terms, fit = state.fit.point.terms[: state.given], _of_all_channels(state), None
+    file, terms = state.fit.point.terms[: state.given], _of_all_channels(state)
     keys = {term.key for term in terms}
     found = tuple(term for term in state.fit.point.terms[state.given :] if term.key not in keys)
     for _ in range(2):

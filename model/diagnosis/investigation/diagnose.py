@@ -78,7 +78,7 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
         state = _next_finding(state, number, tell)
         if state.problem.worked_out:
             tell(0.92, "the budget of work is spent: no further candidate is fitted")
-        if state.calibrations != before.calibrations:
+        if state.calibrations and not before.calibrations:  # everything is sought anew beside them
             return with_findings(replace(state, notes=notes), tell)
         if len(state.found) == len(before.found):
             break
@@ -240,7 +240,9 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     if p_value > options.rules.acceptance.alpha:
         return state
     if state.calibrations is None and within_sheet(state, chosen.term):
-        return calibrated(state, chosen.term)
+        state = calibrated(state, chosen.term)
+        if state.calibrations:
+            return state
     second = runner_up(state.problem, state.fit, _new(state, state.last.candidates), chosen, believed)
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)

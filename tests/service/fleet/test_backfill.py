@@ -20,11 +20,12 @@ from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
 from sprung.service.fleet.tasks import HereTasks, WorkLost
 from sprung.service.pipeline import Pipeline
-from sprung.service.reading import Here, ReadRequest
+from sprung.service.reading import ReadRequest, reading_of
 from sprung.service.settings import Settings
 from sprung.service.store import Store, fleet, history, open_store, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.schema import alarms, models, windows
+from sprung.service.worker import ProcessLimits
 
 START = 1_790_000_000_000_000_000
 SECONDS = 12
@@ -192,14 +193,12 @@ def test_a_copy_of_a_recording_adds_nothing_and_is_told(plan: BackfillPlan, plac
 def test_a_recording_that_breaks_a_reader_is_told_of_and_the_others_go_on(
     plan: BackfillPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    identify = Here
-
-    def breaking(request: ReadRequest) -> object:
+    def breaking(request: ReadRequest, limits: ProcessLimits | None) -> object:
         if request.path.name == "b-north-1.mcap":
             raise KeyError("nobody has thought of it")
-        return identify(request)
+        return reading_of(request, limits)
 
-    monkeypatch.setattr(module, "Here", breaking)
+    monkeypatch.setattr(module, "reading_of", breaking)
     told = backfill(plan, HereTasks(), 2, shown)
     assert told.swapped == 2
     assert any("b-north-1.mcap: unexpected KeyError: 'nobody has thought of it'" in one for one in told.problems)
