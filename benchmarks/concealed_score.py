@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 
 Truth = Mapping[str, Any]
 Verdict = Mapping[str, Any]  # the JSON of a report
@@ -60,7 +60,7 @@ def _matches(said: Mapping[str, Any], true: Mapping[str, Any], named_laws: Itera
     """The right name: the law's own; for a law that no catalogue holds `unknown`, or a formula."""
     if true["effect"] in set(named_laws):
         return bool(said["effect"] == true["effect"])
-    return kind_named(said["effect"]) is EffectKind.UNLISTED
+    return bool(said["kind"] == EffectKind.UNLISTED.value)
 
 
 def _z(said: Mapping[str, Any], true: Mapping[str, Any]) -> list[float]:

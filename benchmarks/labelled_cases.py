@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.replay.record import load_record
@@ -39,9 +39,7 @@ def compare(report: Report, label: dict[str, Any], system: System) -> dict[str, 
     """Verdict, places, names, errors of parameters in standard deviations."""
     unknown = label["verdict"] == "unknown_physics"
     truth = {(f["location"], "unknown" if unknown else f["effect"]) for f in label["findings"]}
-    said = {
-        (f.location, "unknown" if kind_named(f.effect) is EffectKind.UNLISTED else f.effect) for f in report.findings
-    }
+    said = {(f.location, "unknown" if f.kind is EffectKind.UNLISTED else f.effect) for f in report.findings}
     return {
         "verdict": report.verdict == label["verdict"],
         "located": {place for place, _ in truth} == {place for place, _ in said},

@@ -13,7 +13,7 @@ from sprung.service.report import ink
 
 def loops(report: Report, name: str, folder: Path) -> Path:
     """Writes NAME.png: a component's force, measured and modelled, of the part that no fit saw."""
-    arrays = report.evidence
+    arrays = report.plot_data
     measured, modelled = arrays["validation.measured"][:, 0], arrays["validation.augmented"][:, 0]
     nominal = arrays["validation.baseline"][:, 0]
     time = arrays["validation.time"]
@@ -40,7 +40,7 @@ def loops(report: Report, name: str, folder: Path) -> Path:
 
 def missing_force(report: Report, name: str, folder: Path) -> Path:
     """Writes NAME.png: the force that the nominal structure misses over the rate, and the position that no fit saw."""
-    arrays = report.evidence
+    arrays = report.plot_data
     folder.mkdir(parents=True, exist_ok=True)
     figure = ink.new_figure(9.0, 3.0)
     left, right = figure.subplots(1, 2)

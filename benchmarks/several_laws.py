@@ -21,7 +21,7 @@ from sprung.benchmarks.generator.make import make_with_each_missing
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.benchmarks.structure import LIMIT, VISIBLE, MadeSamples, in_order
 from sprung.model.diagnosis.api import Options, diagnose
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.system import MANCHESTER, load_system
 
 WEAK = 0.5  # laws from the middle of their range on
@@ -38,7 +38,7 @@ def run(count: int = 12, seed: int = 1, seconds: float = 60.0) -> Iterator[dict[
         began = time.process_time()
         report = diagnose(system, MadeSamples(in_order(vehicle, system, values)), Options(file=f"several-{number}"))
         truth = {(place, law): ratio / LIMIT for (place, law, _), ratio in zip(case.effects, ratios, strict=True)}
-        listed = {f.effect: kind_named(f.effect, system.catalogue) is not EffectKind.UNLISTED for f in report.findings}
+        listed = {f.effect: f.kind is not EffectKind.UNLISTED for f in report.findings}
         families = [(f.location, f.family.split(" or ")) for f in report.findings if f.family is not None]
         told = [(f.location, f.effect) for f in report.findings if listed[f.effect] and f.family is None]
         among = [(at, law) for at, laws in families for law in laws if (at, law) in truth]

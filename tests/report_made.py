@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
@@ -38,20 +39,21 @@ def friction_report(system: System = SYSTEM) -> Report:
     )
     baseline = tuple(replace(p, value=2.48 * p.value) if p.name == f"{place}.damping" else p for p in augmented)
     friction = LawParameter("force", 395.2, 6.1, "N"), LawParameter("smoothing", 2.1e-3, 3e-4, "m/s")
+    found = Finding(place, "coulomb_friction", EffectKind.LISTED, friction, 0.0, -5100.0, ("damper_blowoff", -4300.0))
     return Report(
         system=system.name,
         recording=RecordingFacts("run.mcap", 60.0, 6000, 3),
         verdict="missing_physics",
         baseline=baseline,
         baseline_validation=fit(system, 0.145),
-        findings=(Finding(place, "coulomb_friction", friction, 0.0, -5100.0, ("damper_blowoff", -4300.0)),),
+        findings=(found,),
         augmented=augmented,
         augmented_validation=fit(system, 0.031),
         noise_floor=fit(system, 0.030),
         localization={place: 5100.0, "car": 30.0},
         explained=0.993,
         candidates=(CandidateRow(place, "coulomb_friction", 5100.0, 0.0, -5100.0),),
-        evidence={
+        plot_data={
             "validation.time": np.arange(600) / system.sample_rate,
             "validation.measured": measured,
             "validation.baseline": measured + 0.2 * rng.normal(size=measured.shape),

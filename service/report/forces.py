@@ -18,7 +18,7 @@ BINS = 25
 
 
 def _get(report: Report, finding: int, key: str) -> NDArray[Any] | None:
-    return report.evidence.get(f"finding.{finding}.{key}")
+    return report.plot_data.get(f"finding.{finding}.{key}")
 
 
 def _unit(values: Array, base: str) -> tuple[float, str]:

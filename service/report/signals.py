@@ -39,7 +39,7 @@ def _excerpt(error: Array) -> slice:
 
 def fit_figure(report: Report, sensors: tuple[str, ...], units: tuple[str, ...], rate: float) -> Figure | None:
     """Rows: sensors; left: an excerpt in time with its errors; right: spectra.  None without the arrays."""
-    found = report.evidence
+    found = report.plot_data
     if "validation.measured" not in found or len(found["validation.measured"]) < 32:
         return None
     measured, baseline = found["validation.measured"], found["validation.baseline"]

@@ -43,7 +43,12 @@ def report(
         "augmented": fit | {"validation": {"nrmse": 0.031}},
         "noise_floor": {"nrmse": 0.03},
         "findings": [
-            {"location": a, "effect": b, "parameters": [{"name": n, "value": v, "std": s} for n, v, s in c]}
+            {
+                "location": a,
+                "effect": b,
+                "kind": "unlisted" if b == "unknown" else "law",
+                "parameters": [{"name": n, "value": v, "std": s} for n, v, s in c],
+            }
             for a, b, c in findings
         ],
     }

@@ -166,6 +166,6 @@ def test_a_force_that_no_law_explains_is_told_as_a_formula_with_its_values() -> 
     assert report.explained is not None and report.explained > 0.99
     for parameter, truth in zip(report.findings[0].parameters, (120.0, 6e-4), strict=True):
         assert abs(parameter.value - truth) < 3 * parameter.std
-    assert {"finding.0.curve_mean", "finding.0.curve_law"} <= set(report.evidence)
+    assert {"finding.0.curve_mean", "finding.0.curve_law"} <= set(report.plot_data)
     spring = next(p for p in report.augmented if p.name == "secondary.stiffness")
     assert abs(spring.value - STIFFNESS["secondary"]) < 3 * spring.std

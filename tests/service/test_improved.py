@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import (
     Finding,
     FitFigures,
@@ -93,9 +94,9 @@ def test_what_the_file_holds_fixed_stays_fixed() -> None:
 
 def test_what_no_file_can_hold_is_told() -> None:
     friction = IdentifiedLaw("strut", "coulomb_friction", (LawParameter("force", 41.0, 0.5, "N"),))
-    named = Finding("strut", "coulomb_friction", (), 1e-9, -50.0)
-    late = Finding("wheel_a|car_a", "node_delay", (), None, None)
-    noisy = Finding("wheel_a", "sensor_noise", (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
+    named = Finding("strut", "coulomb_friction", EffectKind.LISTED, (), 1e-9, -50.0)
+    late = Finding("wheel_a|car_a", "node_delay", EffectKind.FAULT, (), None, None)
+    noisy = Finding("wheel_a", "sensor_noise", EffectKind.FAULT, (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
     assert left_out(report((friction,), (named, late, noisy))) == ["node delay at wheel_a and car_a"]
 
 
@@ -119,7 +120,7 @@ def test_every_fault_of_a_measurement_stays_as_it_was_undone_before() -> None:
 
 
 def test_noise_that_was_found_higher_is_no_law() -> None:
-    noisy = Finding("wheel_a", "sensor_noise", (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
+    noisy = Finding("wheel_a", "sensor_noise", EffectKind.FAULT, (LawParameter("ratio", 3.0, 0.1, "1"),), 1e-9, -50.0)
     again = parse_system(improved_text(TEXT, parse_system(TEXT), report((), (noisy,))))
     assert again.laws == () and again.file.sensors["wheel_a"].noise == pytest.approx(0.06)
 

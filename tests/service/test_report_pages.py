@@ -56,7 +56,7 @@ def test_a_consistent_report_without_arrays_still_makes_a_page(tmp_path: Path) -
         friction_report(),
         verdict="consistent",
         findings=(),
-        evidence={},
+        plot_data={},
         candidates=(),
         explained=None,
         advice=("the record is too short to see <slow> changes",),
@@ -79,7 +79,7 @@ def test_an_unknown_law_is_shown_as_a_force_map(tmp_path: Path) -> None:
         "finding.0.map_force": force,
         "finding.0.map_std": 0 * force + 5,
     }
-    report = replace(report, verdict="unknown_physics", findings=(finding,), evidence=evidence)
+    report = replace(report, verdict="unknown_physics", findings=(finding,), plot_data=evidence)
     assert "force_0" in write_report(report, SYSTEM, tmp_path).pictures
 
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.diagnosis.component.motion import ElementMotion
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
@@ -123,6 +124,11 @@ class Piece:
         return self.law.name
 
     @property
+    def speaks_for(self) -> EffectKind:
+        """What finding it says."""
+        return kind_of(self.law)
+
+    @property
     def title(self) -> str:
         return self.law.title
 
@@ -165,6 +171,10 @@ class Following:
     @property
     def effect(self) -> str:
         return self.piece.effect
+
+    @property
+    def speaks_for(self) -> EffectKind:
+        return self.piece.speaks_for
 
     @property
     def title(self) -> str:
@@ -235,6 +245,7 @@ class SliderSurface:
     """A smooth force over deflection and rate, and a family of sliders (Prandtl and Ishlinskii) for its memory."""
 
     effect: str = UNKNOWN
+    speaks_for: EffectKind = EffectKind.UNLISTED
     title: str = "a force that no law explains"
     key: str = UNKNOWN
     kind: PieceKind = STATIC
@@ -271,6 +282,7 @@ class Lag:
     """The force's channel late against the motion's: no force of its own, everything follows the motion earlier."""
 
     effect: str = SENSOR_LAG.name
+    speaks_for: EffectKind = EffectKind.FAULT
     title: str = SENSOR_LAG.title
     key: str = SENSOR_LAG.name
     kind: PieceKind = STATIC

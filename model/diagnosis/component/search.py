@@ -26,7 +26,7 @@ from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Following, 
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.pieces_following import pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
-from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
+from sprung.model.diagnosis.selection.evidence import bic, chance, effective_count, level_gain
 
 Progress = Callable[[str], None]
 
@@ -58,6 +58,16 @@ class Step:
     @property
     def gain(self) -> float:
         return level_gain(self.before.fit.error, self.chosen.fit.error, self.chosen.count)
+
+    @property
+    def delta_bic(self) -> float:
+        """Of the chosen law, against the model without it."""
+        last = self.chosen.last
+        return bic(self.gain, len(last.signs) + len(last.shapes), int(self.chosen.count))
+
+    def rival_bic(self, rival: Ranked) -> float:
+        """Of another law in its place."""
+        return bic(rival.gain, rival.fit.model.count - self.before.fit.model.count, int(rival.count))
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,12 @@ from sprung.model.diagnosis.component.fit import ComponentFit
 from sprung.model.diagnosis.component.formula import FormulaPiece
 from sprung.model.diagnosis.component.piece import Values
 from sprung.model.diagnosis.component.search import Step
+from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.selection.evidence import bic
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.gas import PRELOAD
 from sprung.model.laws.sensor_faults import SENSOR_LAG
 from sprung.model.signals import FloatArray
 
@@ -41,7 +44,6 @@ def finding_of(
     quoted += _forces_at_rates(fit)
     family = _family(piece.effect, alike)
     rival = step.rivals[0] if step.rivals else None
-    freedom = len(piece.signs) + len(piece.shapes)
     shown = [q for q in quoted if q.name in _SPOKEN] or list(values[:2])
     told = ", ".join(f"{q.name.replace('_', ' ')} {q.words()}" for q in shown[:3])
     formula, memory = (piece.law.formula, piece.law.memory_formula) if isinstance(piece, FormulaPiece) else ("", "")
@@ -55,15 +57,11 @@ def finding_of(
     return Finding(
         location=element,
         effect=piece.effect,
+        kind=piece.speaks_for,
         parameters=values,
         p_value=step.p_value,
-        delta_bic=bic(step.gain, freedom, int(step.chosen.count)),
-        runner_up=None
-        if rival is None
-        else (
-            rival.last.effect,
-            bic(rival.gain, rival.fit.model.count - step.before.fit.model.count, int(rival.count)),
-        ),
+        delta_bic=step.delta_bic,
+        runner_up=None if rival is None else (rival.last.effect, step.rival_bic(rival)),
         runner_up_location=None if rival is None else element,
         family=family,
         advice=None
@@ -136,7 +134,8 @@ def preload_finding(element: str, value: float, sigma: float) -> Finding:
     parameter = LawParameter("force", value, sigma, "N")
     return Finding(
         element,
-        "preload",
+        PRELOAD.name,
+        kind_of(PRELOAD),
         (parameter,),
         None,
         None,
@@ -164,9 +163,10 @@ def unknown_finding(element: str, step: Step, laws: tuple[Step, ...], *, mapped:
     return Finding(
         element,
         UNKNOWN,
+        EffectKind.UNLISTED,
         (),
         step.p_value,
-        bic(step.gain, len(step.chosen.last.signs) + len(step.chosen.last.shapes), int(step.chosen.count)),
+        step.delta_bic,
         runner_up=closest,
         runner_up_location=None if closest is None else element,
         sentence=sentence,
@@ -177,7 +177,8 @@ def reversed_finding(sensor: str, element: str) -> Finding:
     """A force or a motion with the other sign."""
     return Finding(
         sensor,
-        "sign_reversed",
+        SIGN_REVERSED.name,
+        kind_of(SIGN_REVERSED),
         (),
         None,
         None,
@@ -197,9 +198,10 @@ def late_finding(sensor: str, element: str, value: float, sigma: float, step: St
     return Finding(
         sensor,
         SENSOR_LAG.name,
+        kind_of(SENSOR_LAG),
         (LawParameter("time", value, sigma, "s"),),
         step.p_value,
-        bic(step.gain, 1, int(step.chosen.count)),
+        step.delta_bic,
         runner_up=None if rival is None else (rival.last.effect, bic(rival.gain, 1, int(rival.count))),
         runner_up_location=None if rival is None else element,
         family=near,

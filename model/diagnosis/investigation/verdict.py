@@ -18,23 +18,21 @@ from typing import Literal
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.setup_effects import SETUP_EFFECTS, SetupEffect
+from sprung.model.diagnosis.investigation.setup_effects import SetupEffect
 from sprung.model.diagnosis.rules import RULES, VerdictRules
-from sprung.model.laws import CATALOGUE, Law
-from sprung.model.laws.basis import UNKNOWN
-from sprung.model.laws.formula import EFFECT
+from sprung.model.laws import Law
 from sprung.model.signals import FloatArray
 
 Verdict = Literal["consistent", "missing_physics", "sensor_fault", "unknown_physics"]
 
 
 class EffectKind(Enum):
-    """What a finding of an effect speaks for."""
+    """What a finding of an effect speaks for, as reports name it."""
 
-    LISTED = "physics of a law"
-    UNLISTED = "physics that no law explains"
-    FAULT = "a fault of the measurement"
-    NUISANCE = "reported, and no reason for any verdict"
+    LISTED = "law"  # physics of a listed law
+    UNLISTED = "unlisted"  # physics that no law explains: a surface, a formula
+    FAULT = "measurement"  # a fault of a sensor, an input or the set-up
+    NUISANCE = "nuisance"  # reported, and no reason for any verdict
 
 
 def kind_of(effect: Law | SetupEffect) -> EffectKind:
@@ -44,16 +42,6 @@ def kind_of(effect: Law | SetupEffect) -> EffectKind:
     if effect.nuisance:
         return EffectKind.NUISANCE
     return EffectKind.LISTED if effect.listed else EffectKind.UNLISTED
-
-
-def kind_named(name: str, catalogue: Sequence[Law] = CATALOGUE) -> EffectKind:
-    """The kind of a reported effect, by the laws that the diagnosis knew and those that it makes as it finds them."""
-    known: dict[str, Law | SetupEffect] = {effect.name: effect for effect in SETUP_EFFECTS}
-    known |= {law.name: law for law in catalogue}
-    if name in known:
-        return kind_of(known[name])
-    made_of_no_law = name in (UNKNOWN, EFFECT)  # a surface, a formula; others follow a measured signal
-    return EffectKind.UNLISTED if made_of_no_law else EffectKind.LISTED
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
 from sprung.model.diagnosis.report.calibration import calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
-from sprung.model.diagnosis.report.plots_data import evidence_arrays
+from sprung.model.diagnosis.report.plot_data import plot_data_of
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
@@ -67,7 +67,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
         noise=_noise(course),
         summary=_summary(outcome, findings, explained, in_words(calibration)),
         advice=tuple(advice),
-        evidence=evidence_arrays(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
+        plot_data=plot_data_of(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
     )
 
 

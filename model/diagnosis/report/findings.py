@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.investigation.calibration import faulty, in_order
 from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.setup import SetupFault
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
 from sprung.model.diagnosis.report.values import formula_of, law_parameters
@@ -34,8 +34,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
-    kinds = [kind_named(finding.effect, course.system.catalogue) for finding in findings]
-    if said.verdict == "unknown_physics" and EffectKind.UNLISTED not in kinds:
+    if said.verdict == "unknown_physics" and not any(f.kind is EffectKind.UNLISTED for f in findings):
         findings.insert(len(course.setup_faults), _unknown_finding(outcome))
     return findings
 
@@ -53,6 +52,7 @@ def _unknown_finding(outcome: Outcome) -> Finding:
     return Finding(
         location=said.place,
         effect=UNKNOWN,
+        kind=EffectKind.UNLISTED,
         parameters=(),
         p_value=None if best is None else course.last.p_value(best),
         delta_bic=None,
@@ -73,6 +73,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
         finding = Finding(
             location=term.location,
             effect=term.law.name,
+            kind=kind_of(term.law),
             parameters=parameters,
             p_value=found.p_value,
             delta_bic=found.trial.delta_bic(),
@@ -137,7 +138,15 @@ def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:
     score = float(((term.parameters[0] - term.law.absent[0]) / parameters[0].std) ** 2)
     words = term.law.sentence.format(**{p.name: p.words() for p in parameters})
     sentence = f"{term.location}: {words}"
-    return score, Finding(term.location, term.law.name, parameters, p_value=None, delta_bic=None, sentence=sentence)
+    return score, Finding(
+        location=term.location,
+        effect=term.law.name,
+        kind=kind_of(term.law),
+        parameters=parameters,
+        p_value=None,
+        delta_bic=None,
+        sentence=sentence,
+    )
 
 
 def _input_finding(fault: InputFault) -> Finding:
@@ -147,6 +156,7 @@ def _input_finding(fault: InputFault) -> Finding:
     return Finding(
         location=fault.term.location,
         effect=fault.term.law.name,
+        kind=kind_of(fault.term.law),
         parameters=(parameter,),
         p_value=fault.p_value,
         delta_bic=None,
@@ -165,6 +175,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
     return Finding(
         location=fault.site.location,
         effect=fault.effect.name,
+        kind=kind_of(fault.effect),
         parameters=parameters,
         p_value=None,
         delta_bic=None,
@@ -176,6 +187,7 @@ def _noise_finding(fault: NoiseFault) -> Finding:
     return Finding(
         location=fault.location,
         effect=SENSOR_NOISE.name,
+        kind=kind_of(SENSOR_NOISE),
         parameters=(LawParameter("ratio", fault.ratio, fault.std, "1"),),
         p_value=fault.p_value,
         delta_bic=None,
@@ -187,6 +199,7 @@ def _stuck_finding(name: str, at: float) -> Finding:
     return Finding(
         location=name,
         effect=SENSOR_STUCK.name,
+        kind=kind_of(SENSOR_STUCK),
         parameters=(),
         p_value=None,
         delta_bic=None,

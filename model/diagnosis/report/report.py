@@ -1,6 +1,6 @@
 """What a diagnosis says: the data behind the JSON of the contract and behind the pictures.
 
-`Report.to_dict()` is the public form.  `Report.evidence` holds the arrays that pictures are drawn from; every key is
+`Report.to_dict()` is the public form.  `Report.plot_data` holds the arrays that pictures are drawn from; every key is
 optional.  With T samples of the held-out part, S sensors in the system's order, i the number of a finding:
 
     validation.time (T,) s, validation.measured / .baseline / .augmented (T, S), validation.noise (S,)
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sprung.model.diagnosis.investigation.verdict import Verdict
+from sprung.model.diagnosis.investigation.verdict import EffectKind, Verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +103,7 @@ class Finding:
 
     location: str  # element, body, sensor or input
     effect: str  # a word of the contract's table
+    kind: EffectKind  # what it speaks for
     parameters: tuple[LawParameter, ...]
     p_value: float | None  # None: nothing was tested
     delta_bic: float | None  # against the model without this finding; negative: better; None: nothing compared
@@ -122,6 +123,7 @@ class Finding:
         result: dict[str, Any] = {
             "location": self.location,
             "effect": self.effect,
+            "kind": self.kind.value,
             "parameters": plain(self.parameters),
             "p_value": plain(self.p_value),
             "delta_bic": plain(self.delta_bic),
@@ -196,7 +198,7 @@ class Report:
     summary: str = ""
     advice: tuple[str, ...] = ()  # what could not be decided and why
     track: tuple[TrackPoint, ...] = ()  # without measured inputs: natural frequencies over time
-    evidence: dict[str, NDArray[Any]] = field(default_factory=dict)
+    plot_data: dict[str, NDArray[Any]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON of the contract, with extra keys that readers may ignore."""

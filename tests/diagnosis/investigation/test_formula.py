@@ -120,8 +120,8 @@ def test_what_a_later_formula_explains_is_no_finding_of_its_own() -> None:
 
 
 def test_a_formula_of_deflection_and_rate_is_drawn_as_a_map(told: Report) -> None:
-    d, v = np.meshgrid(told.evidence["finding.0.map_d"], told.evidence["finding.0.map_v"])
-    force, std = told.evidence["finding.0.map_force"], told.evidence["finding.0.map_std"]
+    d, v = np.meshgrid(told.plot_data["finding.0.map_d"], told.plot_data["finding.0.map_v"])
+    force, std = told.plot_data["finding.0.map_force"], told.plot_data["finding.0.map_std"]
     (a,) = told.findings[0].parameters
     assert force == pytest.approx(a.value * d * np.abs(v), rel=0.02)  # from the part that was fitted
     assert std == pytest.approx(a.std * np.abs(d * v), rel=0.5)

@@ -24,7 +24,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
 )
 from sprung.model.diagnosis.investigation.setup_response import Group
 from sprung.model.diagnosis.investigation.setup_structure import structure_hypotheses
-from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_named
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.report.compose import places_put_right
@@ -37,7 +37,7 @@ from tests.diagnosis_cases import quarter_car, simulate
 
 def test_every_kind_is_a_fault_of_the_measurement_with_words_of_its_own() -> None:
     for effect in SETUP_EFFECTS:
-        assert kind_named(effect.name) is EffectKind.FAULT and not effect.ordinary
+        assert kind_of(effect) is EffectKind.FAULT and not effect.ordinary
         told = effect.told(SetupPlace("a|b", detail="lower car"), "7")
         assert told.startswith("a and b: ") and ("7" in told) == (effect.parameter is not None)
     assert ONE_GAIN.ordinary

@@ -11,16 +11,20 @@ from sprung.model.diagnosis.investigation.verdict import (
     EffectKind,
     HeldOutErrors,
     bounded_noise,
-    kind_named,
     kind_of,
     verdict_of,
 )
 from sprung.model.laws import CATALOGUE
+from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.hysteresis import BOUC_WEN
 from sprung.model.laws.sensor_faults import SENSOR_GAIN
 
 
 def errors(before: float, after: float, floor: float) -> HeldOutErrors:
     return HeldOutErrors(np.array([before]), np.array([after]), np.array([floor]))
+
+
+EFFECTS = {law.name: kind_of(law) for law in CATALOGUE} | {UNKNOWN: EffectKind.UNLISTED}
 
 
 @pytest.mark.parametrize(
@@ -39,13 +43,13 @@ def errors(before: float, after: float, floor: float) -> HeldOutErrors:
     ],
 )
 def test_verdicts(effects: list[str], before: float, after: float, floor: float, verdict: str) -> None:
-    assert verdict_of([kind_named(effect) for effect in effects], errors(before, after, floor)) == verdict
+    assert verdict_of([EFFECTS[effect] for effect in effects], errors(before, after, floor)) == verdict
 
 
 def test_nothing_is_cleared_by_another_structure_or_while_candidates_were_left_out() -> None:
     floor = errors(0.03, 0.03, 0.03)
     assert verdict_of([], floor, ended=True) == "unknown_physics"
-    found = [kind_named("bouc_wen")]
+    found = [kind_of(BOUC_WEN)]
     assert verdict_of(found, errors(0.3, 0.03, 0.03), ended=True) == "missing_physics"
     assert verdict_of(found, errors(0.3, 0.03, 0.03), other_structure=True) == "unknown_physics"
 
@@ -81,6 +85,4 @@ def test_a_floor_learnt_from_the_misfit_is_bounded_by_what_was_declared_or_measu
 def test_a_fault_among_the_laws_of_a_user_is_a_fault() -> None:
     own = replace(SENSOR_GAIN, name="icing")
     assert kind_of(own) is EffectKind.FAULT
-    assert kind_named("icing", (*CATALOGUE, own)) is EffectKind.FAULT
-    assert kind_named("formula") is EffectKind.UNLISTED
     assert verdict_of([kind_of(own)], errors(0.3, 0.03, 0.03)) == "sensor_fault"

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 
+from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import Finding, FitFigures, IdentifiedLaw, LawParameter, plain
 
 
@@ -17,10 +18,11 @@ def test_numbers_that_are_not_finite_are_null() -> None:
 
 def test_a_finding_says_only_what_is_known_of_it() -> None:
     force = LawParameter("force", 395.0, 6.0, "N")
-    bare = Finding("k1", "coulomb_friction", (force,), None, None)
+    bare = Finding("k1", "coulomb_friction", EffectKind.LISTED, (force,), None, None)
     assert set(bare.to_dict()) == {
         "location",
         "effect",
+        "kind",
         "parameters",
         "p_value",
         "delta_bic",
@@ -30,6 +32,7 @@ def test_a_finding_says_only_what_is_known_of_it() -> None:
     told = Finding(
         "k1",
         "coulomb_friction",
+        EffectKind.LISTED,
         (force,),
         1e-9,
         -50.0,

@@ -23,7 +23,7 @@ _MOST = 4000  # samples of a scatter
 _BINS = 41
 
 
-def evidence_arrays(
+def plot_data_of(
     course: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
 ) -> dict[str, NDArray[Any]]:
     """Everything that a picture may need; `order`: place and effect of every finding, as reported."""

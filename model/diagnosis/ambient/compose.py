@@ -1,0 +1,194 @@
+"""From judged windows without measured inputs to the report: findings, values, sentences, frequencies over time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from sprung.model.diagnosis.ambient.judgement import VARYING, AmbientJudgement, Pooled
+from sprung.model.diagnosis.ambient.windows import WindowResult
+from sprung.model.diagnosis.investigation.course import Options, Recorded
+from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
+from sprung.model.diagnosis.record.channels import Prepared
+from sprung.model.diagnosis.report.report import (
+    Finding,
+    FitFigures,
+    LawParameter,
+    RecordingFacts,
+    Report,
+    ReportedParameter,
+    TrackPoint,
+    Unexplained,
+)
+from sprung.model.diagnosis.rules import AmbientRules
+from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.sensor_faults import SENSOR_STUCK
+from sprung.model.mechanics import Mode
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+
+def compose_unforced(
+    system: System,
+    prepared: Prepared,
+    record: Recorded,
+    options: Options,
+    windows: list[WindowResult],
+    pooled: Pooled,
+    said: AmbientJudgement,
+) -> Report:
+    """The report of a recording without measured inputs."""
+    names = prepared.signals.sensor_names
+    rules = options.rules.ambient
+    errors, left = said.errors, said.left
+    findings = _findings(system, prepared, windows, pooled, rules)
+    where = ""
+    if np.any(left > 0):
+        worst = int(np.argmax(left))
+        where = (
+            f"{100 * errors.after[worst] ** 2:.0f} % of the power of {names[worst]} is at other frequencies than the "
+            f"structure has it, most at {said.band[0]:.3g} to {said.band[1]:.3g} Hz"
+        )
+    if said.verdict == "unknown_physics":
+        place = names[int(np.argmax(errors.after))]
+        sentence = f"a misfit that no law explains: {where}"
+        findings.insert(0, Finding(place, UNKNOWN, EffectKind.UNLISTED, (), None, None, sentence=sentence))
+    track = tuple(_point(system, window) for window in windows)
+    values = tuple(
+        ReportedParameter(p.name, value, value * float(s), p.nominal, p.unit)
+        for p, value, s in zip(
+            system.parameters,
+            (np.array([p.nominal for p in system.parameters]) * np.exp(pooled.log_ratio)).tolist(),
+            pooled.deviation.tolist(),
+            strict=True,
+        )
+    )
+    return Report(
+        system=system.name,
+        recording=RecordingFacts(
+            options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
+        ),
+        verdict=said.verdict,
+        baseline=values,
+        baseline_validation=_figures(names, errors.before),
+        findings=tuple(findings),
+        augmented=values,
+        augmented_validation=_figures(names, errors.after),
+        noise_floor=_figures(names, errors.bounded(options.rules.verdict)),
+        localization={},
+        explained=said.explained,
+        unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
+        summary=_summary(said.verdict, findings, track, where),
+        advice=tuple(_advice(system, pooled, said, windows, rules)),
+        track=track,
+        plot_data=_arrays(track),
+    )
+
+
+def _findings(
+    system: System, prepared: Prepared, windows: list[WindowResult], pooled: Pooled, rules: AmbientRules
+) -> list[Finding]:
+    found = [
+        Finding(
+            location=name,
+            effect=SENSOR_STUCK.name,
+            kind=kind_of(SENSOR_STUCK),
+            parameters=(),
+            p_value=None,
+            delta_bic=None,
+            sentence=f"{name}: repeats one value from {at:.2f} s on",
+        )
+        for name, at in prepared.stuck
+    ]
+    for p in np.flatnonzero(pooled.varying):
+        parameter = system.parameters[int(p)]
+        sure = [w for w in windows if w.covariance[p, p] < rules.told**2]
+        sure = [w for w in sure if w.adequate and w.covariance[p, p] < rules.sure**2] or sure
+        ends = [min(sure, key=lambda w: w.log_ratio[p]), max(sure, key=lambda w: w.log_ratio[p])]
+        low, high = (
+            LawParameter(
+                name,
+                parameter.nominal * float(np.exp(w.log_ratio[p])),
+                parameter.nominal * float(np.exp(w.log_ratio[p]) * np.sqrt(w.covariance[p, p])),
+                parameter.unit,
+            )
+            for name, w in zip(("lowest", "highest"), ends, strict=True)
+        )
+        sentence = (
+            f"{parameter.element}: its {parameter.quantity} changes during the recording, from {low.value:.5g} "
+            f"+- {low.std:.2g} {parameter.unit} at {ends[0].middle:.3g} s to {high.value:.5g} +- {high.std:.2g} "
+            f"{parameter.unit} at {ends[1].middle:.3g} s"
+        )
+        law, chance = VARYING[parameter.quantity], float(pooled.chance[p])
+        found.append(Finding(parameter.element, law.name, kind_of(law), (low, high), chance, None, sentence=sentence))
+    return found
+
+
+def modes_at(system: System, log_ratio: FloatArray) -> list[Mode]:
+    """Natural modes with other values, by frequency."""
+    values = {p.name: p.nominal * float(np.exp(x)) for p, x in zip(system.parameters, log_ratio, strict=True)}
+    mechanics = system.mechanics
+    stiffness = [values.get(f"{e}.stiffness", k) for e, k in zip(system.elements, mechanics.stiffness, strict=True)]
+    damping = [values.get(f"{e}.damping", c) for e, c in zip(system.elements, mechanics.damping, strict=True)]
+    changed = replace(mechanics, stiffness=np.array(stiffness), damping=np.array(damping))
+    modes = sorted(changed.modes(system.bodies), key=lambda mode: mode.frequency)
+    return [mode for mode in modes if mode.frequency > 1e-6 * modes[-1].frequency]
+
+
+def _point(system: System, window: WindowResult) -> TrackPoint:
+    """Frequencies with deviations by differences along every parameter."""
+    frequency = np.array([mode.frequency for mode in modes_at(system, window.log_ratio)])
+    slopes = []
+    for p in range(len(window.log_ratio)):
+        moved = window.log_ratio + 1e-4 * np.eye(len(window.log_ratio))[p]
+        slopes.append((np.array([mode.frequency for mode in modes_at(system, moved)]) - frequency) / 1e-4)
+    slope = np.array(slopes)
+    deviation = np.sqrt(np.maximum(np.einsum("pm,pq,qm->m", slope, window.covariance, slope), 0.0))
+    return TrackPoint(window.begin, window.end, tuple(frequency.tolist()), tuple(deviation.tolist()), window.adequate)
+
+
+def _summary(verdict: str, findings: list[Finding], track: tuple[TrackPoint, ...], where: str) -> str:
+    first = np.array([point.frequency[0] for point in track])
+    sure = np.array([point.deviation[0] < 0.1 * point.frequency[0] for point in track])
+    seen = first[sure] if sure.any() else first
+    lowest = f"lowest natural frequency {np.min(seen):.4g} to {np.max(seen):.4g} Hz over {len(seen)} windows"
+    text = "; ".join(f.sentence for f in findings)
+    if verdict == "consistent":
+        text = "The nominal structure explains the spectra of the sensors; what excites it was not measured"
+    elif where and verdict != "unknown_physics":
+        text += f"; still unexplained: {where}"
+    return f"{text}; {lowest}."
+
+
+def _advice(
+    system: System, pooled: Pooled, said: AmbientJudgement, windows: list[WindowResult], rules: AmbientRules
+) -> list[str]:
+    words = []
+    adequate = float(np.mean([w.adequate for w in windows]))
+    if said.rejected:
+        words.append(
+            "nothing fits: the structure of the system file does not have these spectra. Likeliest: bodies or modes "
+            "that the file does not have; masses or stiffnesses far from nominal; an excitation with lines of its own "
+            "(a machine)"
+        )
+    if adequate < 0.5:
+        words.append(f"only {100 * adequate:.0f} % of the windows are explained down to chance")
+    if float(np.mean(said.errors.floor**2)) > rules.coarse:
+        words.append("so few windows would hardly show a wrong structure: record longer")
+    loose = [p.name for p, std in zip(system.parameters, pooled.deviation, strict=True) if std > rules.told]
+    if loose:
+        words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows tell more")
+    return words
+
+
+def _figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
+    return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
+
+
+def _arrays(track: tuple[TrackPoint, ...]) -> dict[str, np.ndarray]:
+    return {
+        "track.time": np.array([0.5 * (p.begin + p.end) for p in track]),
+        "track.frequency": np.array([p.frequency for p in track]),
+        "track.std": np.array([p.deviation for p in track]),
+    }

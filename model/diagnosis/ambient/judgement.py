@@ -1,0 +1,105 @@
+"""Windows without measured inputs judged: what they say together, their errors, and the verdict."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+from sprung.model.diagnosis.ambient.windows import WindowResult, displaced, independent
+from sprung.model.diagnosis.investigation.course import Options
+from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
+from sprung.model.diagnosis.record.channels import Prepared
+from sprung.model.diagnosis.rules import RULES, AmbientRules
+from sprung.model.identifier import PRIOR_STD
+from sprung.model.laws import ElementLaw
+from sprung.model.laws.drift import TIME_VARYING_DAMPING, TIME_VARYING_STIFFNESS
+from sprung.model.laws.sensor_faults import SENSOR_STUCK
+from sprung.model.signals import BoolArray, FloatArray
+from sprung.model.system import System
+
+VARYING: dict[str, ElementLaw] = {"stiffness": TIME_VARYING_STIFFNESS, "damping": TIME_VARYING_DAMPING}
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """What all windows say together."""
+
+    log_ratio: FloatArray  # (P,)
+    deviation: FloatArray  # (P,), with the scatter over windows
+    varying: BoolArray  # parameters that differ from window to window beyond chance, (P,)
+    chance: FloatArray  # of such a scatter, (P,)
+
+
+@dataclass(frozen=True)
+class AmbientJudgement:
+    """What a recording without measured inputs comes to."""
+
+    errors: HeldOutErrors  # per sensor
+    verdict: Verdict
+    explained: float | None  # share of the excess error, where anything was found
+    left: FloatArray  # unexplained share of every sensor's power, (S,)
+    band: tuple[float, float]  # Hz, where most of what is left lies
+    rejected: bool  # another structure than the file's
+
+
+def pool(windows: list[WindowResult], rules: AmbientRules = RULES.ambient) -> Pooled:
+    """Weighted means over windows, and which parameters differ between them."""
+    theta = np.array([w.log_ratio for w in windows])
+    sigma = np.sqrt(np.array([np.diag(w.covariance) for w in windows]))
+    P = theta.shape[1]
+    mean, deviation = np.zeros(P), np.full(P, PRIOR_STD)
+    varying, chance = np.zeros(P, dtype=bool), np.ones(P)
+    apart = independent(windows)
+    for p in range(P):
+        tells = sigma[:, p] < rules.told
+        if not tells.any():
+            continue
+        value, std = theta[tells, p], sigma[tells, p]
+        one = apart & tells
+        if one.sum() >= rules.independent:
+            own, own_std = theta[one, p], sigma[one, p]
+            centre = np.sum(own / own_std**2) / np.sum(1 / own_std**2)
+            scatter = float(np.sum(((own - centre) / own_std) ** 2))
+            chance[p] = float(chi2.sf(scatter, one.sum() - 1))
+            wide = np.subtract(*np.quantile(own, [0.85, 0.15]))
+            varying[p] = chance[p] < rules.alpha and wide > max(rules.varies, rules.spread * float(np.median(own_std)))
+        mean[p] = float(np.median(value)) if varying[p] else float(np.sum(value / std**2) / np.sum(1 / std**2))
+        number = max(1, int(one.sum()))
+        inside = 1 / np.sqrt(np.sum(1 / std**2) * number / len(std))  # overlapping windows tell the same thing twice
+        between = float(np.std(value)) / np.sqrt(number) if number >= rules.independent else 0.0
+        deviation[p] = max(inside, between)
+    return Pooled(mean, deviation, varying, chance)
+
+
+def errors_of(
+    before: list[WindowResult], after: list[WindowResult], rules: AmbientRules
+) -> tuple[HeldOutErrors, tuple[float, float]]:
+    """Before: one value of every parameter for all windows; after: with what varies."""
+    one, chance, _ = displaced([w for w, good in zip(before, independent(before), strict=True) if good], rules.parts)
+    own, _, band = displaced([w for w, good in zip(after, independent(after), strict=True) if good], rules.parts)
+    return HeldOutErrors(np.sqrt(one), np.sqrt(own), np.sqrt(chance)), band
+
+
+def judged(
+    prepared: Prepared,
+    system: System,
+    pooled: Pooled,
+    errors: HeldOutErrors,
+    band: tuple[float, float],
+    options: Options,
+) -> AmbientJudgement:
+    """The verdict of all windows."""
+    rules = options.rules
+    kinds = [kind_of(SENSOR_STUCK)] * len(prepared.stuck)
+    kinds += [kind_of(VARYING[system.parameters[int(p)].quantity]) for p in np.flatnonzero(pooled.varying)]
+    verdict = verdict_of(kinds, errors, rules.verdict)
+    return AmbientJudgement(
+        errors=errors,
+        verdict=verdict,
+        explained=errors.explained(rules.verdict) if kinds else None,
+        left=errors.unexplained(rules.verdict),
+        band=band,
+        rejected=verdict == "unknown_physics" and float(np.mean(errors.after**2)) > rules.ambient.rejected,
+    )

@@ -1,0 +1,198 @@
+"""From judged component tests to the report: findings, values, sentences, arrays for pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sprung.model.diagnosis.component.deviations import covariance, spread
+from sprung.model.diagnosis.component.fit import ComponentFit
+from sprung.model.diagnosis.component.given import identified_laws
+from sprung.model.diagnosis.component.judgement import ComponentJudgement, Judged
+from sprung.model.diagnosis.component.piece import Lag
+from sprung.model.diagnosis.component.words import (
+    finding_of,
+    late_finding,
+    leftover_words,
+    preload_finding,
+    reversed_finding,
+    unknown_finding,
+)
+from sprung.model.diagnosis.investigation.course import Options, Recorded
+from sprung.model.diagnosis.investigation.verdict import EffectKind
+from sprung.model.diagnosis.report.report import (
+    CandidateRow,
+    Finding,
+    FitFigures,
+    IdentifiedLaw,
+    RecordingFacts,
+    Report,
+    ReportedParameter,
+    Unexplained,
+)
+from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
+from sprung.model.signals import FloatArray
+from sprung.model.system import System
+
+
+def compose_components(
+    system: System, record: Recorded, options: Options, judged: Sequence[Judged], said: ComponentJudgement
+) -> Report:
+    """The report of component tests."""
+    errors, left = said.errors, said.left
+    findings = sorted((f for one in judged for f in _findings(one)), key=_rank)
+    names = [j.record.sensor for j in judged]
+    words = "; ".join(leftover_words(j.record.element, j.final, j.size) for j, x in zip(judged, left, strict=True) if x)
+    unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), words)
+    advice = [note for j in judged for note in j.record.notes]
+    return Report(
+        system=system.name,
+        recording=RecordingFacts(
+            options.file, len(record.values) / record.sample_rate, len(record.values), int(record.lost)
+        ),
+        verdict=said.verdict,
+        baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base, covariance(j.base))),
+        baseline_validation=_figures(names, errors.before),
+        findings=tuple(findings),
+        augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final, j.covariance)),
+        augmented_validation=_figures(names, errors.after),
+        noise_floor=_figures(names, errors.bounded(options.rules.verdict)),
+        localization={
+            j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual)) for j in judged
+        },
+        candidates=tuple(c for j in judged for c in _candidates(j)),
+        explained=said.explained,
+        laws=tuple(law for j in judged for law in _laws(j)),
+        noise={j.record.sensor: j.record.task.noise for j in judged if j.record.task.noise > 0},
+        unexplained=unexplained,
+        summary=_summary(said, findings, unexplained),
+        advice=tuple(advice if said.verdict != "consistent" else []),
+        plot_data=_arrays(judged, record.sample_rate),
+    )
+
+
+def _rank(finding: Finding) -> tuple[int, float]:
+    """Set-up faults first, laws by evidence, nuisances last."""
+    order = {EffectKind.FAULT: 0, EffectKind.NUISANCE: 2}.get(finding.kind, 1)
+    return order, finding.delta_bic if finding.delta_bic is not None else 0.0
+
+
+def _findings(one: Judged) -> list[Finding]:
+    full, names = one.covariance
+    findings = []
+    if one.reversed:
+        findings.append(reversed_finding(one.record.sensor, one.record.element))
+    for index, step in enumerate(one.found.steps if one.named else (), len(one.record.given.pieces)):
+        sigma = spread(one.final, index, full, names)
+        others = [other.effect for other in one.alike if other.index == index]
+        if isinstance(one.final.model.pieces[index], Lag):
+            late, std = one.final.model.late, float(sigma[0][0])
+            findings.append(late_finding(one.record.sensor, one.record.element, late, std, step, others))
+        else:
+            findings.append(finding_of(one.record.element, one.final, one.base, index, step, sigma, others))
+    if one.unnamed is not None:
+        mapped = one.surface is not None
+        findings.append(unknown_finding(one.record.element, one.unnamed, one.found.steps, mapped=mapped))
+    deviation, by_chance = (float(np.sqrt(max(of[0, 0], 0.0))) for of in (full, one.by_chance[0]))
+    sign = -1.0 if one.reversed else 1.0
+    least = one.final.task.rules.preload * max(by_chance, one.floor / np.sqrt(one.record.task.split))
+    if abs(one.final.preload) > least:
+        findings.append(preload_finding(one.record.element, sign * one.final.preload, deviation))
+    return findings
+
+
+def _laws(one: Judged) -> tuple[IdentifiedLaw, ...]:
+    """What a system file takes over: laws that are given or named, and the preload."""
+    count = len(one.record.given.pieces) + (len(one.found.steps) if one.named else 0)
+    return identified_laws(one.final, one.record.element, count, *one.covariance, -1.0 if one.reversed else 1.0)
+
+
+def _parameters(
+    system: System, element: str, fit: ComponentFit, told: tuple[FloatArray, list[str]]
+) -> list[ReportedParameter]:
+    full, names = told
+    sigma = dict(zip(names, np.sqrt(np.maximum(np.diag(full), 0.0)).tolist(), strict=False))
+    values = []
+    for parameter in system.parameters:
+        if parameter.element == element:
+            value = float(getattr(fit.element, parameter.quantity))
+            deviation = sigma.get(parameter.quantity, 0.0)
+            values.append(ReportedParameter(parameter.name, value, deviation, parameter.nominal, parameter.unit))
+    values.append(ReportedParameter(f"{element}.preload", fit.preload, sigma["preload"], 0.0, "N"))
+    return values
+
+
+def _figures(names: list[str], per_sensor: FloatArray) -> FitFigures:
+    return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
+
+
+def _candidates(one: Judged) -> list[CandidateRow]:
+    rows: dict[str, CandidateRow] = {}
+    for step in one.found.steps:
+        for ranked in (step.chosen, *step.rivals):
+            delta = step.rival_bic(ranked)
+            p_value = chance(ranked.gain, ranked.fit.model.count - step.before.fit.model.count, one.found.tests)
+            rows.setdefault(
+                ranked.last.effect, CandidateRow(one.record.element, ranked.last.effect, ranked.gain, p_value, delta)
+            )
+    for effect, gain in one.found.screened.items():
+        rows.setdefault(effect, CandidateRow(one.record.element, effect, gain, chance(gain, 2, one.found.tests)))
+    return list(rows.values())[:20]
+
+
+def _summary(said: ComponentJudgement, findings: list[Finding], left: Unexplained) -> str:
+    if said.verdict == "consistent":
+        text = "The nominal structure explains the recording down to the noise."
+        nuisance = "; ".join(f.sentence for f in findings)
+        return f"{text} {nuisance[:1].upper()}{nuisance[1:]}." if nuisance else text
+    told = [f for f in findings if f.kind is not EffectKind.NUISANCE]
+    text = "; ".join(f.sentence for f in told)
+    if not text:
+        text = "No law of the catalogue explains what was measured"
+    if said.explained is not None and said.explained > 0:
+        share = 100 * said.explained
+        exact = "100" if left.share == 0 else f"{min(share, 99):.0f}"
+        text += f"; explains {exact} % of the excess error"
+    if left.share > 0:
+        text += f"; still unexplained: {left.where}"
+    nuisance = "; ".join(f.sentence for f in findings if f not in told)
+    return f"{text}{'; ' + nuisance if nuisance else ''}."
+
+
+def _arrays(judged: Sequence[Judged], sample_rate: float) -> dict[str, np.ndarray]:
+    """Arrays for pictures: validation of every force, and for every law motion and force before and after."""
+    first = judged[0]
+    arrays: dict[str, np.ndarray] = {}
+    if all(len(j.record.task.force) == len(first.record.task.force) for j in judged):
+        at = {id(j): slice(j.final.task.split, None) for j in judged}
+        arrays["validation.time"] = first.final.task.motion.time[at[id(first)]]
+        parts = [(j.final.task.force, j.base.force, j.final.force) for j in judged]
+        for number, key in enumerate(("measured", "baseline", "augmented")):
+            held = [series[number][at[id(j)]] for j, series in zip(judged, parts, strict=True)]
+            arrays[f"validation.{key}"] = np.column_stack(held)
+        arrays["validation.noise"] = np.array([j.floor for j in judged])
+    arrays["localization.names"] = np.array([j.record.element for j in judged], dtype=str)
+    arrays["localization.score"] = np.array([j.found.base.error for j in judged])
+    for number, (one, columns) in enumerate((j, columns) for j in judged for columns in _columns_of_findings(j)):
+        task = one.final.task
+        thin = slice(None, None, max(1, len(task.force) // 4000))
+        law = one.final.model.columns(task)[:, columns] @ one.final.strengths[columns]
+        key = f"finding.{number}"
+        arrays[f"{key}.time"], arrays[f"{key}.deflection"] = task.motion.time[thin], task.motion.deflection[thin]
+        arrays[f"{key}.rate"] = task.motion.rate[thin]
+        arrays[f"{key}.force_before"] = one.base.residual[thin]
+        arrays[f"{key}.force_after"] = one.final.residual[thin]
+        arrays[f"{key}.loop_x"], arrays[f"{key}.loop_y"] = task.motion.deflection[thin], law[thin]
+        arrays[f"{key}.total_measured"] = task.force[thin]
+        arrays[f"{key}.total_modelled"] = one.final.force[thin]
+    return arrays
+
+
+def _columns_of_findings(one: Judged) -> list[slice]:
+    """Which columns of the model every finding is: one law's, or all of what is unnamed."""
+    counts = [len(piece.signs) for piece in one.final.model.pieces]
+    given, steps = len(one.record.given.pieces), len(one.found.steps)
+    if not one.named:
+        return [slice(sum(counts[:given]), sum(counts))]
+    return [slice(sum(counts[:i]), sum(counts[: i + 1])) for i in range(given, given + steps)]

@@ -1,0 +1,98 @@
+"""Component tests judged: errors on the held-out part and the verdict of all of them together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.diagnosis.component.alike import Alike, look_alikes
+from sprung.model.diagnosis.component.deviations import covariance, left_open
+from sprung.model.diagnosis.component.fit import ComponentFit
+from sprung.model.diagnosis.component.measured import ComponentRecord
+from sprung.model.diagnosis.component.search import Search, Step
+from sprung.model.diagnosis.investigation.setup_effects import SIGN_REVERSED
+from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, Verdict, kind_of, verdict_of
+from sprung.model.diagnosis.rules import Rules
+from sprung.model.signals import FloatArray
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One component with everything that the report says of it."""
+
+    record: ComponentRecord
+    found: Search
+    base: ComponentFit
+    final: ComponentFit
+    floor: float  # N
+    reversed: bool  # the force or the motion was measured with the other sign
+    surface: Step | None = None  # what no law explains, as an unnamed force
+    named: bool = True  # the laws explain enough to be the component's; else they are what comes closest
+
+    @property
+    def size(self) -> float:
+        """Deviation of the held-out force, N."""
+        return float(np.std(self.record.task.force[self.record.task.split :])) or 1.0
+
+    @cached_property
+    def by_chance(self) -> tuple[FloatArray, list[str]]:
+        """Covariance of what the final model has, by chance alone, and names."""
+        return covariance(self.final)
+
+    @cached_property
+    def covariance(self) -> tuple[FloatArray, list[str]]:
+        """Covariance of what the final model has, with what the record leaves open besides chance, and names."""
+        full, names = self.by_chance
+        return full + left_open(self.final, [one.moved for one in self.alike]), names
+
+    @cached_property
+    def alike(self) -> tuple[Alike, ...]:
+        """What the record does not tell from the laws that are named."""
+        return look_alikes(self.final, self.found.steps if self.named else (), len(self.record.given.pieces))
+
+    @property
+    def errors(self) -> HeldOutErrors:
+        held = [np.sqrt(fit.held_out) / self.size for fit in (self.base, self.final)]
+        return HeldOutErrors(np.array(held[:1]), np.array(held[1:]), np.array([self.floor / self.size]))
+
+    @property
+    def unnamed(self) -> Step | None:
+        """What stands for the force that no law explains."""
+        first = None if self.named else next(iter(self.found.steps), None)
+        return self.surface or first
+
+
+@dataclass(frozen=True)
+class ComponentJudgement:
+    """What the component tests of a recording come to, together."""
+
+    errors: HeldOutErrors  # per force
+    verdict: Verdict
+    explained: float | None  # share of the excess error, where anything but nuisances was found
+    left: FloatArray  # unexplained share of every force's power
+
+
+def concluded(judged: Sequence[Judged], rules: Rules) -> ComponentJudgement:
+    """The verdict of all tests, by the rules of components."""
+    parts = [one.errors for one in judged]
+    errors = HeldOutErrors(*(np.concatenate([getattr(e, key) for e in parts]) for key in ("before", "after", "floor")))
+    said = sorted((pair for one in judged for pair in _speaks(one)), key=lambda pair: pair[1])
+    deciding = replace(rules.verdict, carried=rules.component.named)
+    found = any(kind is not EffectKind.NUISANCE for kind, _ in said)
+    explained = errors.explained(deciding) if found else None
+    verdict = verdict_of([kind for kind, _ in said], errors, deciding)
+    return ComponentJudgement(errors, verdict, explained, errors.unexplained(deciding))
+
+
+def _speaks(one: Judged) -> Iterator[tuple[EffectKind, float]]:
+    """What every finding speaks for and its evidence, the most negative first; a preload speaks for nothing."""
+    if one.reversed:
+        yield kind_of(SIGN_REVERSED), -np.inf
+    given = len(one.record.given.pieces)
+    for part, step in zip(one.final.model.pieces[given:], one.found.steps if one.named else (), strict=False):
+        yield part.speaks_for, step.delta_bic
+    if one.unnamed is not None:
+        yield EffectKind.UNLISTED, one.unnamed.delta_bic
