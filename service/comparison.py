@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sprung.model.signals import FloatArray
-from sprung.model.simulate.ride import Ride, fitted_start, simulate_ride
+from sprung.model.simulate.begun import fitted_start
+from sprung.model.simulate.ride import Ride, simulate_ride
 from sprung.model.system import System, load_system
 from sprung.replay.record import Record
 from sprung.service.errors import UserError
@@ -74,11 +75,7 @@ def _against_system(record: Record, system: System, names: tuple[str, str]) -> C
     if last - first < _LEAST:
         raise UserError(f"{names[0]}: no stretch of {_LEAST} samples with every input")
     driven, measured = record.values[first:last, :inputs], record.values[first:last, inputs:]
-    start = np.zeros(2 * system.mechanics.n)
-    ride = simulate_ride(system, driven)
-    for _ in range(3 if system.laws else 1):
-        start = start + fitted_start(system, driven, measured, ride)
-        ride = simulate_ride(system, driven, start=start)
+    ride = simulate_ride(system, driven, start=fitted_start(system, driven, measured))
     time = np.arange(last - first) / system.sample_rate
     return Comparison(system, names, time, measured, ride.sensors, ride)
 

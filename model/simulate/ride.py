@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, ElementLaw, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.in_place import LawError, is_linear, put_in_place
@@ -167,26 +166,3 @@ def _shown(
     if noise is not None:
         shown += system.sensor_noise * noise.standard_normal(shown.shape)
     return shown
-
-
-def fitted_start(system: System, inputs: FloatArray, measured: FloatArray, ride: Ride) -> FloatArray:
-    """The state at the first sample with which a ride from rest comes nearest to what the sensors show, shape (N,).
-
-    measured: (T, S), NaN where missing.  Weighted least squares over the linear system's free motion; laws act on it
-    to first order only, so that a strongly non-linear system wants a second round from the ride that this gives.
-    """
-    A, _, C, _ = system.mechanics.matrices()
-    step = scipy.linalg.expm(A / system.sample_rate)
-    lowest = max(float(np.abs(np.linalg.eigvals(A).real).min()), 1e-3)
-    count = int(min(len(inputs), max(4 / lowest * system.sample_rate, 4 * len(A))))
-    rows, power = np.empty((count, len(C), len(A))), np.eye(len(A))
-    for k in range(count):
-        rows[k] = C @ power
-        power = step @ power
-    error = (measured - ride.sensors)[:count] / system.sensor_noise
-    present = np.isfinite(error)
-    design = (rows / system.sensor_noise[:, None])[present]
-    scale = np.linalg.norm(design, axis=0)
-    solution, *_ = np.linalg.lstsq(design / np.where(scale > 0, scale, 1.0), error[present], rcond=1e-10)
-    start: FloatArray = solution / np.where(scale > 0, scale, 1.0)
-    return start
