@@ -22,6 +22,7 @@ from sprung import model
 from sprung.benchmarks.concealed_score import Score, explained, rate, score, summary
 from sprung.benchmarks.generator import draw_cases, read_vehicle, write_set
 from sprung.benchmarks.generator.laws import LAWS
+from sprung.benchmarks.sindy import compare
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.laws import CATALOGUE
 from sprung.model.system import MANCHESTER, System, load_system
@@ -79,8 +80,6 @@ def run(
     yield from _by_kind(everything)
     yield from _ablations(system, sets, ablate, false_alarm_rate)
     if pysindy:
-        from sprung.benchmarks.sindy import compare
-
         chosen = {
             name: [(folder / f, t) for f, t in list(_labels(folder).items())[:pysindy]] for name, folder in sets.items()
         }

@@ -27,6 +27,7 @@ from sprung.service.pipeline import Pipeline
 from sprung.service.processed import ToFold
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
+from sprung.service.store.archive import Archive
 from sprung.service.store.partitions import prepare
 
 Figures = Iterator[dict[str, Any]]
@@ -174,8 +175,6 @@ def _window_bytes(store: Any, count: int) -> float:
 
 def _parquet_bytes(store: Any, folder: Path) -> float:
     try:
-        from sprung.service.store.archive import Archive
-
         archive = Archive(str(folder / "archive"))
     except ValueError:
         return 0.0

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch.utils.flop_counter import FlopCounterMode
 
 from sprung.benchmarks.bounds import time_domain_bound
 from sprung.benchmarks.full_state import full_state_system
@@ -245,8 +246,6 @@ def _tracked_speed(system: System) -> Iterator[dict[str, Any]]:
 
 def _arithmetic(identifier: Identifier, runs: Runs, rate: float) -> Iterator[dict[str, Any]]:
     """Multiplications of matrices that a window needs, counted, and the share of the cores' peak reached."""
-    from torch.utils.flop_counter import FlopCounterMode
-
     counter = FlopCounterMode(display=False)
     alone = load_identifier(identifier.system)  # the counter sees one thread
     with counter:

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import image
 from scipy.optimize import least_squares
 
 from sprung.model.signals import FloatArray
@@ -210,8 +211,6 @@ def _told(fit: SwingFit | None, truth: dict[str, float]) -> dict[str, Any]:
 
 
 def _pictures(folder: Path) -> FloatArray:
-    from matplotlib import image
-
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)[:MOST_FRAMES]
     if not paths:
         raise ValueError(f"no pictures ({' '.join(PICTURES)})")

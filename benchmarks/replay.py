@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -17,6 +18,14 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+from sprung.service import feed, reading
+from sprung.service.compute import Compute
+from sprung.service.engine import load_engine
+from sprung.service.pipeline import Pipeline
+from sprung.service.processed import Batch
+from sprung.service.settings import Settings
+from sprung.service.store import open_store
 
 RECORDING = Path(__file__).resolve().parents[1] / "tests" / "data" / "drift-600s.blf"
 TARGET = 100.0  # times real time
@@ -73,16 +82,6 @@ def run(recording: Path = RECORDING, *, repeats: int = 3, lengths: str = "1,10")
 
 def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[str, Any]:
     """In the child: replay into a store, `times` after one another, and measure."""
-    import resource
-
-    from sprung.service import feed, reading
-    from sprung.service.compute import Compute
-    from sprung.service.engine import load_engine
-    from sprung.service.pipeline import Pipeline
-    from sprung.service.processed import Batch
-    from sprung.service.settings import Settings
-    from sprung.service.store import open_store
-
     engine = load_engine(Settings())
     stages: dict[str, float] = {}
 

@@ -20,9 +20,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import uvicorn
+from fastapi import FastAPI
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
+from sprung.service.api.app import create_app
+from sprung.service.core import build_core
+from sprung.service.engine import load_engine
+from sprung.service.numerics import numerics
+from sprung.service.settings import Settings
 
 TARGET_MS = 15.0
 WARM_UP = 20
@@ -184,9 +191,6 @@ def free_port() -> int:
 
 
 def _serve_echo(port: int) -> None:
-    import uvicorn
-    from fastapi import FastAPI
-
     app = FastAPI()
 
     @app.post("/echo")
@@ -198,14 +202,6 @@ def _serve_echo(port: int) -> None:
 
 def serve_sprung(port: int, folder: str) -> None:
     """The service on the store of a folder, until the process is ended."""
-    import uvicorn
-
-    from sprung.service.api.app import create_app
-    from sprung.service.core import build_core
-    from sprung.service.engine import load_engine
-    from sprung.service.numerics import numerics
-    from sprung.service.settings import Settings
-
     settings = Settings(data_dir=Path(folder))
     with numerics(load_engine(settings), settings) as (engine, following):
         app = create_app(build_core(settings, engine, following))

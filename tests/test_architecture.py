@@ -58,6 +58,28 @@ STAGES = (
 )
 # Imports inside functions of `model`, each with its reason
 LATE: dict[str, str] = {}
+# Outside `model`, a function imports what an extra brings, what one kind of machine has, or for these reasons
+EXTRAS = {
+    "aiokafka",
+    "asammdf",
+    "cryptography",
+    "filterpy",
+    "h5py",
+    "jwt",
+    "nats",
+    "nptdms",
+    "psycopg",
+    "pyarrow",
+    "pysindy",
+    "ray",
+}
+OF_POSIX = {"fcntl", "resource"}
+LATE_OUTSIDE = {
+    "service/cli/": "a command loads what it needs when it is called: `--help` is there in a tenth of a second",
+    "service/engine.py": "torch, which processes that are forked before it may not have loaded",
+    "service/simulated.py": "torch, the same",
+    "service/diagnosing.py": "threads of linear algebra are bounded before it is loaded",
+}
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}
 STANDARD_BUT_NOT_FOR_THE_CORE = {"socket", "http", "sqlite3", "logging", "argparse", "asyncio"}
 
@@ -220,6 +242,23 @@ def test_the_core_imports_at_the_top_of_its_files() -> None:
                 inner = [n for n in ast.walk(node) if isinstance(n, (ast.Import, ast.ImportFrom))]
                 late |= {f"{path.relative_to(ROOT).as_posix()}:{node.name}" for _ in inner}
     assert late == set(LATE)
+
+
+@pytest.mark.parametrize("folder", [folder for folder in OURS if folder != "model"])
+def test_late_imports_have_a_reason(folder: str) -> None:
+    """docs/decisions/0011-late-imports.md."""
+    without = set()
+    for path in modules(folder):
+        name = path.relative_to(ROOT).as_posix()
+        if any(name.startswith(place) for place in LATE_OUTSIDE):
+            continue
+        for node in nodes(path):
+            if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+                for inner in ast.walk(node):
+                    names = [one.name for one in inner.names] if isinstance(inner, ast.Import) else []
+                    names += [inner.module or ""] if isinstance(inner, ast.ImportFrom) else []
+                    without |= {f"{name}: {one}" for one in names if one.split(".")[0] not in EXTRAS | OF_POSIX}
+    assert without == set()
 
 
 @pytest.mark.parametrize("folder", OURS)

@@ -59,6 +59,7 @@ class RecordRules:
     passed: float = rule(0.4, "of the slowest mode, edge of the filter for integrals; chosen", 0.3, 0.5)
     settled: float = rule(2.0, "periods of that edge lost at either end; derived: 1e-4 of a transient left", 1.5, 3.0)
     stuck: float = rule(0.02, "of the recording; chosen: quantised sensors at rest repeat for less", 0.01, 0.05)
+    stuck_samples: int = rule(20, "at least, the same; derived: coarse steps of slow channels repeat for less", 10, 40)
     resting: float = rule(0.5, "of the channels that repeat a value together: standstill; chosen", 0.3, 0.7)
     held: float = rule(0.05, "Hz; derived: a slower mode is one that no stiffness holds", 0.02, 0.1)
     least_noise: float = rule(0.2, "of a declared noise that an estimate may fall to; chosen: data sheets", 0.1, 0.4)
@@ -94,6 +95,8 @@ class ScreeningRules:
     of_lines: float = rule(22.0, "the same of frequencies and phases; derived: 2 log 60 000", 18.0, 26.0)
     lowest_mode: float = rule(1.0, "Hz; derived: below, an elastic mode is a rigid one of a train's body", 0.5, 2.0)
     highest_mode: float = rule(0.4, "of the sample rate; derived: there anti-alias filters cut", 0.3, 0.45)
+    mode_damping: float = rule(0.01, "ratio of trial modes, and three times that; chosen: car bodies", 0.005, 0.02)
+    mass_damping: float = rule(0.05, "the same of trial masses; chosen: equipment on rubber", 0.025, 0.1)
 
 
 @dataclass(frozen=True)
@@ -158,6 +161,10 @@ class PlausibleRules:
     alone: float = rule(
         3.0, "times the next largest, that one gain or zero is off alone; derived: of 8, one rig in 90", 2.0, 5.0
     )
+    few: int = rule(3, "gains and zeros, of which the largest may be as far from the next by chance; chosen", 2, 5)
+    simulated: float = rule(
+        1e-3, "of a law's parameter, that simulating kinks leaves; derived: 4 steps per sample", 3e-4, 3e-3
+    )
     close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
 
 
@@ -215,6 +222,9 @@ class NoiseRules:
     upper: float = rule(0.38, "of the sample rate; derived: above, anti-alias filters cut", 0.34, 0.42)
     white: float = rule(0.5, "of the excess, that goes on above the band; derived: noise does, physics ends", 0.3, 0.7)
     bins: int = rule(20, "above the band, that tell noise; derived: their level is known to 20 %", 10, 40)
+    blocks: int = rule(24, "of the band, whose median is a sensor's level; chosen: physics fills few", 12, 48)
+    own: float = rule(0.01, "of a bin's variance, from which it tells a sensor's own noise; chosen", 0.003, 0.03)
+    fall: float = rule(0.01, "of a force's noise power, that one round may leave; chosen: steps of ten", 0.003, 0.1)
     displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
     velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
 
@@ -281,6 +291,7 @@ class ReportRules:
     alike: float = rule(0.5, "correlation from which a sign or scale is a likely reason; chosen", 0.3, 0.7)
     scale: float = rule(3.0, "ratio of sizes; chosen: no parameter explains it", 2.0, 5.0)
     far: float = rule(1.6, "log-ratio to nominal; chosen: a factor of 5, no rebuilt vehicle is as far off", 1.1, 2.3)
+    stretches: int = rule(20, "of the spectrum, with misfits of their own; derived: a covariance needs some", 10, 40)
     loose: float = rule(0.2, "standard deviation of a log-ratio of an undecided parameter; chosen", 0.1, 0.4)
 
 
@@ -346,6 +357,8 @@ class ComponentRules:
     integral_settled: float = rule(1.5, "of those periods lost at either end; chosen", 1.0, 2.5)
     seen_to_fall: float = rule(0.25, "of a friction's fall with the rate, that it must show; chosen", 0.1, 0.5)
     turn: float = rule(0.05, "of the travel's range, that a turning point turns by; chosen", 0.02, 0.1)
+    cycles: int = rule(6, "turning points of what repeats itself; derived: three cycles", 4, 10)
+    still_samples: int = rule(25, "of a standstill; derived: its noise is then known to 14 %", 15, 50)
     one_cycle: float = rule(0.1, "of a cycle's travel and duration, within which all are one; chosen", 0.05, 0.2)
     stretches: int = rule(20, "of the fitted part, with errors of their own; derived: a covariance needs some", 10, 40)
     formula_reach: float = rule(20.0, "times the usual size of a length or rate, either way; chosen", 10.0, 40.0)

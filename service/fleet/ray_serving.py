@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from sprung.model.signals import Estimate, FloatArray
+from sprung.service.api.live_ingest import ingest_app
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.errors import Busy, UserError
@@ -150,8 +151,6 @@ async def _asked(pending: Any) -> Any:
 def application(settings: Settings, sizes: ServingSizes) -> Any:
     """The Serve application: `serve.run(application(...))`."""
     from ray import serve
-
-    from sprung.service.api.live_ingest import ingest_app
 
     scaling = {"min_replicas": 1, "max_replicas": sizes.replicas, "target_ongoing_requests": BUSY_BATCHES}
     shared: dict[str, Any] = {

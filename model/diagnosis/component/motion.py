@@ -24,8 +24,6 @@ ComplexArray = NDArray[np.complexfloating]
 _FINER, _MOST = 4, 100_000  # steps per sample along which memories are followed, and all of them at most
 _ORDER = 6  # of the differences that tell white noise
 _BLOCKS = 40  # of them, the median counts: bursts are no noise
-_CYCLES = 6  # turning points at least of what repeats itself
-_STILL_SAMPLES = 25  # at least, of a standstill
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class ElementMotion:
     def repeats(self, rules: ComponentRules = RULES.component) -> bool:
         """Whether it is one cycle again and again: of one travel and one duration, as of a sine test."""
         at = turning_points(self.deflection, rules.turn * float(np.ptp(self.deflection)))
-        if len(at) < _CYCLES:
+        if len(at) < rules.cycles:
             return False
         travels, durations = np.abs(np.diff(self.deflection[at])), self.time[at[2:]] - self.time[at[:-2]]
         low, middle, high = np.quantile(np.column_stack([travels[1:], durations]), [0.1, 0.5, 0.9], axis=0)
@@ -180,7 +178,7 @@ def white_noise(series: FloatArray) -> float:
 
 def still_stretches(series: FloatArray, sample_rate: float, rules: ComponentRules = RULES.component) -> list[slice]:
     """Where a motion (T,) stands still."""
-    span = max(_STILL_SAMPLES, int(rules.rest * sample_rate))
+    span = max(rules.still_samples, int(rules.rest * sample_rate))
     if len(series) < 4 * span:
         return []
     mean = uniform_filter1d(series, span)

@@ -76,7 +76,7 @@ def _begun(
     if len(noise.force):
         # far from the truth a lightly damped system fits no better in any direction: their noise accounts for it
         lin = linearise(problem, start, Working(Whitener.of(problem.forward(start), noise)))
-        problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise))
+        problem = replace(problem, noise=force_noise(lin.forward, lin.spectrum, noise, rules.noise))
     if not system.file.inputs:
         start = replace(start, theta=_from_the_beginning(problem, first, declared, start))
     return problem, optimise(problem, start)
@@ -108,10 +108,10 @@ def refreshed(problem: Problem, fit: Fit) -> tuple[Problem, Fit]:
     settled = 0
     for _ in range(_REFITS):
         before = problem.noise
-        noise = force_noise(fit.forward, fit.spectrum, before)
+        noise = force_noise(fit.forward, fit.spectrum, before, problem.rules.noise)
         if np.all(np.abs(noise.force / before.force - 1) < _SETTLED):
             settled += 1
-            noise = sensor_noise(fit.forward, fit.spectrum, noise)
+            noise = sensor_noise(fit.forward, fit.spectrum, noise, problem.rules.noise)
         renewed = replace(problem, noise=noise)
         enough = settled == (2 if problem.process_noise else 1)
         again = try_optimise(renewed, fit.point, 6 if enough else 2)

@@ -19,12 +19,10 @@ from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.record.signals import Noise, Part
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.forward import Forward
+from sprung.model.diagnosis.rules import NoiseRules
 from sprung.model.signals import FloatArray
 
-_BLOCKS = 24
 _ROUNDS = 4
-_OWN = 0.01  # least share of a sensor's own noise in a bin that tells its level
-_LEAST = 0.01  # share of a force's noise power that one round may leave
 
 
 def input_noise(part: Part, noise: Noise) -> Noise:
@@ -55,7 +53,7 @@ def input_noise(part: Part, noise: Noise) -> Noise:
     return replace(noise, displacement=displacement, velocity=velocity)
 
 
-def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise:
+def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: NoiseRules) -> Noise:
     """Levels of the sensors from the residual (F, S) of a fit."""
     band = forward.part.grid.band
     residual = spectrum[band][1:]
@@ -66,23 +64,23 @@ def sensor_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Nois
         alone = np.real(np.einsum("fss->fs", precision))  # 1 / variance given the other sensors
         normalised = np.abs(np.einsum("fst,ft->fs", precision, residual)) ** 2 / alone  # mean 1 at the truth
         share = alone * variance * noise.sensors**2  # of the own noise in the variance given the others
-        ratio = [_level(normalised[:, i], share[:, i]) for i in range(len(noise.sensors))]
+        ratio = [_level(normalised[:, i], share[:, i], rules) for i in range(len(noise.sensors))]
         noise = replace(noise, sensors=np.maximum(noise.sensors * np.sqrt(ratio), noise.least))
     return noise
 
 
-def _level(normalised: FloatArray, share: FloatArray) -> float:
+def _level(normalised: FloatArray, share: FloatArray, rules: NoiseRules) -> float:
     """Ratio of a sensor's noise power to the supposed one, from the bins (F,) where its own noise counts."""
-    own = share > _OWN
-    if np.sum(own) < 2 * _BLOCKS:
+    own = share > rules.own
+    if np.sum(own) < 2 * rules.blocks:
         return 1.0
     normalised, share = normalised[own], share[own]
-    edges = np.linspace(0, len(normalised), _BLOCKS + 1).astype(int)
+    edges = np.linspace(0, len(normalised), rules.blocks + 1).astype(int)
     blocks = np.array([normalised[a:b].mean() for a, b in pairwise(edges)])
     return max(1 + (_robust(blocks, np.diff(edges)) - 1) / float(np.median(share)), 0.05)
 
 
-def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise:
+def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise, rules: NoiseRules) -> Noise:
     """Levels of the measured forces from the residual (F, S) of a fit, by Fisher scoring of its likelihood."""
     if not len(noise.force):
         return noise
@@ -95,7 +93,7 @@ def force_noise(forward: Forward, spectrum: ComplexArray, noise: Noise) -> Noise
         size = np.sum(np.abs(seen) ** 2, axis=1)  # mean of `copied` at the truth
         score, fisher = np.sum(copied - size, axis=0), np.sum(size**2, axis=0)
         power = noise.force**2
-        noise = replace(noise, force=np.sqrt(np.maximum(power + score / fisher, _LEAST * power)))
+        noise = replace(noise, force=np.sqrt(np.maximum(power + score / fisher, rules.fall * power)))
     return noise
 
 

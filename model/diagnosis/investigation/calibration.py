@@ -22,13 +22,13 @@ from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
-_FEW = 3  # gains and zeros, among which the largest may well be three times the next
 _STEPS = 12, 6  # of a fit of the structure beside the calibration, and of one that begins near
 
 
@@ -64,18 +64,18 @@ def within_sheet(state: Investigation, term: Term) -> bool:
     return bool(off <= state.options.rules.plausible.calibration * spread)
 
 
-def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], times: float) -> bool:
-    """Whether a fault is off by `times` as much as any other gain or zero, if there are enough of them.
+def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
+    """Whether a fault is off by several times as much as any other gain or zero, if there are enough of them.
 
     In units of what data sheets leave, and from the median of its kind: all may share what the file has too large.
     """
-    if len(terms) <= _FEW or all(term.key != key for term in terms):
+    if len(terms) <= rules.few or all(term.key != key for term in terms):
         return False
     kinds = {term.law.name for term in terms}
     middles = {kind: float(np.median([_off(term) for term in terms if term.law.name == kind])) for kind in kinds}
     away = {term.key: abs(_off(term) - middles[term.law.name]) for term in terms}
     own = away.pop(key)
-    return own > times * max(away.values())
+    return own > rules.alone * max(away.values())
 
 
 def _off(term: Term) -> float:
@@ -97,7 +97,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = fit.point.terms[len(file) : len(file) + len(terms)]
-        if stands_alone(fitted, shown.key, state.options.rules.plausible.alone):
+        if stands_alone(fitted, shown.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
         terms = tuple(term for term in fitted if within_sheet(state, term))
         if len(terms) == len(fitted):

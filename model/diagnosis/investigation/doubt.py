@@ -21,7 +21,6 @@ from sprung.model.laws import observe
 from sprung.model.laws.basis import static_law, trials
 from sprung.model.signals import FloatArray
 
-_STRETCHES = 20  # of the spectrum: a covariance needs some
 _SEEN = 1e-6  # of a force's power: less of it is not seen beside the fit
 
 
@@ -33,7 +32,7 @@ def by_what_is_left(problem: Problem, fit: Fit) -> FloatArray:
     inverse = np.linalg.pinv(normal / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
     chance = max(fit.reduced - 1.0, 0.0) * inverse[:free, :free]
     own = inverse[:free, :free] + chance
-    sandwich = inverse @ _of_stretches(fit) @ inverse
+    sandwich = inverse @ _of_stretches(fit, problem.rules.report.stretches) @ inverse
     grow = np.sqrt(np.maximum(np.diag(sandwich)[:free] / np.maximum(np.diag(own), 1e-300), 1.0))
     slopes = np.concatenate([np.ones(len(fit.point.theta)), *[term.slopes for term in fit.point.terms]])
     added = own * np.outer(grow, grow) - inverse[:free, :free]
@@ -42,11 +41,11 @@ def by_what_is_left(problem: Problem, fit: Fit) -> FloatArray:
     return np.asarray(added * np.outer(slopes, slopes))
 
 
-def _of_stretches(fit: Fit) -> FloatArray:
+def _of_stretches(fit: Fit, count: int) -> FloatArray:
     """Sum of the outer products of J^T r of every stretch of the spectrum, (P + p + 2n, P + p + 2n)."""
     bins = fit.whitener.factor.shape[0]
     score = (fit.jacobian * fit.residual[:, None]).reshape(2, bins, -1, fit.jacobian.shape[1]).sum(axis=(0, 2))
-    parts = np.array([part.sum(axis=0) for part in np.array_split(score, _STRETCHES)])
+    parts = np.array([part.sum(axis=0) for part in np.array_split(score, count)])
     return np.asarray(parts.T @ parts)
 
 

@@ -52,14 +52,14 @@ def prepare(system: System, values: FloatArray, sample_rate: float, rules: Recor
     notes += [
         f"input {name} is zero throughout: taken for no force" for name in sorted(resting) if _recorded(system, name)
     ]
-    still = standstill(values, max(int(sample_rate), 20), rules.resting)
+    still = standstill(values, max(int(sample_rate), rules.stuck_samples), rules.resting)
     if still.any() and not still.all():
         values[still] = np.nan
         notes.append(
             f"standstill of {still.sum() / sample_rate:.1f} s is left out: the longest stretch that moves is used"
         )
     steady = {"speed"} if system.on_track else set()  # may be the same for minutes
-    stuck = _blank_stuck(values, names, sample_rate, resting | steady, rules.stuck)
+    stuck = _blank_stuck(values, names, sample_rate, resting | steady, rules)
     first, last = _usable_stretch(values, max(1, int(rules.gap * sample_rate)))
     if last - first < rules.minimum_samples:
         raise TooLittleError(
@@ -146,7 +146,7 @@ def _require_motion(system: System, signals: Signals, rules: RecordRules) -> Non
 
 
 def _blank_stuck(
-    values: FloatArray, names: list[str], sample_rate: float, resting: set[str], share: float
+    values: FloatArray, names: list[str], sample_rate: float, resting: set[str], rules: RecordRules
 ) -> list[tuple[str, float]]:
     """Columns that repeat one value for long (a share of the recording) become NaN, but for those that rest."""
     found = []
@@ -159,7 +159,7 @@ def _blank_stuck(
         edges = np.concatenate([[-1], change, [len(good) - 1]])
         runs = np.diff(edges)
         longest = int(np.argmax(runs))
-        if runs[longest] >= max(sample_rate, share * len(values), 20):
+        if runs[longest] >= max(sample_rate, rules.stuck * len(values), rules.stuck_samples):
             found.append((name, float(good[edges[longest] + 1] / sample_rate)))
             values[:, column] = np.nan
     return found

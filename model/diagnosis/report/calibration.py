@@ -20,7 +20,7 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     for index in indices:
         term = course.fit.point.terms[index]
         if in_order(course, term):
-            (parameter,) = law_parameters(final, index)
+            (parameter,) = law_parameters(final, index, course.options.rules.plausible)
             found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
     for fault in course.input_faults:
         if in_order(course, fault.term):

@@ -83,7 +83,7 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     for index, term in enumerate(fit.point.terms[:count]):
         moot = index in channels(course) and (term.location, term.law.name) not in told
         if term.law.named and not moot:
-            values, texts = law_parameters(fit, index), formula_of(term)
+            values, texts = law_parameters(fit, index, course.options.rules.plausible), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
     for fault in course.input_faults:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]

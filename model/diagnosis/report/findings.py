@@ -67,7 +67,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
         term = course.fit.point.terms[course.given + index]
         if in_order(course, term):
             continue
-        parameters = _free(term, law_parameters(outcome.final, course.given + index))
+        parameters = _free(term, law_parameters(outcome.final, course.given + index, course.options.rules.plausible))
         rival = found.runner_up
         family, advice = _look_alikes(found, course.options.rules.report)
         finding = Finding(
@@ -134,7 +134,7 @@ def _experiment(term: Term) -> str:
 def _out_of_order(outcome: Outcome, index: int) -> tuple[float, Finding]:
     """A gain or zero that is beyond its tolerance only beside everything that was found, and its rank."""
     term = outcome.investigation.fit.point.terms[index]
-    parameters = law_parameters(outcome.final, index)
+    parameters = law_parameters(outcome.final, index, outcome.investigation.options.rules.plausible)
     score = float(((term.parameters[0] - term.law.absent[0]) / parameters[0].std) ** 2)
     words = term.law.sentence.format(**{p.name: p.words() for p in parameters})
     sentence = f"{term.location}: {words}"

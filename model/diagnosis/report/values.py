@@ -7,7 +7,7 @@ import numpy as np
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.report.report import FitFigures, LawParameter, ReportedParameter
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.selection.plausible import SIMULATED
+from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import ElementLaw, reversal_step
 from sprung.model.laws.sensor_faults import OF_CHANNEL
 from sprung.model.signals import FloatArray
@@ -52,10 +52,10 @@ def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ..
     return tuple(values)
 
 
-def law_parameters(fit: Fit, index: int) -> tuple[LawParameter, ...]:
+def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible) -> tuple[LawParameter, ...]:
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
-    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), SIMULATED * np.abs(term.parameters))
+    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), rules.simulated * np.abs(term.parameters))
     hidden = not term.law.named
     units = {channel.name: channel.unit for channel in fit.forward.system.channels}
     return tuple(

@@ -20,8 +20,6 @@ from sprung.model.laws import CLOCK_LEAD, BodyLaw, Law
 from sprung.model.mechanics import ACCELERATION, VELOCITY
 from sprung.model.signals import FloatArray
 
-_RATIOS = (0.01, 0.03)  # damping ratios of trial modes
-
 
 def body_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterator[tuple[Candidate, int]]:
     """The best trial of every body law at every body, and how many were tried."""
@@ -89,7 +87,7 @@ def _modes(projector: Projector, law: BodyLaw, index: int, name: str) -> Iterato
 
 def _mode_grid(sample_rate: float, rules: ScreeningRules) -> tuple[FloatArray, FloatArray]:
     frequencies, ratios = [], []
-    for ratio in _RATIOS:
+    for ratio in (rules.mode_damping, 3 * rules.mode_damping):
         count = int(np.log(rules.highest_mode * sample_rate / rules.lowest_mode) / ratio)
         grid = np.geomspace(rules.lowest_mode, rules.highest_mode * sample_rate, max(count, 2))
         frequencies.append(grid)

@@ -24,7 +24,6 @@ from sprung.model.system import System
 
 _PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of 1, x, y
 _PLACES = {"x": 9, "y": 5}  # along an axis that turns
-_RATIOS = (0.05, 0.15)  # damping ratios of trial masses
 _SEEN = 1e-6  # of a column's square, left by the projection
 
 
@@ -216,7 +215,7 @@ def _suspended(projector: Projector, law: StructureLaw, name: str) -> tuple[Cand
 def _trials(sample_rate: float, rules: ScreeningRules) -> FloatArray:
     """Frequencies and damping ratios of trial masses, (trials, 2)."""
     highest, found = rules.highest_mode * sample_rate, []
-    for ratio in _RATIOS:
+    for ratio in (rules.mass_damping, 3 * rules.mass_damping):
         count = max(2, int(np.log(highest / rules.lowest_mode) / ratio))
         found += [(frequency, ratio) for frequency in np.geomspace(rules.lowest_mode, highest, count)]
     return np.array(found)

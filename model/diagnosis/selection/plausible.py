@@ -17,8 +17,6 @@ from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw, SupportLaw, reversal_step
 from sprung.model.signals import FloatArray
 
-SIMULATED = 1e-3  # of a law's parameter: what the simulation of kinks and stops at 4 steps a sample is good for
-
 
 def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
     """Why a fitted term is not believed, in words; None: nothing speaks against it."""
@@ -60,7 +58,7 @@ def hardly_there(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) 
     if len(term.parameters) != 1 or not np.isfinite(term.law.absent[0]):
         return False
     value = term.parameters[0]
-    stated = np.hypot(np.sqrt(max(fit.covariance[-1, -1], 0.0)), SIMULATED * abs(value))
+    stated = np.hypot(np.sqrt(max(fit.covariance[-1, -1], 0.0)), rules.simulated * abs(value))
     return bool(abs(value - term.law.absent[0]) < rules.apart * stated)
 
 
