@@ -43,7 +43,7 @@ from sprung.model.laws.sensor_faults import (
 )
 from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, PROGRESSIVE_STOP
 from sprung.model.laws.structure import MISSING_CONNECTION, SUSPENDED_MASS, WRONG_POSITION
-from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS
+from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS, STRUCTURAL_DAMPING
 
 CATALOGUE: tuple[Law, ...] = (
     CUBIC_STIFFNESS,
@@ -67,6 +67,7 @@ CATALOGUE: tuple[Law, ...] = (
     PRELOAD,
     AIR_SPRING,
     FRACTIONAL_STIFFNESS,
+    STRUCTURAL_DAMPING,
     ANTI_ROLL_BAR,
     WHEEL_FLAT,
     RAIL_JOINTS,

@@ -23,7 +23,8 @@ from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
 # "bodies": two bodies, or a body and a support; "axle": both supports of one
-Where = Literal["element", "pair", "body", "bodies", "sensor", "support", "axle"]
+# "elements": all springs of a system together
+Where = Literal["element", "elements", "pair", "body", "bodies", "sensor", "support", "axle"]
 Channels = Literal["sensor", "support", "force"]
 Values = Sequence[Any]  # one float or array per parameter, in the law's order; they broadcast with the motion
 
@@ -142,7 +143,8 @@ class Maxwell(NamedTuple):
 
     stiffness: float  # N/m
     time: float  # s, damper over spring
-    replaces: float  # N s/m, what of the element's own damper is in the branch
+    replaces: float = 0.0  # N s/m, what of the element's own damper is in the branch
+    of_spring: bool = False  # whether its stiffness is a share of the element's own
 
 
 class FittedElement(NamedTuple):
@@ -301,6 +303,8 @@ class StructureLaw(Parametrised):
     powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # as of a `BodyLaw`
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
     strengths: tuple[int, ...] = ()  # parameters in which it is linear at first order, together 0 where it is absent
+    # What it puts beside every spring that its location names; the mechanics stay as they are
+    branches: Callable[[Values, SpringDamper], tuple[Maxwell, ...]] | None = None
     prior_cost: float = 0.0
     fault: bool = False
 
@@ -351,6 +355,16 @@ def _as_large_as_found(step: float, amplitude: float) -> float:
     return max(abs(amplitude), 1e-9)
 
 
+class DataSheet(NamedTuple):
+    """What an instrument in order may be off by: standard deviations; and what it shows."""
+
+    gain: float  # relative
+    zero: float  # in the channel's unit
+    delay: float  # s
+    size: float  # standard deviation of what it shows, in the channel's unit
+    step: float  # s, from sample to sample
+
+
 @dataclass(frozen=True)
 class SensorLaw(Parametrised):
     """A fault of a measurement: what it shows instead of the truth.
@@ -373,9 +387,8 @@ class SensorLaw(Parametrised):
     stuck: bool = False  # the channel repeats its first value
     prior_cost: float = 0.0
     fault: bool = True
-    # Deviation of the only parameter in an instrument in order: of what its data sheet leaves to gain and zero, and of
-    # the size of the signal; None: no instrument has the fault
-    of_instrument: Callable[[float, float, float], float] | None = None
+    # Deviation of the only parameter in an instrument in order; None: no instrument has the fault
+    of_instrument: Callable[[DataSheet], float] | None = None
 
     def distort(self, truth: FloatArray, p: Values, sample_rate: float) -> FloatArray:
         """What is shown of the truth (..., T) along the last axis."""

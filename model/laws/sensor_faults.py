@@ -26,7 +26,7 @@ SENSOR_GAIN = SensorLaw(
     response=lambda p: SensorResponse(gain=p[0]),
     at=("sensor", "support", "force"),
     scale=lambda step, amplitude: 0.1,
-    of_instrument=lambda gain, zero, size: gain,
+    of_instrument=lambda sheet: sheet.gain,
 )
 _LATE = SensorLaw(
     name="sensor_lag",
@@ -39,6 +39,7 @@ _LATE = SensorLaw(
     response=lambda p: SensorResponse(delay=p[0]),
     at=("sensor", "support"),
     scale=_tenth_of_a_sample,
+    of_instrument=lambda sheet: min(sheet.delay, sheet.step),  # whoever samples fast keeps better time
 )
 # Filters in the measuring chain are late by another law; at the frequencies that a suspension passes on alike at first
 _FIRST_ORDER = replace(
@@ -56,6 +57,7 @@ _BOTH = replace(
     absent=(0.0, 0.0),
     response=lambda p: SensorResponse(lag=p[0], delay=p[1]),
     sentence="the sensor lags with a time constant of {time}, and by {delay} besides",
+    of_instrument=None,
     prior_cost=RARE,
 )
 SENSOR_LAG = replace(_LATE, forms={"first order": _FIRST_ORDER, "first order and delay": _BOTH})
@@ -69,7 +71,7 @@ SENSOR_BIAS = SensorLaw(
     sentence="the sensor is off by {offset}",
     response=lambda p: SensorResponse(offset=p[0]),
     at=("sensor", "force"),
-    of_instrument=lambda gain, zero, size: max(zero, gain * size),  # in small signals the zero, in large ones the gain
+    of_instrument=lambda sheet: max(sheet.zero, sheet.gain * sheet.size),  # small signals: the zero, large: the gain
 )
 SENSOR_NOISE = SensorLaw(
     name="sensor_noise",

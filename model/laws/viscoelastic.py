@@ -1,4 +1,4 @@
-"""Rubber: a stiffness that grows with the frequency, with damping in proportion, over decades.
+"""Rubber: a stiffness that grows with the frequency, with damping in proportion, over decades; material damping.
 
 A fractional derivative (Bagley and Torvik, 1983), K(w) = k (j w / w1)^a with w1 of 1 Hz, as five Maxwell branches:
 
@@ -6,6 +6,14 @@ A fractional derivative (Bagley and Torvik, 1983), K(w) = k (j w / w1)^a with w1
 
 with poles x_i a factor e^D = 5 apart around 3.5 Hz.  What is left out below them is a stiffness and above them a
 damping, which the element's own take up.
+
+Metal, concrete and joints lose about the same share of their energy in every cycle, at any frequency (structural or
+hysteretic damping): a loss factor h, the limit of small a with h = pi a / 2, as branches of the same poles,
+
+    h k = sum_i (2 D / pi) h k  w x_i / (w^2 + x_i^2)        to 1 % between the outer poles
+
+It is a property of the material, and the springs of a structure have it together.  No material is as even as that: h
+may grow with a small power of the frequency, h (x_i / w1)^b in place of it.
 """
 
 from __future__ import annotations
@@ -13,7 +21,20 @@ from __future__ import annotations
 import numpy as np
 from scipy.signal import lfilter
 
-from sprung.model.laws.base import RARE, ElementLaw, Motion, Observed, ParameterSpec, SpringDamper, Values, grid
+from sprung.model.laws.base import (
+    RARE,
+    ElementLaw,
+    Foothold,
+    Maxwell,
+    Motion,
+    Observed,
+    ParameterSpec,
+    SpringDamper,
+    StructureLaw,
+    Values,
+    grid,
+)
+from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
 _APART = 5.0
@@ -85,5 +106,48 @@ FRACTIONAL_STIFFNESS = ElementLaw(
     memory_rate=_rate,
     memory_decay=_decay,
     path=_path,
+    prior_cost=RARE,
+)
+
+
+_AT_1_HZ = _UNIT**2 + _POLES**2  # what the branches' answers there are divided by
+
+
+def _unchanged(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
+    return mechanics
+
+
+def _lossy(p: Values, element: SpringDamper) -> tuple[Maxwell, ...]:
+    """Branches beside a spring that loses the same share of its energy at every frequency."""
+    loss, power = (float(value) for value in p)
+    shares = 2 * np.log(_APART) / np.pi * (_POLES / _UNIT) ** power
+    lost, kept = (float(shares @ part) for part in (_UNIT * _POLES / _AT_1_HZ, _UNIT**2 / _AT_1_HZ))
+    size = float(element.stiffness) * loss / (lost - loss * kept)  # of the spring with its branches, at 1 Hz
+    return tuple(Maxwell(float(size * s), float(1 / x), of_spring=True) for s, x in zip(shares, _POLES, strict=True))
+
+
+STRUCTURAL_DAMPING = StructureLaw(
+    name="structural_damping",
+    title="material damping of all springs",
+    parameters=(
+        ParameterSpec(
+            "loss_factor",
+            "1",
+            0.0,
+            0.4,
+            "energy lost per radian over the energy stored, at 1 Hz",
+            lambda seen: 0.02,
+        ),
+        ParameterSpec("power", "1", -0.2, 0.5, "of the frequency, with which it grows", lambda seen: 0.1, minor=True),
+    ),
+    where="elements",
+    modify=_unchanged,
+    absent=(0.0, 0.0),
+    looks_like="every resonance is damped about alike, high ones more and low ones less than dampers would have them",
+    confused_with=("fractional_stiffness", "air_spring", "suspended_mass"),
+    sentence="all springs lose energy at any frequency, as materials and joints do, by a loss factor of {loss_factor} "
+    "at 1 Hz",
+    strengths=(0,),
+    branches=_lossy,
     prior_cost=RARE,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sprung.model.laws import SpringDamper
+from sprung.model.laws import CATALOGUE, SpringDamper, StructureLaw
 from sprung.model.laws.base import Motion
 from sprung.model.laws.expression import MOTION, parse
 from tests.named_laws import element_law
@@ -38,3 +38,17 @@ def test_the_text_of_the_parts_says_the_same() -> None:
     told = [[parse(text, known)(**values, z=z) for text in part] for part, z in zip(RUBBER.parts, states, strict=True)]
     assert sum(f for f, _ in told) == pytest.approx(float(force), rel=1e-12)
     assert [rate for _, rate in told] == pytest.approx(rates.tolist(), rel=1e-12)
+
+
+@pytest.mark.parametrize(("loss", "power"), [(0.02, 0.0), (0.1, 0.0), (0.3, 0.0), (0.1, 0.2)])
+def test_material_damping_is_a_loss_factor_over_two_decades(loss: float, power: float) -> None:
+    law = next(law for law in CATALOGUE if law.name == "structural_damping")
+    assert isinstance(law, StructureLaw) and law.branches is not None
+    s = 2j * np.pi * np.geomspace(0.5, 25, 60)
+    parts = law.branches((loss, power), SpringDamper(3e5, 100.0))
+    answer = 3e5 + sum(part.stiffness * s * part.time / (1 + s * part.time) for part in parts)
+    found = answer.imag / answer.real
+    assert found[np.argmin(np.abs(np.abs(s) - 2 * np.pi))] == pytest.approx(loss, rel=0.03)
+    if loss < 0.05 and not power:
+        assert found == pytest.approx(np.full(60, loss), rel=0.1)  # the spring stiffens meanwhile
+    assert found[-1] / found[0] == pytest.approx((25 / 0.5) ** power, rel=3 * loss + 0.1)

@@ -195,9 +195,11 @@ def _theta_forces(forward: Forward, motions: Motions) -> tuple[ComplexArray, dic
         element = forward.system.elements.index(parameter.element)
         along = motions.rate if parameter.quantity == "damping" else motions.deflection
         forces[:, i] = value * along[:, element]
-        for branch in structure.branches if parameter.quantity == "damping" else ():
-            if branch.element == element and branch.replaces:  # c s / (1 + s c / ks) by log c
-                forces[:, i] /= (1 + 1j * omega * branch.time) ** 2
+        for branch in structure.branches:
+            if branch.element == element and parameter.quantity == "damping" and branch.replaces:
+                forces[:, i] /= (1 + 1j * omega * branch.time) ** 2  # c s / (1 + s c / ks) by log c
+            elif branch.element == element and parameter.quantity == "stiffness" and branch.of_spring:
+                forces[:, i] += branch.impedance(omega) * motions.deflection[:, element]
     return forces, loads
 
 
@@ -252,6 +254,9 @@ def _log_det_slopes(forward: Forward, whitener: Whitener) -> FloatArray:
         else:
             element = forward.system.elements.index(parameter.element)
             factor = value * (jw if parameter.quantity == "damping" else 1.0)
+            if parameter.quantity == "stiffness":
+                shares = [b for b in plant.structure.branches if b.element == element and b.of_spring]
+                factor = sum((b.impedance(plant.grid.omega[band])[:, None] for b in shares), factor)
             along = plant.sensor_of_force[band][:, :, element, None] * (factor * deflection[:, element])[:, None]
             change = along * shown
         slopes[i] = whitener.log_det_slope(change)

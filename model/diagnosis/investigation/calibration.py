@@ -1,12 +1,13 @@
-"""Gains and zeros of instruments in order: as far off as data sheets leave them, they are part of the model, no fault.
+"""Gains, zeros and delays of instruments in order: as data sheets leave them, they are part of the model, no fault.
 
-No rig has gains of one and zeros of nothing.  A recording of little noise shows a gain of one per cent at once, and
-names for whatever else fits a little better beside it: a mass that hangs, an elastic mode.  So once one shows, the
-gains and zeros of all sensors and measured forces are fitted beside the structure, expected to be as far off as data
-sheets leave them (`gain_std`, `offset_std` of an address), and findings are sought anew.  Within the tolerance they are
+No rig has gains of one, zeros of nothing and channels that are sampled at the same instant.  A recording of little
+noise shows a gain of one per cent or a delay of a hundredth of a sample at once, and names for whatever else fits a
+little better beside it: a mass that hangs, an elastic mode.  So once one shows, gains, zeros and delays of all sensors
+and gains and zeros of measured forces are fitted beside the structure, expected to be as far off as data sheets leave
+them (`gain_std`, `offset_std`, `delay_std` of an address), and findings are sought anew.  Within the tolerance they are
 told and decide nothing; the deviations of all other values contain theirs.
 
-Where many channels tell, it is by them that one is judged: a gain or zero that is off by far more than any other is a
+Where many channels tell, it is by them that one is judged: one that is off by far more than any other of its kind is a
 fault, however small, since the instruments of one rig are of one kind.
 """
 
@@ -26,6 +27,7 @@ from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
+from sprung.model.laws.base import DataSheet
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
@@ -38,7 +40,8 @@ def expected(system: System, signals: Signals, law: Law, location: str) -> float
     if not isinstance(law, SensorLaw) or law.of_instrument is None or location not in names:
         return 0.0
     sheet = system.tolerances[names.index(location)]
-    return law.of_instrument(sheet.gain, sheet.zero, _size(signals, location))
+    size, step = _size(signals, location), 1 / signals.sample_rate
+    return law.of_instrument(DataSheet(sheet.gain, sheet.zero, sheet.delay, size, step))
 
 
 def _size(signals: Signals, location: str) -> float:
@@ -69,12 +72,12 @@ def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: Plausi
 
     In units of what data sheets leave, and from the median of its kind: all may share what the file has too large.
     """
-    if len(terms) <= rules.few or all(term.key != key for term in terms):
+    if len(terms) <= rules.few or all(term.key[:2] != key[:2] for term in terms):  # a lag's form is told by little
         return False
     kinds = {term.law.name for term in terms}
     middles = {kind: float(np.median([_off(term) for term in terms if term.law.name == kind])) for kind in kinds}
-    away = {term.key: abs(_off(term) - middles[term.law.name]) for term in terms}
-    own = away.pop(key)
+    away = {term.key[:2]: abs(_off(term) - middles[term.law.name]) for term in terms}
+    own = away.pop(key[:2])
     return own > rules.alone * max(away.values())
 
 
@@ -134,8 +137,15 @@ def faulty(state: Investigation) -> list[int]:
     return [index for index in channels(state) if not in_order(state, state.fit.point.terms[index])]
 
 
+def _shows(law: SensorLaw, *, rate: bool, support: bool) -> bool:
+    """Whether a fault shows: a rate has no offset, and supports are taken to be sampled at their time."""
+    slope = law.slope()
+    moved = slope.lag or slope.delay
+    return bool(slope.gain or (moved and not support) or (slope.offset and not rate))
+
+
 def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
-    """Gain and zero of every sensor and measured force, gain of every support; off where that was found."""
+    """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; off as found."""
     signals, part = state.signals, state.problem.part
     laws = [law for law in state.options.catalogue if isinstance(law, SensorLaw)]
     rates = {name for name, rate in zip(signals.sensor_names, part.differentiated, strict=True) if rate}
@@ -154,7 +164,7 @@ def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
                 spread = expected(state.system, signals, law, name)
                 if not spread or channel not in law.at or (name, law.name) in given:
                     continue
-                if name not in rates or law.slope().gain:  # a rate shows no offset
+                if _shows(law, rate=name in rates, support=channel == "support"):
                     nothing = Term(law, str(name), law.absent, scales=(spread,), known=(spread,))
                     found.append(replace(nothing, parameters=values.get(nothing.key, law.absent)))
     return tuple(found)

@@ -30,6 +30,7 @@ from sprung.model.diagnosis.investigation.idle import without_idle
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
 from sprung.model.diagnosis.investigation.judgement import (
     another_structure,
+    is_part,
     judged,
     leaves_more_than_noise,
     unmeasured_share,
@@ -383,6 +384,9 @@ def _minor(state: Investigation, trial: Trial) -> bool:
     if _takes_up(state, trial):
         return True
     rules = state.options.rules.acceptance
+    even = (found.trial.gain for found in state.found if _of_all_springs(found.trial.term.law))
+    if is_part(trial.term.law) and trial.gain < rules.minor_beside * max(even, default=0.0):
+        return True  # no material is as even over the frequency as its law
     for index, found in enumerate(state.found):
         if found.trial.term.location != trial.term.location:
             least = rules.minor_followed if state.problem.process_noise else rules.minor_elsewhere
@@ -397,6 +401,10 @@ def _minor(state: Investigation, trial: Trial) -> bool:
         elif trial.worth < rules.minor_beside * _worth(state.fit, state.given + index, found.trial.term.law):
             return not _explains_the_rest(state, trial)
     return False
+
+
+def _of_all_springs(law: Law) -> bool:
+    return isinstance(law, StructureLaw) and law.branches is not None
 
 
 def _explains_the_rest(state: Investigation, trial: Trial) -> bool:

@@ -17,7 +17,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, VerdictRules
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.selection.holdout import FreeRun
-from sprung.model.laws import Law, StructureLaw
+from sprung.model.laws import ElementLaw, Law, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 from sprung.model.signals import FloatArray
 
@@ -86,9 +86,17 @@ def leaves_more_than_noise(state: Investigation) -> bool:
 
 
 def changed_parts(state: Investigation) -> int:
-    """How many changes of the structure there are among the findings: elements elsewhere, connections, hung masses."""
+    """How many changes of the structure there are among the findings: elements elsewhere and linear parts."""
     moved = sum(fault.effect is WRONG_BODY for fault in state.setup_faults)
-    return moved + sum(isinstance(found.trial.term.law, StructureLaw) for found in state.found)
+    return moved + sum(is_part(found.trial.term.law) for found in state.found)
+
+
+def is_part(law: Law) -> bool:
+    """Whether a law is a linear part of the structure: a connection, a hung mass, a spring in series, rubber.
+
+    Sums of them come close to any other structure.
+    """
+    return isinstance(law, StructureLaw) or (isinstance(law, ElementLaw) and law.memory_decay is not None)
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:

@@ -23,6 +23,7 @@ from sprung.model.diagnosis.report.report import (
     Unexplained,
 )
 from sprung.model.diagnosis.report.values import deviations, figures, formula_of, law_parameters, reported_parameters
+from sprung.model.laws import StructureLaw
 
 
 def compose(outcome: Outcome, record: Recorded) -> Report:
@@ -82,7 +83,8 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
         moot = index in channels(course) and (term.location, term.law.name) not in told
-        if term.law.named and not moot:
+        everywhere = isinstance(term.law, StructureLaw) and term.law.branches is not None  # no file has room for it
+        if term.law.named and not moot and not everywhere:
             values, texts = law_parameters(fit, index, course.options.rules.plausible), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
     for fault in course.input_faults:

@@ -18,7 +18,7 @@ from sprung.model.diagnosis.response.frf import Plant
 from sprung.model.diagnosis.response.harmonic_balance import TOLERANCE, HarmonicBalance, LawForces, fixed_point
 from sprung.model.diagnosis.response.newton import PATIENCE, newton_step
 from sprung.model.diagnosis.response.structure import Structure
-from sprung.model.diagnosis.response.terms import Term, branch_of, split, supports
+from sprung.model.diagnosis.response.terms import Term, branches_of, is_waveform, supports
 from sprung.model.laws import CLOCK_LEAD, BodyLaw, SensorLaw, SensorResponse, SpringDamper, StructureLaw, SupportLaw
 from sprung.model.laws.structure import sites_of
 from sprung.model.mechanics import VELOCITY
@@ -66,16 +66,13 @@ class Forward:
     def plant(self) -> Plant:
         structure = structure_of(self.system, self.sensors, self.theta, self.terms)
         structure = replace(structure, sensor_kind=np.where(self.part.differentiated, VELOCITY, structure.sensor_kind))
-        waveform, linear, _, _ = split(self.terms)
         stiffness, damping = structure.stiffness.copy(), structure.damping.copy()
-        for term in waveform:
+        for term in filter(is_waveform, self.terms):
             if "|" not in term.location:
                 e = self.system.elements.index(term.location)
                 stiffness[e] += term.equivalent[0]
                 damping[e] += term.equivalent[1]
-        places = [self.system.elements.index(term.location) for term in linear]
-        found = [branch_of(term, e, structure.damping[e]) for term, e in zip(linear, places, strict=True)]
-        branches = tuple(branch for branch in found if branch is not None)
+        branches = tuple(branch for term in self.terms for branch in branches_of(term, self.system, structure))
         structure = replace(structure, stiffness=stiffness, damping=damping, branches=branches)
         if self.known is not None and self.known.grid == self.part.grid and self.known.structure.same(structure):
             return self.known
@@ -101,7 +98,7 @@ class Forward:
         plant, s = self.plant, self.plant.structure
         support = self.support_polynomial
         moved = support @ s.G.T
-        load = -(moved * s.stiffness + plant.derivative(moved) * s.damping) @ s.H
+        load = -(moved * s.stiffness + plant.derivative(moved) * s.steady_damping) @ s.H
         load = load + self.force_polynomial @ s.F.T
         q = plant.polynomial_response(load)
         return q, q @ s.H.T + moved
@@ -320,7 +317,7 @@ class Forward:
 
     def loop(self, state: FloatArray) -> HarmonicBalance | None:
         """The laws that act along the trajectory and the plant between them; None when there is none."""
-        waveform, *_ = split(self.terms)
+        waveform = [term for term in self.terms if is_waveform(term)]
         if not waveform:
             return None
         ports = np.array([term.port(self.system) for term in waveform])

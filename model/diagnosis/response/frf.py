@@ -207,7 +207,7 @@ class Plant:
         s, T = self.structure, self.grid.length
         p = DEGREE + 1
         first = np.diag(np.arange(1, p), 1) / T  # coefficients of the derivative
-        system = np.kron(np.eye(p), s.K) + np.kron(first, s.C) + np.kron(first @ first, np.diag(s.mass))
+        system = np.kron(np.eye(p), s.K) + np.kron(first, s.steady_C) + np.kron(first @ first, np.diag(s.mass))
         scale = np.abs(system).max(axis=1)
         scale[scale == 0] = 1.0
         columns = np.tile(1 / np.sqrt(np.maximum(np.abs(np.diag(s.K)), s.mass / T**2)), p)
@@ -221,7 +221,7 @@ class Plant:
         kind = s.sensor_kind
         result = np.where(kind == ACCELERATION, self.derivative(q1) @ s.S.T, 0.0)
         result += np.where(kind == VELOCITY, q1 @ s.S.T, 0.0) + np.where(kind == DISPLACEMENT, q @ s.S.T, 0.0)
-        force = d * s.stiffness + self.derivative(d) * s.damping
+        force = d * s.stiffness + self.derivative(d) * s.steady_damping
         result += np.where(kind == DEFLECTION, d @ s.L.T, 0.0) + np.where(kind == FORCE, force @ s.L.T, 0.0)
         return result
 

@@ -18,12 +18,17 @@ class Branch:
     element: int
     stiffness: float  # N/m
     time: float  # s, damper over spring
-    replaces: float  # N s/m, what of the element's damper is in the branch
+    replaces: float = 0.0  # N s/m, what of the element's damper is in the branch
+    of_spring: bool = False  # whether its stiffness is a share of the element's own
 
     def impedance(self, omega: FloatArray) -> ComplexArray:
         """What the branch adds to k + j w c, N/m, (F,)."""
         jw = 1j * omega
-        return np.asarray(self.stiffness * jw * self.time / (1 + jw * self.time) - jw * self.replaces)
+        return np.asarray(jw * self.per_rate(omega))
+
+    def per_rate(self, omega: FloatArray) -> ComplexArray:
+        """The same per rate, N s/m, (F,): the rate of a motion whose ends do not meet has a spectrum of its own."""
+        return np.asarray(self.stiffness * self.time / (1 + 1j * omega * self.time) - self.replaces)
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,18 @@ class Structure:
     @property
     def C(self) -> FloatArray:
         return (self.H.T * self.damping) @ self.H + np.diag(self.own_damping)
+
+    @property
+    def steady_C(self) -> FloatArray:
+        return (self.H.T * self.steady_damping) @ self.H + np.diag(self.own_damping)
+
+    @property
+    def steady_damping(self) -> FloatArray:
+        """Force per rate of the elements in steady motion, N s/m, (E,)."""
+        damping = self.damping.copy()
+        for branch in self.branches:
+            damping[branch.element] += branch.stiffness * branch.time - branch.replaces
+        return damping
 
     @property
     def states(self) -> int:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.response.structure import Branch
-from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw, StructureLaw
+from sprung.model.diagnosis.response.structure import Branch, Structure
+from sprung.model.laws import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper, StructureLaw
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -122,23 +122,21 @@ def supports(system: System) -> list[str]:
     return [name for name, source in system.file.inputs.items() if source.kind != "force"]
 
 
-def branch_of(term: Term, element: int, damping: float) -> Branch | None:
-    """The branch that a law with linear memory puts beside an element; None: the law is not linear."""
+def branches_of(term: Term, system: System, structure: Structure) -> tuple[Branch, ...]:
+    """The branches that a law with linear memory puts beside its elements; none: it is no such law.
+
+    structure: of the model, with its stiffnesses and dampings.
+    """
     law = term.law
-    if not isinstance(law, ElementLaw) or law.branch is None:
-        return None
-    return Branch(element, *law.branch(term.parameters, damping))
+    places = [system.elements.index(name) for name in term.location.split("|") if name in system.elements]
+    if isinstance(law, ElementLaw) and law.branch is not None:
+        return tuple(Branch(e, *law.branch(term.parameters, float(structure.damping[e]))) for e in places)
+    if isinstance(law, StructureLaw) and law.branches is not None:
+        of = [(e, SpringDamper(structure.stiffness[e], structure.damping[e])) for e in places]
+        return tuple(Branch(e, *branch) for e, element in of for branch in law.branches(term.parameters, element))
+    return ()
 
 
 def is_waveform(term: Term) -> bool:
     """Whether the law's force is found along the trajectory, in the loop."""
     return isinstance(term.law, ElementLaw) and term.law.branch is None
-
-
-def split(terms: tuple[Term, ...]) -> tuple[list[Term], list[Term], list[Term], list[Term]]:
-    """Terms by how they act: along the trajectory, as branches, on a body, on a measurement."""
-    waveform = [t for t in terms if is_waveform(t)]
-    linear = [t for t in terms if isinstance(t.law, ElementLaw) and not is_waveform(t)]
-    body = [t for t in terms if isinstance(t.law, BodyLaw)]
-    sensor = [t for t in terms if isinstance(t.law, SensorLaw)]
-    return waveform, linear, body, sensor

@@ -10,7 +10,7 @@ import numpy as np
 
 from sprung.model.chunks import WORKERS, share
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING, ComplexArray
-from sprung.model.diagnosis.response.terms import WIDER, Term, branch_of, is_waveform
+from sprung.model.diagnosis.response.terms import WIDER, Term, branches_of, is_waveform
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED
 from sprung.model.diagnosis.screening.places import places
 from sprung.model.diagnosis.screening.score import Candidate, Projector, ScalarResponse
@@ -68,14 +68,8 @@ class TrialElement:
 
     def _of_branch(self, term: Term) -> ComplexArray:
         """Force of a branch over the compared bins, (F,)."""
-        branch = branch_of(term, 0, float(self.element.damping))
-        assert branch is not None
-        omega = self.projector.grid.omega[self.projector.grid.band]
-        factor = branch.impedance(omega)
-        # series impedances vanish at zero frequency, so the rate carries them and ends that do not meet do no harm
-        per_rate = np.zeros_like(factor)
-        per_rate[1:] = factor[1:] / (1j * omega[1:])
-        return np.asarray(per_rate * self._rate_spectrum)
+        (branch,) = branches_of(term, self.projector.problem.system, self.projector.fit.forward.plant.structure)
+        return np.asarray(branch.per_rate(self.projector.grid.omega[self.projector.grid.band]) * self._rate_spectrum)
 
     @cached_property
     def _rate_spectrum(self) -> ComplexArray:

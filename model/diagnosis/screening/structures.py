@@ -8,12 +8,13 @@ system and projected once; then every place is scored in closed form.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
 from sprung.model.diagnosis.record.spectra import ComplexArray
-from sprung.model.diagnosis.response.terms import Term, supports
+from sprung.model.diagnosis.response.terms import Term, branches_of, supports
 from sprung.model.diagnosis.rules import ScreeningRules
 from sprung.model.diagnosis.screening.families import STRUCTURE
 from sprung.model.diagnosis.screening.score import Candidate, Projector
@@ -24,6 +25,7 @@ from sprung.model.system import System
 
 _PAIRS = tuple(combinations_with_replacement(range(3), 2))  # of 1, x, y
 _PLACES = {"x": 9, "y": 5}  # along an axis that turns
+_FAINT = 1e-3  # a share in which every law is linear
 _SEEN = 1e-6  # of a column's square, left by the projection
 
 
@@ -39,11 +41,29 @@ def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterato
         elif law.where == "body":
             for name in system.bodies:
                 yield _suspended(projector, law, name)
+        elif law.branches is not None:
+            yield from _of_all_springs(projector, law)
         else:
             for name in system.elements:
                 for axis in law.variants:
                     if turns(system, name, axis):
                         yield from _moved(projector, law, name, axis)
+
+
+def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[Candidate, int]]:
+    """What every spring has together."""
+    system, grid, structure = projector.problem.system, projector.grid, projector.fit.forward.plant.structure
+    springs = [name for e, name in enumerate(system.elements) if structure.stiffness[e] > 0]
+    term = Term(law, "|".join(springs), (_FAINT, *law.absent[1:]))
+    rates = grid.compared_spectra(projector.fit.element_motion[1].T)
+    spectrum = np.zeros(projector.of_force.shape[:2], dtype=complex)
+    for branch in branches_of(term, system, structure):
+        force = branch.per_rate(grid.omega[grid.band]) * rates[branch.element]
+        spectrum += projector.of_force[:, :, branch.element] * force[:, None]
+    score, amount = projector.score(projector.pack(spectrum))
+    if springs and amount > 0:
+        amount = min(_FAINT * amount, law.parameters[0].high)
+        yield Candidate(replace(term, parameters=(amount, *law.absent[1:]), scales=(amount, 0.1)), score, STRUCTURE), 1
 
 
 def unconnected(system: System) -> Iterator[tuple[str, str]]:

@@ -11,7 +11,7 @@ from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.fit.smoothing import opened
 from sprung.model.diagnosis.response.point import Point, advance, fixed
-from sprung.model.diagnosis.response.terms import Term, is_waveform
+from sprung.model.diagnosis.response.terms import Term, branches_of, is_waveform
 from sprung.model.diagnosis.screening.score import Candidate
 from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
 from sprung.model.laws.base import FittedElement, Restart
@@ -43,8 +43,8 @@ def start_of(base: Fit, candidate: Candidate) -> Point:
     if isinstance(law, (BodyLaw, StructureLaw)) and law.adds_motion:  # a degree of freedom, last in q and in q'
         n = (len(state) - len(base.forward.plant.structure.branches)) // 2
         state = np.concatenate([state[:n], [0.0], state[n : 2 * n], [0.0], state[2 * n :]])
-    if isinstance(candidate.term.law, ElementLaw) and not is_waveform(candidate.term):  # the force of one more branch
-        state = np.append(state, 0.0)
+    more = branches_of(candidate.term, base.forward.system, base.forward.plant.structure)
+    state = np.pad(state, (0, len(more)))  # their forces
     near = point.warm_start
     if is_waveform(candidate.term):
         near = (*near, base.force_along(candidate.term))

@@ -8,12 +8,14 @@ import pytest
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.report.report import Report
+from sprung.model.laws.channel import delayed
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
 
 
 def _of_ordinary_instruments(record: MadeRecord) -> MadeRecord:
-    """car_a 1.2 % too high, bogie_a 1 % too low, car_b off by 0.012 m/s^2."""
+    """car_a 1.2 % too high, bogie_a 1 % too low, car_b off by 0.012 m/s^2, bogie_b 0.4 ms late."""
+    record.values[:, 5] = delayed(record.values[:, 5], 4e-4, 100)
     record.values[:, 2] *= 1.012
     record.values[:, 4] *= 0.99
     record.values[:, 3] += 0.012
@@ -31,6 +33,8 @@ def test_a_rig_with_ordinary_instruments_is_consistent() -> None:
     for key, truth in {("car_a", "sensor_gain"): 1.012, ("bogie_a", "sensor_gain"): 0.99}.items():
         assert abs(told[key][0] - truth) < 3 * told[key][1] < 0.03
     assert told["car_b", "sensor_bias"][0] == pytest.approx(0.012, abs=1e-3)
+    late = told["bogie_b", "sensor_lag"][0] - told.get(("bogie_a", "sensor_lag"), (0.0, 0.0))[0]
+    assert late == pytest.approx(4e-4, abs=1e-4)
     assert "within calibration: " in report.summary
 
 

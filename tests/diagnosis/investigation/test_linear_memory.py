@@ -10,6 +10,7 @@ import pytest
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
+from sprung.service.improved import left_out
 from tests.diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
 from tests.named_laws import element_law
 
@@ -17,13 +18,18 @@ SIZE, ORDER = 6.0e4, 0.4
 K, C = STIFFNESS["secondary"], DAMPING["secondary"]
 
 
-def ride(of: Callable[[np.ndarray], np.ndarray], seconds: float = 30.0, seed: int = 3) -> MadeRecord:
-    """Steady running on a road of random phases, 0.5 to 18 Hz; of: dynamic stiffness of the secondary element at s."""
+def ride(
+    of: Callable[[np.ndarray], np.ndarray],
+    seconds: float = 30.0,
+    seed: int = 3,
+    below: Callable[[np.ndarray], np.ndarray] = lambda s: STIFFNESS["primary"] + s * DAMPING["primary"],
+) -> MadeRecord:
+    """Steady running on a road of random phases, 0.5 to 18 Hz; dynamic stiffness of secondary and primary at s."""
     rng = np.random.default_rng(seed)
     f = np.linspace(0.5, 18, 160)
     s = 2j * np.pi * f
     w = 6e-4 / f * np.exp(1j * rng.uniform(0, 2 * np.pi, len(f)))
-    upper, lower = of(s), STIFFNESS["primary"] + s * DAMPING["primary"]
+    upper, lower = of(s), below(s)
     system = np.array([[8000 * s**2 + upper, -upper], [-upper, 1300 * s**2 + upper + lower]])
     car, bogie = np.linalg.solve(system.transpose(2, 0, 1), np.stack([0 * f, lower * w], axis=1)[..., None])[..., 0].T
     wave = np.exp(2j * np.pi * np.arange(int(seconds * 100))[:, None] / 100 * f)
@@ -68,3 +74,20 @@ def test_a_damper_that_gives_way_much_is_no_late_node() -> None:
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("secondary", "series_stiffness")
     assert finding.parameters[0].value == pytest.approx(1.5e6, rel=0.02)
+
+
+@pytest.mark.slow
+def test_springs_that_lose_the_same_at_every_frequency_are_named_together() -> None:
+    """Not by parts that imitate them one by one: a mass that hangs, springs in series."""
+    power = 0.06  # of the frequency: the loss factor is tan(pi power / 2) at all of them
+
+    def spring(stiffness: float) -> Callable[[np.ndarray], np.ndarray]:
+        return lambda s: stiffness * (s / (2 * np.pi)) ** power
+
+    report = diagnose(quarter_car(), ride(spring(K), seed=4, below=spring(STIFFNESS["primary"])), Options())
+    assert report.verdict == "missing_physics"
+    (finding,) = report.findings
+    assert (finding.location, finding.effect) == ("primary|secondary", "structural_damping")
+    loss = finding.parameters[0]
+    assert loss.value == pytest.approx(np.tan(np.pi * power / 2), rel=0.05)
+    assert left_out(report) == ["structural damping at primary and secondary"]
