@@ -46,7 +46,7 @@ def test_material_damping_is_a_loss_factor_over_two_decades(loss: float, power: 
     assert isinstance(law, StructureLaw) and law.branches is not None
     s = 2j * np.pi * np.geomspace(0.5, 25, 60)
     parts = law.branches((loss, power), SpringDamper(3e5, 100.0))
-    answer = 3e5 + sum(part.stiffness * s * part.time / (1 + s * part.time) for part in parts)
+    answer = 3e5 + np.sum([part.stiffness * s * part.time / (1 + s * part.time) for part in parts], axis=0)
     found = answer.imag / answer.real
     assert found[np.argmin(np.abs(np.abs(s) - 2 * np.pi))] == pytest.approx(loss, rel=0.03)
     if loss < 0.05 and not power:
