@@ -170,10 +170,6 @@ class Speed(Address):
     value: float | None = Field(default=None, gt=0)  # m/s
 
 
-def _as_speed(raw: Any) -> Any:
-    return {"value": raw} if isinstance(raw, (int, float)) and not isinstance(raw, bool) else raw
-
-
 class FollowedSignal(Address):
     """A measured signal that moves and weighs nothing: a valve's voltage, a temperature.  `unit` is only its name."""
 
@@ -186,7 +182,7 @@ class SystemFile(Strict):
     window: int = Field(ge=8)  # samples, the paper's tau
     hop: int | None = Field(default=None, ge=1)  # samples between window starts; default half a window
     time: TimeKey = TimeKey()
-    speed: Annotated[Speed | None, BeforeValidator(_as_speed, json_schema_input_type=float | Speed | None)] = None
+    speed: Annotated[Speed | None, BeforeValidator(_as_value, json_schema_input_type=float | Speed | None)] = None
     temperature: Address | None = Field(default=None, description="of the air, or of the bogie: degC, K or degF")
     yaw_rate: Address | None = Field(default=None, description="of the car or a bogie, rad/s: curves")
     lateral_acceleration: Address | None = Field(default=None, description="of the car or a bogie: curves")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from sprung.model.address import TimeKey
+from sprung.model.laws.placed import did_you_mean
 from sprung.model.schema import Body, Element, Input, Parts, Sensor, Speed, SystemFile, SystemFileError
 
 _ENTRIES: dict[str, TypeAdapter[Any]] = {
@@ -151,17 +151,16 @@ def _words(detail: ErrorDetails, keys: list[str]) -> str:
         case "missing":
             return "this key is missing"
         case "extra_forbidden":
-            return f"unknown key{_nearest(keys[-1], _all_keys())}"
+            return f"unknown key{did_you_mean(keys[-1], _all_keys())}"
         case "union_tag_not_found":
             return "kind: this key is missing"
         case "union_tag_invalid":
             known = str(limits["expected_tags"]).replace("'", "").split(", ")
-            return (
-                f"kind {limits['tag']!r} is unknown here; known are {', '.join(known)}{_nearest(limits['tag'], known)}"
-            )
+            near = did_you_mean(limits["tag"], known)
+            return f"kind {limits['tag']!r} is unknown here; known are {', '.join(known)}{near}"
         case "literal_error":
             known = str(limits["expected"]).replace("'", "").replace(" or ", ", ").split(", ")
-            return f"one of {', '.join(known)} is expected{value}{_nearest(str(given), known)}"
+            return f"one of {', '.join(known)} is expected{value}{did_you_mean(str(given), known)}"
         case "greater_than" | "greater_than_equal" | "less_than" | "less_than_equal" as kind:
             words = kind.replace("_equal", "_or_equal_to").replace("than_or", "than or").replace("_", " ")
             return f"must be {words} {next(iter(limits.values())):g}{value}"
@@ -191,11 +190,6 @@ def _words(detail: ErrorDetails, keys: list[str]) -> str:
 
 def _plain(message: str) -> str:
     return message.removeprefix("Value error, ")
-
-
-def _nearest(name: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _all_keys() -> list[str]:

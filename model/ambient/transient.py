@@ -24,7 +24,7 @@ from sprung.model.ambient.excitation import Prior
 from sprung.model.ambient.fit import Fitted, fit
 from sprung.model.ambient.response import Response, Responses
 from sprung.model.ambient.sensing import Sensing, sensing
-from sprung.model.ambient.whittle import Evaluation
+from sprung.model.ambient.whittle import Evaluation, adjoint
 from sprung.model.identifier import PRIOR_STD
 from sprung.model.mechanics import Mode
 from sprung.model.signals import FloatArray
@@ -101,18 +101,18 @@ class TransientLikelihood:
         D, moved = [], []
         for p in range(self.P):
             dA = white @ (at.response.per_force * at.response.factor[:, p][:, None, :]) @ at.response.motion
-            half = (dA * level) @ _adjoint(WA)
-            D.append(half + _adjoint(half))
+            half = (dA * level) @ adjoint(WA)
+            D.append(half + adjoint(half))
             moved.append(np.einsum("frn,fn->fr", dA, ends))
         D += [level[i] * WA[:, :, i, None] * WA[:, None, :, i].conj() for i in range(self.n)]
-        D.append(noise * white @ _adjoint(white))
+        D.append(noise * white @ adjoint(white))
         moved += [np.zeros_like(e)] * (self.n + 1)
         change, M = np.stack(D), np.stack([_real(one) for one in moved], axis=1)
         M -= at.basis @ (at.basis.T @ M)
         slope = np.einsum("xfrr->x", change).real - np.einsum("fr,xfrs,fs->x", e.conj(), change, e).real
         flat = change.reshape(len(change), -1)
         information = (flat @ flat.conj().T).real + 2 * M.T @ M
-        S = (A * level) @ _adjoint(A) + noise * np.eye(A.shape[1])
+        S = (A * level) @ adjoint(A) + noise * np.eye(A.shape[1])
         whitened = e[:, :, None] * e[:, None, :].conj()
         return Evaluation(at.cost, slope - 2 * _real(e) @ M, information, whitened, S, S)
 
@@ -124,7 +124,7 @@ class TransientLikelihood:
         """The whitened bins at a point, what the window's ends explain of them projected out."""
         response = self.responses.at(x[: self.P], self.omega)
         A, jw = response.signals, (1j * self.omega)[:, None, None]
-        S = (A * np.exp(x[self.P : -1])) @ _adjoint(A) + np.exp(x[-1]) * np.eye(A.shape[1])
+        S = (A * np.exp(x[self.P : -1])) @ adjoint(A) + np.exp(x[-1]) * np.eye(A.shape[1])
         factor = np.linalg.cholesky(S)
         white = np.linalg.inv(factor)
         columns = white @ np.concatenate([A, jw * A, self.leaks], axis=2)
@@ -135,10 +135,6 @@ class TransientLikelihood:
         residual = bins - (columns @ ends[:, None])[:, :, 0]
         log_det = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2).real).sum()
         return _Whitened(response, white, basis, ends, residual, float(log_det + np.sum(np.abs(residual) ** 2)))
-
-
-def _adjoint(matrix: np.ndarray) -> np.ndarray:
-    return np.asarray(matrix.conj().swapaxes(-1, -2))
 
 
 def _real(series: np.ndarray) -> FloatArray:
@@ -243,7 +239,7 @@ def _judged(fitted: Fitted, frequency: FloatArray, whole: FloatArray, sensed: Se
     parts = np.array_split(np.arange(len(frequency)), min(PARTS, max(1, len(frequency) // 4)))
     deviation = [np.abs(white[part].mean(axis=0) - 1) * np.sqrt(len(part)) for part in parts]
     factor, back = np.linalg.cholesky(at.covariance), np.linalg.pinv(sensed.rows)
-    rest = back @ factor @ at.whitened @ _adjoint(back @ factor)
+    rest = back @ factor @ at.whitened @ adjoint(back @ factor)
     noise = np.exp(fitted.x[-1] / 2) * sensed.noise / np.sqrt(np.maximum(whole.mean(axis=0), 1e-300))
     return TransientFit(
         fitted=fitted,

@@ -52,7 +52,7 @@ class Whittle:
         """The negative log-likelihood alone."""
         response = self.responses.at(x[: self.P], self.omega)
         sources = self.excitation.sources(x[self.P :])
-        S = self.noise + _centre(response.signals @ sources.matrix @ _adjoint(response.signals))
+        S = self.noise + _centre(response.signals @ sources.matrix @ adjoint(response.signals))
         return self._cost(*self._whiten(S))
 
     def evaluate(self, x: FloatArray) -> Evaluation:
@@ -60,16 +60,16 @@ class Whittle:
         response = self.responses.at(x[: self.P], self.omega)
         sources = self.excitation.sources(x[self.P :])
         A = response.signals
-        XA = sources.matrix @ _adjoint(A)
+        XA = sources.matrix @ adjoint(A)
         S = self.noise + _centre(A @ XA)
         inverse, log_det, whitened = self._whiten(S)
         F, size, both = len(S), S.shape[1] ** 2, np.concatenate([inverse, inverse])
-        column, row = both @ response.per_force, response.motion @ XA @ _adjoint(both)
+        column, row = both @ response.per_force, response.motion @ XA @ adjoint(both)
         place = (column.swapaxes(1, 2)[:, :, :, None] * row[:, :, None, :]).reshape(2 * F, -1, size)
         by_unknown = (response.factor @ place).reshape(2 * F, -1, *S.shape[1:])
-        by_unknown = by_unknown + _adjoint(by_unknown)
+        by_unknown = by_unknown + adjoint(by_unknown)
         white = (both @ A)[:, None]
-        by_source = white @ sources.slopes @ _adjoint(white)
+        by_source = white @ sources.slopes @ adjoint(white)
         W = _centre(np.concatenate([by_unknown, by_source], axis=1)).reshape(F, -1, size)
         local = W.view(np.float64)  # (F, P + L, 2 R^2): real products are traces
         left = np.eye(S.shape[1]) - whitened
@@ -95,14 +95,15 @@ class Whittle:
         factor = np.linalg.cholesky(S)
         inverse = np.linalg.inv(factor)
         log_det = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2).real).sum(axis=1)
-        return inverse, log_det, inverse @ self.seen @ _adjoint(inverse)
+        return inverse, log_det, inverse @ self.seen @ adjoint(inverse)
 
     def _cost(self, inverse: np.ndarray, log_det: FloatArray, whitened: np.ndarray) -> float:
         trace = np.einsum("fii->f", whitened).real
         return float(self.spectra.weight @ (log_det + trace))
 
 
-def _adjoint(matrix: np.ndarray) -> np.ndarray:
+def adjoint(matrix: np.ndarray) -> np.ndarray:
+    """Conjugate transpose of the last two axes."""
     return np.asarray(matrix.conj().swapaxes(-1, -2))
 
 

@@ -91,7 +91,7 @@ def _placed(
         law, wanted = law.wider, given
     for name in sorted(given - wanted):
         raise ValueError(
-            f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{_near(name, law.names)}"
+            f"{name} is no parameter of it; it has {', '.join(law.names) or 'none'}{did_you_mean(name, law.names)}"
         )
     for name in law.names:
         if name not in numbers:
@@ -140,7 +140,7 @@ def _law(effect: str, setting: LawSetting, kinds: tuple[type, ...], catalogue: S
     raise ValueError(
         "this law does not belong here"
         if elsewhere
-        else f"no such law; known here are {', '.join(known)}{_near(effect, known)}"
+        else f"no such law; known here are {', '.join(known)}{did_you_mean(effect, known)}"
     )
 
 
@@ -186,6 +186,7 @@ def revalued(laws: Sequence[PlacedLaw], values: Mapping[str, float]) -> tuple[tu
     return changed, {name: value for name, value in values.items() if name not in known}
 
 
-def _near(name: str, known: Sequence[str]) -> str:
+def did_you_mean(name: str, known: Sequence[str]) -> str:
+    """The known name next to a wrong one, as the end of a message; empty where none is near."""
     near = difflib.get_close_matches(name, known, n=1)
     return f"; did you mean {near[0]!r}?" if near else ""

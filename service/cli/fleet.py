@@ -15,6 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sprung.service.cli.options import time_of
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
@@ -33,7 +34,7 @@ from sprung.service.pipeline import Pipeline
 from sprung.service.settings import settings_with
 from sprung.service.store import open_store
 from sprung.service.store.partitions import prepare
-from sprung.service.times import NANOSECONDS, from_iso, now_ns
+from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.tokens import Tokens
 
 FOREVER = 2**62
@@ -50,7 +51,7 @@ def run_backfill(
 ) -> int:
     """Back-fill; 1 when a file could not be read whole."""
     plan = BackfillPlan(
-        settings_with(options), _place(place), _time("--since", since, 0), _time("--until", until, FOREVER)
+        settings_with(options), _place(place), time_of("--since", since, 0), time_of("--until", until, FOREVER)
     )
     if plan.since >= plan.until:
         raise UserError(f"--until {until}: is not after --since {since}")
@@ -201,10 +202,3 @@ def _on(text: str) -> str:
     if text not in ("here", "ray", "auto"):
         raise UserError(f"--on {text}: known are here, ray, auto")
     return text
-
-
-def _time(option: str, text: str | None, default: int) -> int:
-    try:
-        return default if text is None else from_iso(text)
-    except (ValueError, OverflowError):
-        raise UserError(f"{option} {text}: give an RFC 3339 time, as in 2026-09-21T14:13:20Z") from None

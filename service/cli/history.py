@@ -6,13 +6,13 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from sprung.service.cli.options import time_of
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
 from sprung.service.settings import settings_with
 from sprung.service.store import fleet, history, open_store
 from sprung.service.store.archive import open_archive
-from sprung.service.times import from_iso
 
 UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 FOREVER = 2**63 - 1
@@ -41,7 +41,7 @@ def run(
     for name in parameters:
         if name not in known:
             raise UserError(f"--parameter {name}: {engine.system.name} has {', '.join(known[:3])}, ...")
-    begin, end = _time("--since", since, 0), _time("--until", until, FOREVER)
+    begin, end = time_of("--since", since, 0), time_of("--until", until, FOREVER)
     with ExitStack() as stack:
         opened = open_store(settings.store_url)
         stack.callback(opened.close)
@@ -69,13 +69,6 @@ def run(
         out.write_bytes(body)
         print(f"{out}: {len(found.time)} points of {len(parameters or known)} parameters", file=sys.stderr)
     return 0
-
-
-def _time(option: str, text: str | None, default: int) -> int:
-    try:
-        return default if text is None else from_iso(text)
-    except (ValueError, OverflowError):
-        raise UserError(f"{option} {text}: give an RFC 3339 time, as in 2026-09-21T14:13:20Z") from None
 
 
 def _seconds(text: str) -> float:

@@ -7,6 +7,9 @@ from typing import Annotated
 
 import typer
 
+from sprung.service.errors import UserError
+from sprung.service.times import from_iso
+
 System = Annotated[
     Path | None, typer.Option("--system", metavar="FILE", help="System file; default: the Manchester vehicle.")
 ]
@@ -25,3 +28,11 @@ StoreUrl = Annotated[
     typer.Option("--store", metavar="URL", help="SQLAlchemy URL or SQLite file of the store; also SPRUNG_STORE."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON lines on stdout, for machines.")]
+
+
+def time_of(option: str, text: str | None, default: int) -> int:
+    """An option's time in nanoseconds.  Errors: `UserError`."""
+    try:
+        return default if text is None else from_iso(text)
+    except (ValueError, OverflowError):
+        raise UserError(f"{option} {text}: give an RFC 3339 time, as in 2026-09-21T14:13:20Z") from None

@@ -13,7 +13,6 @@ from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.report.report import (
     Finding,
-    FitFigures,
     LawParameter,
     RecordingFacts,
     Report,
@@ -21,6 +20,7 @@ from sprung.model.diagnosis.report.report import (
     TrackPoint,
     Unexplained,
 )
+from sprung.model.diagnosis.report.values import figures
 from sprung.model.diagnosis.rules import AmbientRules
 from sprung.model.laws.basis import UNKNOWN
 from sprung.model.laws.sensor_faults import SENSOR_STUCK
@@ -71,11 +71,11 @@ def compose_unforced(
         ),
         verdict=said.verdict,
         baseline=values,
-        baseline_validation=_figures(names, errors.before),
+        baseline_validation=figures(names, errors.before),
         findings=tuple(findings),
         augmented=values,
-        augmented_validation=_figures(names, errors.after),
-        noise_floor=_figures(names, errors.bounded(options.rules.verdict)),
+        augmented_validation=figures(names, errors.after),
+        noise_floor=figures(names, errors.bounded(options.rules.verdict)),
         localization={},
         explained=said.explained,
         unexplained=Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), where),
@@ -180,10 +180,6 @@ def _advice(
     if loose:
         words.append(f"undecided without measured inputs: {', '.join(loose)}; longer windows tell more")
     return words
-
-
-def _figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
-    return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
 
 
 def _arrays(track: tuple[TrackPoint, ...]) -> dict[str, np.ndarray]:

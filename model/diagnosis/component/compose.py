@@ -24,13 +24,13 @@ from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
-    FitFigures,
     IdentifiedLaw,
     RecordingFacts,
     Report,
     ReportedParameter,
     Unexplained,
 )
+from sprung.model.diagnosis.report.values import figures
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
@@ -53,11 +53,11 @@ def compose_components(
         ),
         verdict=said.verdict,
         baseline=tuple(p for j in judged for p in _parameters(system, j.record.element, j.base, covariance(j.base))),
-        baseline_validation=_figures(names, errors.before),
+        baseline_validation=figures(names, errors.before),
         findings=tuple(findings),
         augmented=tuple(p for j in judged for p in _parameters(system, j.record.element, j.final, j.covariance)),
-        augmented_validation=_figures(names, errors.after),
-        noise_floor=_figures(names, errors.bounded(options.rules.verdict)),
+        augmented_validation=figures(names, errors.after),
+        noise_floor=figures(names, errors.bounded(options.rules.verdict)),
         localization={
             j.record.element: level_gain(j.base.error, j.final.error, effective_count(j.final.residual)) for j in judged
         },
@@ -121,10 +121,6 @@ def _parameters(
             values.append(ReportedParameter(parameter.name, value, deviation, parameter.nominal, parameter.unit))
     values.append(ReportedParameter(f"{element}.preload", fit.preload, sigma["preload"], 0.0, "N"))
     return values
-
-
-def _figures(names: list[str], per_sensor: FloatArray) -> FitFigures:
-    return FitFigures(float(np.sqrt(np.mean(per_sensor**2))), dict(zip(names, per_sensor.tolist(), strict=True)))
 
 
 def _candidates(one: Judged) -> list[CandidateRow]:

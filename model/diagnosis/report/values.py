@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
@@ -14,7 +16,7 @@ from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
 
-def figures(names: tuple[str, ...], per_sensor: FloatArray) -> FitFigures:
+def figures(names: Sequence[str], per_sensor: FloatArray) -> FitFigures:
     return FitFigures(
         nrmse=float(np.sqrt(np.mean(np.asarray(per_sensor) ** 2))),
         per_sensor={name: float(value) for name, value in zip(names, per_sensor, strict=True)},
