@@ -94,7 +94,9 @@ def _pass(
         fed = estimate is not None and followed.last == window.start and followed is not before
         if fed and followed.state.used:  # before, there is nothing but the prior: no measurement, not drawn as one
             posterior = Posterior(*tracker.posterior(followed.state))
-        loads = body_loads(engine, followed.state) if fed else {}
+        # At a stop the load is that of the ride before, and any other is possible.
+        known = fed and tracker.loads_as_of(followed.state) is None
+        loads = body_loads(engine, followed.state) if known else {}
         outcome, reason = outcome_of(window, estimate)
         stood = counted(outcome, model_id) if posterior is not None else {}
         ran.append(Ran(window.start, running(system, window, loads) | stood))

@@ -87,6 +87,7 @@ class VehicleView:
     sensors: tuple[MeasurementFault, ...] = ()  # what was found wrong with measurements
     load: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # kg beside the empty mass, std, by body
     built: tuple[BuiltOtherwise, ...] = ()  # how bodies are built otherwise than the system file says
+    load_as_of_ns: int | None = None  # the last window that told of the loads, where any other is possible by now
 
     @property
     def active(self) -> tuple[Alarm, ...]:
@@ -151,6 +152,7 @@ class VehicleView:
                 for f in self.sensors
             ],
             "load": {body: list(pair) for body, pair in self.load.items()},
+            "load_as_of": optional_iso(self.load_as_of_ns) if self.load else None,
             "built": [asdict(one) for one in self.built],
         }
 
@@ -188,6 +190,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         engine.tracker.sensors(state),
         body_loads(engine, state),
         engine.tracker.built(state),
+        engine.tracker.loads_as_of(state),
     )
 
 

@@ -34,6 +34,7 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
             outputs=refined.outputs[b] if states and refined.outputs.shape[1] else None,
             informative=bool(informative[b]),
             deviating=deviating[b],
+            noise=float(refined.noise[b]),
         )
         for b in range(len(refined.log_ratio))
     ]

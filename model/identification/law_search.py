@@ -20,7 +20,7 @@ from sprung.model.identification.law_opening import opened
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import PRIOR_STD
-from sprung.model.identification.noise_share import noise_share
+from sprung.model.identification.noise_share import mean_share, noise_share
 from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WEAK_STD, Refined
 from sprung.model.signals import FloatArray
 
@@ -213,11 +213,12 @@ class LawSearch:
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
         P = len(w.system.parameters)
-        weak = (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        share, weak = np.zeros(len(found)), (std[:, :P] > WEAK_STD).any(dim=1).nonzero().squeeze(1)
         if len(weak):
             chosen = data.take(weak)
             noise = noise_share(w.model, w.model.linearise(found[weak][:, w.linear], chosen), chosen)
             identifiable[weak, :P] &= noise[:, :P] < NOISE_SHARE
+            share[weak.numpy()] = mean_share(noise[:, :P])
         signals = len(w.model.compression.matrix(data.present))
         taken = self.states.shape[2] + len(w.memories) + identifiable.sum(dim=1)
         freedom = 2 * w.model.bins * signals - taken
@@ -246,4 +247,5 @@ class LawSearch:
             cross=torch.where(identifiable[:, :, None], self.cross, 0.0).numpy(),
             information=(self.information / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(self.score / chi_square.clamp_min(1)[:, None]).numpy(),
+            noise=share,
         )

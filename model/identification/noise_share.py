@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from sprung.model.identification.gauss_newton import Linearisation, Transfer, WindowBatch
 from sprung.model.identification.linearise import WindowModel
+from sprung.model.signals import FloatArray
 from sprung.model.simulate.linear import ElementValues
 from sprung.model.simulate.loading import by_inertia
 
@@ -33,6 +35,11 @@ def noise_share(model: WindowModel, at: Linearisation, data: WindowBatch) -> Ten
         noise = torch.cat([noise, of_inertia[:, : shown.shape[1] - noise.shape[1]]], dim=1)
     share: Tensor = noise / shown.clamp_min(1e-300)
     return share
+
+
+def mean_share(share: Tensor) -> FloatArray:
+    """Of the sensitivities to parameters, (B, P), as one number of each window, (B,)."""
+    return np.asarray(share.clamp(max=1.0).mean(dim=1).numpy(), dtype=np.float64)
 
 
 def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data: WindowBatch) -> tuple[Tensor, Tensor]:

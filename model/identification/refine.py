@@ -29,7 +29,7 @@ from sprung.model.chunks import alike, chunks, share
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import Chord, Linearisation, WindowBatch
 from sprung.model.identification.linearise import WindowModel
-from sprung.model.identification.noise_share import noise_share
+from sprung.model.identification.noise_share import mean_share, noise_share
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
@@ -69,6 +69,7 @@ class Refined:
     cross: FloatArray  # change of the log-ratios per deviation, shape (B, P, H); H = 0 unless asked for
     information: FloatArray  # on the deviations, shape (B, H, H)
     score: FloatArray  # slope of the log-likelihood along them, shape (B, H)
+    noise: FloatArray  # share of noise in what looks like information on parameters; 0: negligible, shape (B,)
 
     def take(self, at: IntArray) -> Refined:
         """The windows `at` of the batch."""
@@ -236,11 +237,12 @@ class Refiner:
         x, x0, covariance = progress.x[rows], progress.x0[rows], progress.covariance[rows]
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
-        weak = (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
+        noise, weak = np.zeros(len(x)), (std > WEAK_STD).any(dim=1).nonzero().squeeze(1)
         if len(weak):
             chosen = data.take(weak)
             share = noise_share(self.model, self.model.linearise(x[weak], chosen), chosen)
             P = len(self.system.parameters)
+            noise[weak.numpy()] = mean_share(share[:, :P])
             vague = (std[weak, P:] > WEAK_STD).any(dim=1) & (share[:, :P].mean(dim=1) > VAGUE_SHARE)
             identifiable[weak] &= (share < NOISE_SHARE) & ~(vague[:, None] & (std[weak] > WEAK_STD))
         signals = len(self.model.compression.matrix(data.present))
@@ -270,6 +272,7 @@ class Refiner:
             cross=torch.where(identifiable[:, :, None], progress.cross[rows], 0.0).numpy(),
             information=(progress.information[rows] / chi_square.clamp_min(1)[:, None, None]).numpy(),
             score=(progress.score[rows] / chi_square.clamp_min(1)[:, None]).numpy(),
+            noise=noise,
         )
 
 

@@ -37,6 +37,10 @@ VAGUE = 0.2  # standard deviation of a log-ratio that teaches nothing of a param
 SKEW = 0.03  # standard deviation of a log-ratio below which it is as good as linear: it errs by 0.1 %
 FURTHEST = 1.0  # log-ratio from the belief up to which a window is taken as linear in the values themselves
 STILL = 5.0  # log-likelihood ratio of a change above which a parameter teaches no slopes
+COMMON = 0.45  # deviations by which windows err alike that noise of the inputs makes up for the most part; simulated,
+NOISY = 0.08  # 5 to 24 m/s: half of that at this share of noise; 0.07 at a share of 0.035, nothing seen below 0.02
+MANY = 500.0  # such windows whose mean is as uncertain as what they have in common: a ride of some minutes
+STEADY = 0.5  # weight of a window below which its scatter is that of noise, and no sign of a law that the model lacks
 KNOWN = 0.5  # a posterior narrower than this share of the prior counts as identified
 
 
@@ -48,6 +52,7 @@ class _Window:
     time_ns: int
     centre: int  # ns
     share: float  # of a window that is new
+    weight: float  # what the window counts as, of a window without noise in its inputs
     value: FloatArray  # log-ratios (P,)
     covariance: FloatArray  # (P, P)
     cross: FloatArray  # sensitivities to deviations (P, H)
@@ -96,7 +101,10 @@ class Fusion:
             belief = kalman.predict(belief, elapsed, settings.process, settings.prior, model.walk, self.limit)
         found = estimate.deviating if model.size else None
         belief, cargo = self._loaded(state, belief, elapsed, found, conditions)
-        belief, calibration, found, jump, agrees = self._weighed(state.calibration, belief, found, time_ns, share)
+        weight = weight_of(estimate.noise)
+        belief, calibration, found, jump, agrees = self._weighed(
+            state.calibration, belief, found, time_ns, (share, weight)
+        )
         if estimate.faults and not agrees:  # corrected by what is not believed yet: its values are of neither
             undecided = replace(state, last=time_ns, rejected=state.rejected + 1)
             return replace(undecided, belief=belief, calibration=calibration), None
@@ -105,7 +113,7 @@ class Fusion:
             state = replace(state, changes=change_test.restarted(state.changes, jump.since))
         weighed = found is not None and found.whole
         values = self._at_belief(estimate, found, calibration, belief, mask)
-        window = _Window(mask, time_ns, centre, share, *values, weighed)
+        window = _Window(mask, time_ns, centre, share, weight, *values, weighed)
         window = _linear(window, belief)
         filtered = self._filtered(state, belief, calibration, window)
         weather, tested = self._tested(state, calibration, conditions, window, filtered)
@@ -130,22 +138,27 @@ class Fusion:
         belief: kalman.Belief,
         found: Deviating | None,
         time_ns: int,
-        share: float,
+        counts: tuple[float, float],
     ) -> tuple[kalman.Belief, dev.DeviationRecord, Deviating | None, Jump | None, bool]:
-        """Deviations after a window; it as they take it, a jump, and whether it agrees with what is believed."""
-        model = self.model
+        """Deviations after a window; it as they take it, a jump, and whether it agrees with what is believed.
+
+        counts: share of the window that is new, and its weight.
+        """
+        model, (share, weight) = self.model, counts
         if found is None:
             return belief, calibration, None, None, True
         if not found.whole:
             moved = self._moved(calibration.cross, belief)
             doubt = 1 + float((moved**4 / found.given.diagonal() ** 2).max()) / HARMLESS**4
-            belief = dev.loaded(belief, model, found, share / doubt)  # its load is that of gains and delays as stated
+            belief = dev.loaded(
+                belief, model, found, share * weight / doubt
+            )  # its load is that of gains and delays as stated
             gains = np.where(model.along, found.cross, calibration.cross)
             found = replace(found, cross=gains, point=np.where(model.along, found.point, 0.0))
             return belief, calibration, found, None, True
         apart = (time_ns - int(calibration.recent[-1])) * 1e-9
-        weight = min(1.0, apart / self.settings.window)
-        calibration, belief, jump, agrees = dev.weigh(calibration, model, belief, found, weight, time_ns)
+        part = min(1.0, apart / self.settings.window) * weight
+        calibration, belief, jump, agrees = dev.weigh(calibration, model, belief, found, part, time_ns)
         return belief, calibration, found, jump, agrees
 
     def _filtered(
@@ -157,12 +170,13 @@ class Fusion:
         open_ = self._open(calibration, belief, window.cross)
         # What is not known of gains and delays moves windows unlike each other: that is no contradiction.
         told = variance + self._carried(belief, window.cross, ~self.model.own)
+        steady = mask & (window.weight > STEADY)
         measured = inflation.update(
-            state.inflation, value, told, mask, time=window.time_ns, window=nanoseconds(settings.window)
+            state.inflation, value, told, steady, time=window.time_ns, window=nanoseconds(settings.window)
         )
         wide = np.sqrt(measured.factor)
         covariance = window.covariance * np.outer(wide, wide)
-        fresh = (variance + open_) * measured.factor / window.share
+        fresh = (variance + open_) * measured.factor / (window.share * window.weight)
 
         known = belief.level_variance < (KNOWN * settings.prior) ** 2
         foreseen = dev.level_variance(belief, self.model, window.cross)
@@ -175,7 +189,7 @@ class Fusion:
                 belief = dev.unsure(belief, self.model)
         cross = window.cross if self.model.size else None
         belief, step = kalman.correct(
-            belief, value, covariance, mask, share=window.share, bound=settings.outlier, cross=cross,
+            belief, value, covariance, mask, share=window.share * window.weight, bound=settings.outlier, cross=cross,
             silent=None if window.weighed or cross is None else ~self.model.along,
         )  # fmt: skip
         return _Filtered(belief, measured, watch, fresh, plausible, step.bounded)
@@ -414,6 +428,16 @@ def _linear(window: _Window, belief: kalman.Belief) -> _Window:
         covariance=window.covariance * np.outer(scale, scale),
         cross=window.cross * scale[:, None],
     )
+
+
+def weight_of(noise: float) -> float:
+    """What a window counts as whose information on the parameters is noise to this share.
+
+    Noise of the inputs that looks like motion pulls springs, dampers and loads of all such windows the same way, which
+    their number does not average out.
+    """
+    alike = COMMON * noise**2 / (noise**2 + NOISY**2)
+    return 1 / (1 + MANY * alike**2)
 
 
 def proper(covariance: FloatArray) -> bool:

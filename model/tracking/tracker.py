@@ -305,6 +305,14 @@ class Tracker:
                 found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + self._doubt[1][h, h])))
         return found
 
+    def loads_as_of(self, state: TrackerState) -> int | None:
+        """Start of the last window that told of the loads, ns, where any other is possible by now: people board while a
+        vehicle stands.  None: what `loads` says holds."""
+        if state.last is None or state.time is None:
+            return None
+        idle = (state.time - state.last) * 1e-9 - self.settings.window
+        return state.last if idle > dev.STOPPED else None
+
 
 def _stuck(state: TrackerState, estimate: Estimate, centre: int) -> tuple[Stuck, ...]:
     return counted(state.stuck, [(f.channel, f.kind, f.value) for f in estimate.faults], centre)

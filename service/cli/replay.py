@@ -231,7 +231,10 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
         for one in found.get("built", [])
     ]
     loads = found.get("load") or {}
-    return lines + [f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal" for body, (mass, std) in loads.items()]
+    before = f", as of {found['load_as_of']}, before it stood" if found.get("load_as_of") else ""
+    return lines + [
+        f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal{before}" for body, (mass, std) in loads.items()
+    ]
 
 
 def incomplete_line(path: Path, fed: Fed) -> str | None:

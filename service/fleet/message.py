@@ -162,7 +162,7 @@ def _beside(values: FloatArray, coding: Coding) -> list[float]:
 def _estimates(found: Sequence[Estimate], coding: Coding) -> dict[str, Any]:
     level, covariance = np.stack([e.log_ratio for e in found]), np.stack([e.covariance for e in found])
     known = np.stack([e.identifiable for e in found])
-    scalars = np.array([[e.nrmse, e.chi_square] for e in found])
+    scalars = np.array([[e.nrmse, e.chi_square, e.noise] for e in found])
     sensors = np.stack([e.per_sensor for e in found])
     flags = [e.adequate + 2 * e.converged + 4 * e.informative + 8 * e.iterations for e in found]
     deviating = [(i, e.deviating) for i, e in enumerate(found) if e.deviating is not None]
@@ -190,6 +190,7 @@ def _read_estimates(data: dict[str, Any], coding: Coding) -> list[Estimate]:
         for name in ("scalars", "sensors")
     )
     flags = unpack_ints(data["flags"]).tolist()
+    noise = scalars[:, 2].tolist() if scalars.shape[1:] == (3,) else [0.0] * len(scalars)  # older senders: none
     if not len(level) == len(covariance) == len(known) == len(scalars) == len(sensors) == len(flags):
         raise UnreadableMessage("the message's columns differ in length")
     if covariance.shape[1:] != (level.shape[1],) * 2 or known.shape != level.shape:
@@ -213,6 +214,7 @@ def _read_estimates(data: dict[str, Any], coding: Coding) -> list[Estimate]:
             deviating=deviating.get(i),
             faults=faults.get(i, ()),
             informative=bool(flag & 4),
+            noise=noise[i],
         )
         for i, flag in enumerate(flags)
     ]

@@ -60,6 +60,16 @@ def test_windows_that_hardly_tell_anything_come_to_rest() -> None:
     assert refined.iterations.mean() < 3
 
 
+def test_windows_say_how_much_of_what_they_tell_is_noise_of_their_inputs() -> None:
+    system = load_system()
+    noise = []
+    for speed in (6.0, 40.0):
+        runs = simulate_runs(system, np.zeros((4, 24)), system.window, np.random.default_rng(4), speed=(speed, speed))
+        noise.append(Refiner(system).refine(runs.values, loads=True).noise)
+    assert noise[0].min() > 0.05
+    assert noise[1].max() == 0.0  # every parameter is told to a tenth: nothing to be held against noise
+
+
 def test_one_window_alone_is_the_window_in_a_batch(vehicle: tuple[System, FloatArray, Runs]) -> None:
     system, _, runs = vehicle
     refiner = Refiner(system)

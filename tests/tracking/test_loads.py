@@ -204,3 +204,15 @@ def test_windows_without_what_they_say_of_loads_are_not_moved_by_the_load_again(
     assert tracker.loads(state)["car"][0] == pytest.approx(load, abs=0.01)
     assert worst(tracker, state) < 4.0
     assert np.abs(tracker.posterior(state)[0]).max() < 0.02
+
+
+def test_after_a_stop_the_load_is_that_of_the_ride_before_until_a_window_tells_of_the_new_one() -> None:
+    rng, tracker = np.random.default_rng(8), follow()
+    state = ride(rng, tracker, tracker.initial_state(), 60, constant(0.1))
+    assert tracker.loads_as_of(state) is None
+    stood = ride(rng, tracker, state, 30, constant(0.3), first=60, informative=False)
+    assert tracker.loads_as_of(stood) == EPOCH + 59 * SECOND
+    assert tracker.loads(stood) == tracker.loads(state)
+    rides = ride(rng, tracker, stood, 2, constant(0.3), first=90)
+    assert tracker.loads_as_of(rides) is None
+    assert abs(tracker.loads(rides)["car"][0] - 0.3) < 0.05

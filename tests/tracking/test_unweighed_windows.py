@@ -27,6 +27,26 @@ def test_weak_windows_of_a_damper_do_not_make_it_seem_larger() -> None:
     assert np.mean(scores) < 1.2  # weighed as they state it, all three are 2 to 4 deviations too large
 
 
+def test_windows_of_a_slow_train_err_alike_and_are_not_averaged_away() -> None:
+    rng = np.random.default_rng(3)
+    parts = [Deviation("car", "load", 0.15, -1)]
+    tracker = Tracker([TrackedParameter("element.stiffness")], None, parts)
+    state, std, carried = tracker.initial_state(), 0.06, 0.04
+    for k in range(300):
+        error, load_error = rng.normal(
+            -0.45, 1.0, 2
+        )  # of its deviations: what noise in the inputs makes of each window
+        given, information = np.array([[std**2]]), np.array([[carried**-2.0]])
+        found = Deviating(np.zeros(1), given, np.zeros((1, 1)), information, np.array([load_error / carried]), 300.0)
+        window = estimate(np.array([error * std]), given, deviating=found, noise=0.15)
+        state = tracker.update(state, window, EPOCH + k * SECOND)
+    mean, deviation = tracker.posterior(state)
+    (load, load_deviation), *_ = tracker.loads(state).values()
+    assert state.used == 300
+    assert abs(mean[0]) < 2 * deviation[0] < 0.12  # counted in full, eight
+    assert abs(load) < 2 * load_deviation
+
+
 def test_a_window_that_was_not_weighed_does_not_speak_of_what_moves_it() -> None:
     """A window that tells much is moved less by a gain than one that tells little; their mean is that of neither."""
     rng = np.random.default_rng(2)

@@ -42,6 +42,7 @@ def estimate(rng: np.random.Generator, condition: float = 1e3, deviating: bool =
         3,
         deviating=found if deviating else None,
         faults=(MeasurementFault("car_1l", "frozen", 0.25, 0.0),),
+        noise=0.012,
     )
 
 
