@@ -85,7 +85,7 @@ def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> Mutan
         for path, honest in mutants(name, count, seed, Path(folder)):
             outcome.mutants += 1
             started = time.process_time()
-            _one(path, dbc, honest, outcome)
+            read_one(path, dbc, honest, outcome)
             outcome.slowest = max(outcome.slowest, time.process_time() - started)
             if keep is not None and sum(outcome.faults.values()) + outcome.silent > found:
                 keep.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,8 @@ def run(name: str, count: int, seed: int = 1, keep: Path | None = None) -> Mutan
     return outcome
 
 
-def _one(path: Path, dbc: Any, honest: bool, outcome: MutantOutcome) -> None:
+def read_one(path: Path, dbc: Any, honest: bool, outcome: MutantOutcome) -> None:
+    """Read one file as the product does and note in `outcome` what became of it; honest: its checksums are right."""
     previous = signal.signal(signal.SIGPROF, _hang)
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
     try:
