@@ -51,6 +51,7 @@ NEEDS: dict[tuple[str, str], Need] = {
     ("POST", "/jobs/{id}/cancel"): Need("operate", by_fleet=True),
     ("GET", "/reports/{id}"): Need("read", by_fleet=True),
     ("GET", "/reports/{id}/page"): Need("read", by_fleet=True),
+    ("GET", "/reports/{id}/system"): Need("read", by_fleet=True),
     ("GET", "/"): Need("read", by_fleet=True),
     ("GET", "/fleet/knowledge"): Need("read", by_fleet=True),
     ("GET", "/vehicles"): Need("read", by_fleet=True),

@@ -63,7 +63,7 @@ def routes(client: TestClient) -> list[tuple[str, str]]:
                 found.extend((method, route.path) for method in route.methods if method not in ("HEAD", "OPTIONS"))
 
     walk(client.app.routes)  # type: ignore[attr-defined]
-    assert len(found) > 20, "the routes are not where this looks for them"
+    assert len(found) > 3, "the routes are not where this looks for them"
     return sorted(set(found))
 
 
