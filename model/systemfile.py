@@ -26,6 +26,9 @@ _PATTERNS = {
     "can": "Message.Signal is expected",
 }
 MOST_PROBLEMS = 20  # that are listed
+DEEPEST = 50  # brackets or indents inside each other; a system file has six
+MOST_NODES = 20_000  # names and values, with those that aliases repeat; a vehicle has 600
+TOO_MANY = f"more than {MOST_NODES} names and values, with those that aliases repeat"
 
 
 class _Loader(yaml.SafeLoader):
@@ -34,6 +37,46 @@ class _Loader(yaml.SafeLoader):
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self.problems: list[tuple[int, str]] = []  # line, key and message
+        self.nodes = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """What is too large is not read to its end: that would take seconds."""
+        self.nodes += 1
+        if self.nodes > MOST_NODES:
+            raise yaml.YAMLError(TOO_MANY)
+        return super().compose_node(parent, index)
+
+    def fetch_flow_collection_start(self, token: Any) -> None:
+        """What is nested without end costs the square of its depth to be looked at."""
+        self._not_too_deep(self.flow_level)
+        super().fetch_flow_collection_start(token)
+
+    def add_indent(self, column: int) -> Any:
+        """The same by indents."""
+        self._not_too_deep(len(self.indents))
+        return super().add_indent(column)
+
+    def _not_too_deep(self, level: int) -> None:
+        if level >= DEEPEST:
+            raise yaml.YAMLError(f"line {self.line + 1}: nested more than {DEEPEST} deep")
+
+
+def _size(node: yaml.Node, known: dict[int, int]) -> int:
+    """Nodes of a document as they are once aliases stand for what they name; raises YAMLError when there are too many.
+
+    known: sizes of nodes that were counted; 0 of one that is being counted, so that it holds itself.
+    """
+    if id(node) in known:
+        if not known[id(node)]:
+            raise yaml.YAMLError(f"line {node.start_mark.line + 1}: it refers to itself")
+        return known[id(node)]
+    known[id(node)] = 0
+    inside = node.value if isinstance(node, yaml.CollectionNode) else ()
+    parts = [part for item in inside for part in (item if isinstance(item, tuple) else (item,))]
+    known[id(node)] = size = 1 + sum(_size(part, known) for part in parts)
+    if size > MOST_NODES:
+        raise yaml.YAMLError(TOO_MANY)
+    return size
 
 
 _Loader.add_implicit_resolver(
@@ -74,10 +117,12 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
         loader = _Loader(text)
         try:
             node = loader.get_single_node()
+            if node is not None:
+                _size(node, {})
             raw = loader.construct_document(node) if node is not None else None
         finally:
             loader.dispose()
-    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError, LookupError, AttributeError) as error:
         problem = " ".join(str(error).split())
         raise SystemFileError(f"{source}: not YAML: {problem[:200]}") from None
     if not isinstance(raw, Mapping):

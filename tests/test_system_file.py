@@ -1,6 +1,7 @@
 """What a system file can say about own data, and how everything that is wrong with it is told at once."""
 
 import json
+import time
 from datetime import date
 from pathlib import Path
 
@@ -277,3 +278,31 @@ def test_signals_that_parameters_follow_are_channels_of_their_own() -> None:
 def test_a_signal_that_nobody_measures_is_an_error_with_the_likely_one() -> None:
     with pytest.raises(SystemFileError, match="did you mean 'valve'"):
         parse_system(FOLLOWED % "vavle")
+
+
+TENFOLD = "a: &a [x]\n" + "".join(
+    f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x: " + "[" * 5000, "nested more than 50 deep"),
+        ("- " * 5000, "nested more than 50 deep"),
+        ("x: [" + "1," * 100_000 + "1]", "names and values"),
+        (TENFOLD + "estimate: [*i]", "names and values"),
+        ("a: &a [*a]", "refers to itself"),
+        ("!!timestamp 9999999999", "not YAML"),
+        ("!!bool x", "not YAML"),
+    ],
+)
+def test_yaml_that_costs_or_breaks_is_refused_in_one_line_at_once(
+    text: str, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sprung.model.systemfile.MOST_NODES", 2000)
+    began = time.process_time()
+    with pytest.raises(SystemFileError, match=message) as caught:
+        parse_system_file(text)
+    assert "\n" not in str(caught.value)
+    assert time.process_time() - began < 2
