@@ -26,6 +26,8 @@ log = logging.getLogger("sprung.server")
 LOOK_SECONDS = 1.0
 RATE_AFTER_SECONDS = 10.0  # from then on a body must have come at the lowest rate, on the average
 LOWEST_RATE = 1000.0  # bytes a second
+UNREAD_SECONDS = 60.0  # an answer may wait for the client to take what asyncio holds of it, some 64 kB
+STALLED_SECONDS = 2.0  # from then on a client that does not take its answer is one that only waits
 RESERVED_DESCRIPTORS = 128  # for the store, uploads and workers
 
 REFUSED = (
@@ -101,6 +103,8 @@ class GuardedProtocol(H11Protocol):
         self.host = self.client[0] if self.client else ""
         self.active = self._begun = time.monotonic()  # when something came; when the request that is awaited began
         self._received = 0
+        self._full: float | None = None  # since when the client has not taken what was written for it
+        self._unsent, self._moved = 0, self.active  # bytes that waited when it was last looked at, and since when
         self._admitted = self.doorkeeper.admit(self)
         if not self._admitted:
             transport.write(REFUSED % len(REFUSED_BODY) + REFUSED_BODY)
@@ -122,9 +126,22 @@ class GuardedProtocol(H11Protocol):
         self._received += len(data)
         super().data_received(data)
 
+    def pause_writing(self) -> None:
+        """More waits to be sent than is sensible."""
+        self._full = self._moved = time.monotonic()
+        super().pause_writing()
+
+    def resume_writing(self) -> None:
+        """The client has taken most of it."""
+        self._full = None
+        super().resume_writing()
+
     @property
     def waiting(self) -> bool:
-        """Nothing is being done for this connection: it idles, or its request has not come whole."""
+        """Nothing is being done for this connection: it idles, its request has not come whole, or its answer is not
+        taken."""
+        if self._full is not None and time.monotonic() - self._full > STALLED_SECONDS:
+            return True
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
 
     @property
@@ -133,7 +150,9 @@ class GuardedProtocol(H11Protocol):
         return self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]
 
     def too_slow(self, now: float) -> bool:
-        """Whether a request that has begun does not arrive."""
+        """Whether a request that has begun does not arrive, or an answer is not taken."""
+        if self._full is not None and self._untaken(now, self._full):
+            return True
         if not self.waiting:
             return False
         if self.conn.their_state is h11.IDLE:  # no header yet, or none begun: uvicorn ends what has been kept alive
@@ -146,15 +165,21 @@ class GuardedProtocol(H11Protocol):
         took = now - self._begun
         return took > RATE_AFTER_SECONDS and self._received < LOWEST_RATE * took
 
+    def _untaken(self, now: float, since: float) -> bool:
+        """Whether the client takes nothing of its answer, or too little; to be asked now and then."""
+        unsent = self.transport.get_write_buffer_size()
+        if unsent != self._unsent:
+            self._unsent, self._moved = unsent, now
+        return now - self._moved > self.doorkeeper.body_idle_seconds or now - since > UNREAD_SECONDS
+
     def on_response_complete(self) -> None:
         """uvicorn goes on to the next request."""
         self._begun, self._received = time.monotonic(), 0
         super().on_response_complete()
 
     def end(self) -> None:
-        """Close now."""
-        if not self.transport.is_closing():
-            self.transport.abort()
+        """Close now, also where it is closing and would wait for the client to take the rest."""
+        self.transport.abort()
 
 
 class Server(uvicorn.Server):
