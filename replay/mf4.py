@@ -14,6 +14,7 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.bounds import check_whole, mdf_sizes
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
 from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME
 
@@ -30,6 +31,7 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         head = file.read(16)
     if head[:8].strip() not in SIGNATURES:
         raise UnreadableRecording(f"{path}: not an MDF file: {'it does not begin as one' if head else 'it is empty'}")
+    check_whole(path, mdf_sizes(path))
     with _quietly():
         wrong = ""
         try:

@@ -16,6 +16,7 @@ from sprung.model.signals import ANY_TIME, Channel, SampleBlock, Tally, TimeColu
 from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.beside import Beside
+from sprung.replay.bounds import FOR_ITS_SIZE, most_samples
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
@@ -36,7 +37,6 @@ TEXT_TABLES = (".csv", ".tsv", ".txt", ".dat")
 PARQUET = (".parquet", ".pq")
 TABLES = (*TEXT_TABLES, *PARQUET, *series.KINDS)
 EXTENSIONS = (".mcap", *CAN_READERS, *TABLES)
-SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
 
 
 class Recording:
@@ -86,12 +86,12 @@ class Recording:
     def blocks(self) -> Iterator[SampleBlock]:
         """Blocks in file order; raises UnreadableRecording when none of the channels is in the file, or when it
         gives more samples than its size makes plausible."""
-        left = SAMPLES_ALWAYS + SAMPLES_PER_BYTE * self.path.stat().st_size
+        left = most_samples(self.path)
         shift: int | None = None
         for raw in self._source:
             left -= len(raw.time)
             if left < 0:
-                raise UnreadableRecording(f"{self.path}: gives more samples than a file of its size can hold")
+                raise UnreadableRecording(f"{self.path}: gives more samples than {FOR_ITS_SIZE}")
             block = self._screen.check(raw)
             if len(block.time):
                 self.seen[block.channel[~np.isnan(block.value)]] = True

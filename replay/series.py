@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from scipy.io.matlab import MatReadError
 
 from sprung.replay import uff
 from sprung.replay.account import UnreadableRecording
+from sprung.replay.bounds import check_piece, check_whole, mat_sizes
 from sprung.replay.extras import needed
 from sprung.replay.jsonkeys import load
 from sprung.replay.stamps import SECOND
@@ -42,6 +45,7 @@ def _mat(path: Path) -> Iterator[list[Column]]:
         with _hdf5(path) as columns:
             yield columns
         return
+    check_whole(path, mat_sizes(path))
     try:
         content = loadmat(path, simplify_cells=True)
     except (MatReadError, ValueError, TypeError, OSError, NotImplementedError, IndexError, KeyError, MemoryError) as e:
@@ -117,10 +121,21 @@ def _hdf5(path: Path) -> Iterator[list[Column]]:
 
         def visit(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and not name.startswith("#"):
-                found.extend(_datasets(name, item))
+                found.extend(_checked(path, item, column) for column in _datasets(name, item))
 
         file.visititems(visit)
         yield found
+
+
+def _checked(path: Path, item: Any, column: Column) -> Column:
+    """The column, whose chunks are looked at before the first of them is unpacked."""
+
+    def read(a: int, b: int) -> NDArray[Any]:
+        rows = b - a if item.chunks is None else math.prod(item.chunks)
+        check_piece(path, column.name, rows * item.dtype.itemsize)
+        return column.read(a, b)
+
+    return replace(column, read=read)
 
 
 def _datasets(name: str, item: Any) -> Iterator[Column]:

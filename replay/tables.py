@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, TimeColumn
 from sprung.model.units import FACTORS, known
 from sprung.replay.account import Account, UnreadableRecording
+from sprung.replay.bounds import check_samples
 from sprung.replay.csvlayout import unit_in
 from sprung.replay.slower import SlowerColumns
 from sprung.replay.stamps import SECOND, Stamps
@@ -208,6 +209,7 @@ def column_blocks(
     for column in columns:
         account.contents[column.name] = column.length
     found = find_columns(path, names, channels, account)
+    check_samples(path, sum(columns[at].length for _, at in found))
     by_time: dict[Any, list[tuple[int, Column]]] = {}
     for place, at in found:
         of_time = time_of(path, columns[at], columns, time)

@@ -24,6 +24,7 @@ OURS = ["sprung.replay", "sprung.model.system", "sprung.model.systemfile", "spru
 THEIRS = {"mf4": ["asammdf"], "tdms": ["nptdms"], "dbc": ["cantools"]}  # parsers in Python, which show their branches
 LONGEST = 40_000  # bytes of an input
 MEMORY = 1_500  # MB that a process may hold
+PATIENCE = 900  # s by the clock: what an input may take is counted in processor time (`harness.SECONDS`)
 INSIDE_SHARE = 0.3  # of the changes are made behind the checksums, where a format has them
 FAULT = "FAULT "
 
@@ -110,7 +111,7 @@ def _here(kind: str, seconds: int, seed: int, keep: Path) -> None:
         return atheris.Mutate(data, most)  # type: ignore[no-any-return]
 
     options = [f"-max_total_time={seconds}", f"-max_len={LONGEST}", f"-seed={seed}", f"-rss_limit_mb={MEMORY}"]
-    options += ["-timeout=30", "-print_final_stats=1", f"-artifact_prefix={keep}/{kind}-", "-verbosity=1"]
+    options += [f"-timeout={PATIENCE}", "-print_final_stats=1", f"-artifact_prefix={keep}/{kind}-", "-verbosity=1"]
     kept = [str(folder) for folder in [KEPT / kind] if folder.is_dir()]
     atheris.Setup([sys.argv[0], *options, str(corpus), *kept], one, custom_mutator=change)
     atheris.Fuzz()

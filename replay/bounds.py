@@ -1,0 +1,119 @@
+"""What a file says that it holds, looked at before it is read: what is not plausible for its size is refused.
+
+Packages of others read whole series, make room for what a file states, and inflate what is packed without asking.  Here
+are the bounds for all of them, and the sizes that MATLAB and MDF files state, without more than a piece in memory.
+"""
+
+from __future__ import annotations
+
+import mmap
+import re
+import struct
+import zlib
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from sprung.replay.account import UnreadableRecording
+from sprung.replay.inflate import LARGEST, PIECE
+
+SAMPLES_ALWAYS, SAMPLES_PER_BYTE = 10_000_000, 100  # that a file may give; well packed ones give about 5 a byte
+WHOLE_ALWAYS, WHOLE_RATIO = 1 << 28, 100  # bytes that a file which is read whole may unpack to, and times its size
+FOR_ITS_SIZE = "a file of its size can hold"
+COMPRESSED = 15  # miCOMPRESSED, a variable in zlib's format (MATLAB's "MAT-File Format", table 1-1)
+MAT_HEADER = 128
+MDF_BLOCKS = re.compile(rb"##(?:DZ|CG)\0{4}")
+MDF_ZIPPED = struct.Struct(
+    "<4s4xQQ2sBxIQQ"
+)  # id, length, links, of which block, method, parameter, bytes, packed bytes
+MDF_GROUP = struct.Struct("<4s4xQQ48xQQHH4xII")  # id, length, links, record id, records, flags, -, bytes, further bytes
+READ = 1 << 20  # bytes of packed data that are looked at at once
+VARIABLE = 1  # flag of a group whose records have lengths of their own
+
+
+def most_samples(path: Path) -> int:
+    """How many samples a file may give."""
+    return SAMPLES_ALWAYS + SAMPLES_PER_BYTE * path.stat().st_size
+
+
+def check_samples(path: Path, stated: int) -> None:
+    """Raise UnreadableRecording when a file states more values than it can hold."""
+    if stated > most_samples(path):
+        raise UnreadableRecording(f"{path}: states {stated} values, more than {FOR_ITS_SIZE}")
+
+
+def check_piece(path: Path, name: str, size: int) -> None:
+    """Raise UnreadableRecording when what must be unpacked at once, of a file, is too much."""
+    if size > LARGEST:
+        raise UnreadableRecording(f"{path}: {name} is stored in pieces of {size >> 20} MB, too large to be unpacked")
+
+
+def check_whole(path: Path, sizes: Iterator[int]) -> None:
+    """Raise UnreadableRecording when the parts of a file that is read whole are too much together."""
+    most, total = WHOLE_ALWAYS + WHOLE_RATIO * path.stat().st_size, 0
+    for size in sizes:
+        total += size
+        if total > most:
+            raise UnreadableRecording(f"{path}: unpacks to more than {total >> 20} MB, more than {FOR_ITS_SIZE}")
+
+
+def check_ratio(path: Path, name: str, packed: int, size: int) -> None:
+    """Raise UnreadableRecording when a part of a file states that it unpacks to more than is plausible."""
+    if size > WHOLE_ALWAYS + WHOLE_RATIO * packed:
+        raise UnreadableRecording(f"{path}: {name} states {size >> 20} MB packed in {packed} bytes: not plausible")
+
+
+def mat_sizes(path: Path) -> Iterator[int]:
+    """Bytes that the compressed variables of a MATLAB file (version 5) inflate to, piece by piece."""
+    with path.open("rb") as file:
+        head = file.read(MAT_HEADER)
+        order = {b"IM": "<", b"MI": ">"}.get(head[126:128])
+        if order is None:  # version 4: nothing is packed
+            return
+        while len(tag := file.read(8)) == 8:
+            kind, size = struct.unpack(order + "II", tag)
+            if kind == COMPRESSED:
+                yield from _inflated(_pieces(file, size))
+            else:
+                file.seek(size, 1)
+
+
+def mdf_sizes(path: Path) -> Iterator[int]:
+    """Bytes that the packed blocks of an MDF 4 file inflate to, piece by piece, and those that its groups state.
+
+    Blocks are found by their names wherever they stand, so that a damaged chain hides none.
+    """
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        for found in MDF_BLOCKS.finditer(data):
+            at = found.start()
+            if data[at : at + 4] == b"##CG" and at + MDF_GROUP.size <= len(data):
+                _, length, links, _, records, flags, _, size, further = MDF_GROUP.unpack_from(data, at)
+                if (length, links) == (MDF_GROUP.size, 6) and not flags & VARIABLE:
+                    yield records * (size + further)
+            elif at + MDF_ZIPPED.size <= len(data):
+                _, length, links, _, _, _, _, packed = MDF_ZIPPED.unpack_from(data, at)
+                if links == 0 and length == MDF_ZIPPED.size + packed:
+                    begin = at + MDF_ZIPPED.size
+                    ends = range(begin, begin + packed, READ)
+                    yield from _inflated(data[a : min(a + READ, begin + packed)] for a in ends)
+
+
+def _pieces(file: BinaryIO, size: int) -> Iterator[bytes]:
+    while size > 0 and (piece := file.read(min(size, READ))):
+        size -= len(piece)
+        yield piece
+
+
+def _inflated(pieces: Iterable[bytes]) -> Iterator[int]:
+    """Sizes of what zlib data inflate to, until they end or are damaged."""
+    inflater = zlib.decompressobj()
+    try:
+        for piece in pieces:
+            left = piece
+            while left and not inflater.eof:
+                yield len(inflater.decompress(left, PIECE))
+                left = inflater.unconsumed_tail
+            if inflater.eof:
+                return
+    except zlib.error:
+        return

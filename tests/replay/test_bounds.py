@@ -1,0 +1,111 @@
+"""Files that unpack to, or state, more than they can hold are refused before anything is read."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sprung.replay import UnreadableRecording, bounds, open_recording
+from tests.fuzz.seeds import GROUPED, SEEDS, TABLE
+from tests.replay_files import database
+
+MEGABYTE = 1 << 20
+
+
+def refused(path: Path) -> str:
+    with pytest.raises(UnreadableRecording) as caught:
+        list(open_recording(path, GROUPED if path.suffix == ".tdms" else TABLE, dbc=database()).blocks())
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bounds so low that files of a test reach them."""
+    monkeypatch.setattr(bounds, "WHOLE_ALWAYS", MEGABYTE)
+    monkeypatch.setattr(bounds, "LARGEST", MEGABYTE)
+    monkeypatch.setattr(bounds, "SAMPLES_ALWAYS", 100)
+    monkeypatch.setattr(bounds, "SAMPLES_PER_BYTE", 0)
+
+
+def test_a_table_of_a_billion_rows_that_were_never_written_is_refused(tmp_path: Path) -> None:
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("time", "left", "right"):
+            file.create_dataset(name, (10**12,), "f8", chunks=(1000,))
+    assert "states 2000000000000 values" in refused(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("rows", [400_000, 1000])
+def test_chunks_too_large_to_be_unpacked_are_refused(
+    tmp_path: Path, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bounds, "LARGEST", MEGABYTE)
+    h5py = pytest.importorskip("h5py")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in ("time", "left", "right"):
+            made = file.create_dataset(name, (1000,), "f8", chunks=(rows,), maxshape=(None,), compression="gzip")
+            made[:] = np.arange(1000)
+    if rows == 1000:
+        assert list(open_recording(tmp_path / "a.h5", TABLE).blocks())
+    else:
+        assert "pieces of 3 MB" in refused(tmp_path / "a.h5")
+
+
+def test_a_matlab_file_that_unpacks_to_much_is_refused_unread(
+    tmp_path: Path, small: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    packed = zlib.compress(bytes(20 * MEGABYTE), 9)
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<H", 0x0100) + b"IM"
+    (tmp_path / "a.mat").write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
+    monkeypatch.setattr("sprung.replay.series.loadmat", lambda *_, **__: pytest.fail("read"))
+    assert "unpacks to more than" in refused(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize("kind", ["parquet", "hdf5", "tdms", "mat"])
+def test_more_values_than_a_file_can_hold_are_refused_from_what_it_states(
+    tmp_path: Path, small: None, kind: str
+) -> None:
+    pytest.importorskip({"parquet": "pyarrow", "hdf5": "h5py", "tdms": "nptdms", "mat": "scipy"}[kind])
+    name, write = SEEDS[kind]
+    write(tmp_path / name)
+    assert "states 600 values" in refused(tmp_path / name)
+
+
+def test_pages_that_state_more_than_is_plausible_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow.parquet import write_table
+
+    monkeypatch.setattr(bounds, "WHOLE_ALWAYS", 0)
+    zeros = np.zeros(1_000_000)
+    table = pyarrow.table({"time": np.arange(1_000_000) / 100, "left": zeros, "right": zeros})
+    write_table(table, tmp_path / "a.parquet", compression="zstd", use_dictionary=False)
+    assert "states 7 MB packed in" in refused(tmp_path / "a.parquet")
+
+
+@pytest.mark.parametrize("lies", [False, True])
+def test_an_mdf_file_whose_blocks_unpack_to_much_is_refused_unread(tmp_path: Path, small: None, lies: bool) -> None:
+    name, write = SEEDS["mf4"]
+    write(tmp_path / name)
+    packed = zlib.compress(bytes(20 * MEGABYTE), 9)
+    size = 100 if lies else 20 * MEGABYTE
+    block = bounds.MDF_ZIPPED.pack(b"##DZ", bounds.MDF_ZIPPED.size + len(packed), 0, b"DT", 0, 0, size, len(packed))
+    with (tmp_path / name).open("ab") as file:
+        file.write(block + packed)
+    assert "unpacks to more than" in refused(tmp_path / name)
+
+
+def test_an_mdf_group_that_states_records_without_end_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("asammdf")
+    name, write = SEEDS["mf4"]
+    write(tmp_path / name)
+    data = bytearray((tmp_path / name).read_bytes())
+    groups = [at for at in range(len(data)) if data[at : at + 4] == b"##CG"]
+    for at in groups:
+        data[at + 80 : at + 88] = (1 << 45).to_bytes(8, "little")  # after id, length, number of links, six of them, id
+    (tmp_path / name).write_bytes(data)
+    assert groups and "unpacks to more than" in refused(tmp_path / name)
