@@ -142,7 +142,11 @@ def make_tracker(system: System) -> Tracker:
     rate = system.sample_rate
     settings = TrackerSettings(window=system.window / rate, hop=system.hop / rate)
     limits = {load.body: LoadLimit(load.empty, load.least, load.most) for load in system.loads if load.declared}
-    return Tracker(system.tracked, settings, deviations(system), limits=limits, doubt=_mass_doubt(system))
+    elements = system.file.elements.items()
+    masses = {body: tuple(n for n, e in elements if body in (e.upper, e.lower)) for body in system.built}
+    return Tracker(
+        system.tracked, settings, deviations(system), limits=limits, doubt=_mass_doubt(system), masses=masses
+    )
 
 
 def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:

@@ -219,7 +219,9 @@ def told(alarm: Alarm | AlarmRow) -> str:
 
 def unclear(rivals: Sequence[str]) -> str:
     """A sentence on what the measurements do not tell an alarm from, to stand before others; empty where nothing."""
-    return f"The measurements do not tell it from {' or '.join(rivals)}: check the sensor first. " if rivals else ""
+    heavier = all(rival.endswith(".mass") for rival in rivals)
+    first = "look first for ice, or what was built in" if heavier else "check the sensor first"
+    return f"The measurements do not tell it from {' or '.join(rivals)}: {first}. " if rivals else ""
 
 
 def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:

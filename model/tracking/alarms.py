@@ -5,12 +5,13 @@ A sequential test that has left the baseline says that something changed, not wh
 - a deviation of a measurement must have had its chance: some windows since the onset must have been weighed for it, and
   while their evidence for one rises, the next are waited for; what explains the change as well is named with the alarm,
   and when the windows point to it, it is the alarm;
-- all elements of a kind that moved together are one message: oil that warms, rubber that stiffens in the cold.
+- all elements of a kind that moved together are one message: oil that warms, rubber that stiffens in the cold;
+- where all springs and dampers at a body moved alike, its mass is named with them: it is the scale of their forces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import takewhile
@@ -74,6 +75,7 @@ class Attribution:
     model: DeviationModel
     weather: WeatherModel
     limits: dict[str, LoadLimit]
+    masses: Mapping[str, tuple[str, ...]]  # of bodies whose mass no window tells: the elements at them
 
     @property
     def kinds(self) -> list[str]:
@@ -210,9 +212,11 @@ class Attribution:
             others = self._alternatives(int(i), state, drift, int(since[i]), now)
             if others is None:
                 continue
+            heavier = self._masses_of(int(i), whole)
+            others = (*others, *heavier)
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
             if not kinds and along and self._all_move(whole, members):
-                name, (change, std), others = together, _common(whole, members), ()
+                name, (change, std), others = together, _common(whole, members), heavier
             alarm = Alarm("change", name, int(since[i]), now, "warning", 0.0, 0.0, 0.0, alternatives=others)
             alarmed.add(name)
             out.append(self._followed(alarm, change, std))
@@ -234,6 +238,15 @@ class Attribution:
     def _least_together(self) -> float:
         """Change that all elements of a kind must show for an alarm of theirs: a middle is surer than one element."""
         return self.settings.change / 4
+
+    def _masses_of(self, i: int, drift: Drift) -> tuple[str, ...]:
+        """Masses that would explain the change of parameter `i` as well: of bodies at which all have changed alike."""
+        found = []
+        for body, elements in self.masses.items():
+            at = np.flatnonzero([n.rpartition(".")[0] in elements for n in self.names])
+            if i in at and len({self.kinds[k] for k in at}) > 1 and self._all_move(drift, at):
+                found.append(f"{body}.mass")
+        return tuple(found)
 
     def _moves_along(self, i: int, drift: Drift, members: IntArray) -> bool:
         middle, std = _common(drift, members)

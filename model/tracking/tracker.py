@@ -55,12 +55,13 @@ class Tracker:
         weather: WeatherModel | None = None,
         limits: Mapping[str, LoadLimit] = MappingProxyType({}),
         doubt: tuple[FloatArray, FloatArray] | None = None,
+        masses: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
     ) -> None:
         """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body.
 
         doubt: variance of the log-ratios (P,), and covariance of the deviations (H, H), that no window will ever take
         away, since all have it alike: masses that are not quite those of the file.  It is part of what is stated, not
-        of changes.
+        of changes.  masses: bodies whose mass is the scale of what is estimated, and the elements at them.
         """
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
@@ -73,7 +74,7 @@ class Tracker:
         self.weather = weather or weathers.model_of(self.names, nominal)
         self._doubt = doubt or (np.zeros(len(self.names)), np.zeros((self.model.size, self.model.size)))
         self._attribution = Attribution(
-            self.names, self.settings, self.deviations, self.model, self.weather, dict(limits)
+            self.names, self.settings, self.deviations, self.model, self.weather, dict(limits), dict(masses)
         )
         self._fusion = Fusion(self.settings, self.model, self.weather)
 

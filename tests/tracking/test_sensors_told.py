@@ -224,3 +224,21 @@ def test_chance_names_no_sensor() -> None:
         named += bool(tracker.sensors(state)) and k > 30
     assert named == 0
     assert state.alarms == ()
+
+
+@pytest.mark.parametrize(("kinds", "rivals"), [(("stiffness", "damping"), ("bogie.mass",)), (("damping",), ())])
+def test_a_body_that_is_heavier_is_named_with_the_springs_and_dampers_at_it(
+    kinds: tuple[str, ...], rivals: tuple[str, ...]
+) -> None:
+    """Ice on a bogie makes all its springs and dampers seem softer; old oil its dampers only."""
+    rng = np.random.default_rng(9)
+    names = [f"e{i}.{kind}" for kind in ("stiffness", "damping") for i in range(6)]
+    tracker = Tracker([TrackedParameter(n) for n in names], masses={"bogie": ("e0", "e1", "e2", "e3")})
+    covariance = correlated(rng, np.full(12, 0.01))
+    off = np.array([-0.08 * (n[1] in "0123" and n.rpartition(".")[2] in kinds) for n in names])
+    state = tracker.initial_state()
+    for k in range(100):
+        value = np.linalg.cholesky(covariance) @ rng.normal(size=12) + off * (k >= 40)
+        state = tracker.update(state, estimate(value, covariance), EPOCH + k * SECOND)
+    assert {a.parameter for a in state.alarms} == {n for n, o in zip(names, off, strict=True) if o}
+    assert all(a.alternatives == rivals for a in state.alarms)
