@@ -5,12 +5,12 @@ What a fit is worth and what its parameters cost: `evidence`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.chunks import WORKERS, share
+from sprung.model.chunks import WORKERS, Piece, Result, share
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
@@ -116,13 +116,13 @@ def compete(
     again = rules.again * max((candidate.strength(screened) for candidate in candidates), default=0.0)
 
     def begun(chosen: list[Candidate]) -> list[Trial]:
-        tried = share(
-            lambda candidate: _begun(problem, base, candidate, candidate.strength(screened) > again), chosen, WORKERS
+        tried = _shared(
+            lambda own, candidate: _begun(own, base, candidate, candidate.strength(screened) > again), problem, chosen
         )
         return [trial for trial in tried if trial is not None]
 
     def finished(chosen: list[Trial]) -> list[Trial]:
-        return share(lambda trial: _finished(problem, base, trial), chosen, WORKERS)
+        return _shared(lambda own, trial: _finished(own, base, trial), problem, chosen)
 
     trials = begun([candidate for candidate in candidates if candidate.term.law.named])
     trials += begun(
@@ -162,10 +162,21 @@ def _settled(problem: Problem, base: Fit, trials: list[Trial]) -> list[Trial]:
         if not falling:
             break
         others = [t for t in trials if all(t is not one for one in falling)]
-        again = share(lambda trial: _finished(problem, base, trial), falling, WORKERS)
+        again = _shared(lambda own, trial: _finished(own, base, trial), problem, falling)
         stuck += [new.fit for old, new in zip(falling, again, strict=True) if new.evidence <= old.evidence]
         trials = graded(problem, base, [*again, *others])
     return trials
+
+
+def _shared(work: Callable[[Problem, Piece], Result], problem: Problem, pieces: Sequence[Piece]) -> list[Result]:
+    """Pieces of work on one problem, shared among threads, each with a budget of its own."""
+    if problem.work is None:
+        return share(lambda piece: work(problem, piece), pieces, WORKERS)
+    budgets = problem.work.apart(len(pieces))
+    own = [(replace(problem, work=budget), piece) for budget, piece in zip(budgets, pieces, strict=True)]
+    results = share(lambda pair: work(*pair), own, WORKERS)
+    problem.work.gather(budgets)
+    return results
 
 
 def runner_up(

@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.response.point import Point
+from sprung.model.diagnosis.selection import compete
 from tests.diagnosis_cases import problem_of, quarter_car, simulate
 
 
@@ -30,3 +32,16 @@ def test_work_is_counted_and_nothing_more_is_fitted_once_it_is_done() -> None:
     assert work.done > 0 and not work.ended
     work.most = work.done
     assert work.ended and try_optimise(problem, start, 2) is None
+
+
+def test_where_a_search_ends_does_not_depend_on_which_thread_is_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, record = quarter_car(), simulate(lambda d, v: 300.0 * np.tanh(v / 2e-3), seconds=8, seed=4)
+    whole = WorkBudget(1e9)
+    diagnose(system, record, Options(work=whole))
+    ends = []
+    for workers in (1, 2, 2):
+        monkeypatch.setattr(compete, "WORKERS", workers)
+        work = WorkBudget(0.5 * whole.done)
+        report = diagnose(system, record, Options(work=work))
+        ends.append((report.to_dict(), work.done))
+    assert ends[0] == ends[1] == ends[2] and work.ended

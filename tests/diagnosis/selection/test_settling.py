@@ -42,7 +42,7 @@ def test_what_could_lead_is_fitted_on_while_it_gets_further(
         return replace(one, fit=fit, evidence=one.evidence + step)
 
     monkeypatch.setattr(compete, "_finished", fitted_on)
-    problem: Any = SimpleNamespace(process_noise=True, rules=RULES)
+    problem: Any = SimpleNamespace(work=None, process_noise=True, rules=RULES)
     base: Any = None
     done: Any = FallingFit(0.0, converged=True)
     settled = replace(trial(100.0, 0.0), fit=done)
