@@ -15,7 +15,8 @@ FOLDERS = ("model", "replay", "service", "benchmarks", "deploy", "tests", "docs"
 @pytest.fixture(scope="module")
 def files() -> list[str]:
     inside = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")]
-    return [f"/{path.relative_to(ROOT).as_posix()}" for path in {*inside, *ROOT.glob("*.py"), *ROOT.glob("sprung/*.py")}]
+    paths = {*inside, *ROOT.glob("*.py"), *ROOT.glob("sprung/*.py")}
+    return [f"/{path.relative_to(ROOT).as_posix()}" for path in paths]
 
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)
