@@ -19,13 +19,16 @@ POINTS = 201
 def write_tables(folder: Path, system: System, deflection: float, rate: float) -> list[Path]:
     """One CSV per element and axis up to `deflection` (m) and `rate` (m/s): motion, force of spring or damper and laws.
 
-    A law with memory, or one that changes over time, has no such curve and is refused before anything is written:
-    `ExchangeError`.
+    Elements whose laws have no such curve are left out; `ExchangeError` where none is left, before anything is written.
     """
-    _refuse_what_is_no_curve(system)
+    without = without_curve(system)
+    if len(without) == len(system.elements):
+        raise ExchangeError(f"laws at {', '.join(without)} remember or change over time: no curve is left")
     folder.mkdir(parents=True, exist_ok=True)
     written = []
     for index, element in enumerate(system.elements):
+        if element in without:
+            continue
         laws = [law for law in system.laws if isinstance(law.law, ElementLaw) and law.places == (element,)]
         k, c = system.mechanics.stiffness[index], system.mechanics.damping[index]
         for axis, most in (("d", deflection), ("v", rate)):
@@ -42,12 +45,14 @@ def write_tables(folder: Path, system: System, deflection: float, rate: float) -
     return written
 
 
-def _refuse_what_is_no_curve(system: System) -> None:
-    for placed in system.laws:
-        law = placed.law
-        if isinstance(law, ElementLaw) and (law.memory or law.over_time):
-            why = "has memory" if law.memory else "changes over time"
-            raise ExchangeError(f"{placed.location}: {law.name} {why}, so that no curve F(d) or F(v) describes it")
+def without_curve(system: System) -> list[str]:
+    """Elements whose force is no function of deflection or rate alone: a law there remembers, or changes over time."""
+    following = [
+        placed.places
+        for placed in system.laws
+        if isinstance(placed.law, ElementLaw) and (placed.law.memory or placed.law.over_time)
+    ]
+    return [element for element in system.elements if any(element in places for places in following)]
 
 
 def _of_laws(laws: list[PlacedLaw], d: FloatArray, v: FloatArray, element: SpringDamper) -> FloatArray:

@@ -128,6 +128,38 @@ class Flow:
             path[:, k + 1, :N], path[:, k + 1, N:] = state, force
         return path
 
+    def back(self, by_state: Tensor, by_force: Tensor) -> tuple[Tensor, Tensor]:
+        """What depends on states and on the laws' forces, (B, T, N, X) and (B, T, L, X), by forces that are added to
+        the laws' (B, T, L, X), and by changes of the memories on the way (B, T-1, Z, X): the adjoint of `run`."""
+        (B, T, _, X), N, Z = by_force.shape, self.N, len(self.memories)
+        added, remembered = torch.empty_like(by_force), by_force.new_zeros(B, T - 1, Z, X)
+        state, force, z = by_state[:, -1], by_force[:, -1], by_force.new_zeros(B, Z, X)
+        for k in reversed(range(T - 1)):
+            if Z:
+                state = torch.baddbmm(state, self.beyond[:, k].mT, z)
+            force = torch.baddbmm(force, self.g1.mT, state)
+            added[:, k + 1] = self.small[:, k].mT @ force
+            u = torch.baddbmm(state, self.answers[:, k].mT, force)
+            before = self.step.mT @ u
+            if Z:
+                z = torch.baddbmm(z, self.answers_memory[:, k].mT, force)
+                remembered[:, k] = z
+                before[:, :N] += self.ahead[:, k].mT @ z
+                z = self.keep[:, k] * z
+            state, force = before[:, :N] + by_state[:, k], before[:, N:] + by_force[:, k]
+        added[:, 0] = force
+        return added, remembered
+
+    def along_back(self, by_force: Tensor, remembered: Tensor) -> tuple[Tensor, Tensor]:
+        """The same by deflections and rates along which the laws act, each (B, T, L, X): the adjoint of `along`."""
+        deflection, rate = (slope.unsqueeze(3) * by_force for slope in self.slopes)
+        if self.memories:
+            d0, d1, v0, v1 = (gain.unsqueeze(3) * remembered for gain in self.carried)
+            for of, early, late in ((deflection, d0, d1), (rate, v0, v1)):
+                of[:, :-1, self.memories] += early
+                of[:, 1:, self.memories] += late
+        return deflection, rate
+
     def answer(self, given: Tensor) -> Tensor:
         """Change of the forces (B, T, L) where they are off by `given`, the motion's answer included."""
         if self._closed is None:

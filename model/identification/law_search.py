@@ -16,6 +16,7 @@ from torch import Tensor
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
+from sprung.model.identification.law_noise import by_noise
 from sprung.model.identification.law_opening import opened
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
 from sprung.model.identification.law_window import LawWindows
@@ -130,7 +131,7 @@ class LawSearch:
         w, data, smooth = self.windows, self.data.take(rows), self.smooth[:, rows.numpy()]
         point, before = self.point.take(rows), self.cost[rows]
         steps = w.steps(point, data)
-        point, motion, near = w.settle(point, steps, data, smooth)
+        point, motion, near = w.settle(point, steps, data)
         columns, flow = w.columns(point, steps, motion, data, smooth)
         residual = w.residual(motion, data, columns.whiten)
         cost, step, alone = columns.solve(residual, point.unknowns)
@@ -140,14 +141,12 @@ class LawSearch:
         dx0 = columns.state_step(alone, step)
         smooth = w.smoothed(columns, residual, step, dx0, steps)
         std = torch.diagonal(columns.covariance, dim1=1, dim2=2).sqrt()
-        second = self._second(columns, near, point.moved(step, dx0), data, smooth)
+        second = self._second(columns, near, point.moved(step, dx0), data)
         held = second.there <= there * (1 + 1e-6) + _SLACK
         still = (step.abs() / std).amax(dim=1) < _STILL
         going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the old products are good enough for one more
-            self._third(
-                going, second, columns.take(going), near.take(going), data.take(going), smooth[:, going.numpy()]
-            )
+            self._third(going, second, columns.take(going), near.take(going), data.take(going))
         done = ((second.small(std) & held) | still) & ~worse
         _, diverged = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
         sane = (diverged == 0) & second.there.isfinite()
@@ -164,29 +163,28 @@ class LawSearch:
         self.cost[rows] = torch.where(done & held, second.cost, torch.where(worse, before, cost))
         self.there[rows] = torch.where(worse, self.there[rows], there)
         self.smooth[:, rows.numpy()] = smooth
-        self.converged[rows], self.covariance[rows], self.states[rows] = done, columns.covariance, motion.states
+        covariance, ended = columns.covariance.clone(), ((done | last) & sane).nonzero().squeeze(1)
+        if len(ended):
+            covariance[ended] += by_noise(w, columns.take(ended), steps.take(ended), flow.take(ended), data.present)
+        self.converged[rows], self.covariance[rows], self.states[rows] = done, covariance, motion.states
         self.iterations[rows] += 1
         shown = torch.as_tensor(np.flatnonzero(data.present))
         self.outputs[rows[:, None], :, shown] = motion.outputs.mT
         self.error[rows[:, None], shown] = (data.measured - motion.outputs).square().mean(dim=1).sqrt()
 
-    def _second(
-        self, columns: Columns, flow: Flow, there: WindowPoint, data: WindowBatch, smooth: FloatArray
-    ) -> Second:
+    def _second(self, columns: Columns, flow: Flow, there: WindowPoint, data: WindowBatch) -> Second:
         """The step from `there` with products from nearby."""
         w = self.windows
-        there, motion, _ = w.settle(there, w.steps(there, data), data, smooth, flow)
+        there, motion, _ = w.settle(there, w.steps(there, data), data, flow)
         residual = w.residual(motion, data, columns.whiten)
         return Second(there, motion, residual, *columns.solve(residual, there.unknowns))
 
-    def _third(
-        self, at: Tensor, second: Second, columns: Columns, flow: Flow, data: WindowBatch, smooth: FloatArray
-    ) -> None:
+    def _third(self, at: Tensor, second: Second, columns: Columns, flow: Flow, data: WindowBatch) -> None:
         """One more step of the windows `at`, whose products are given, where it makes nothing worse."""
         old = second.take(at)
         step = self._limited(old.step)
         there = old.point.moved(step, columns.state_step(old.alone, step))
-        new = self._second(columns, flow, there, data, smooth)
+        new = self._second(columns, flow, there, data)
         better = (new.there <= old.there * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
         second.put(at[better], new.take(better))
 

@@ -37,6 +37,7 @@ _SWEEPS = 4  # of Newton's method on the forces, at most
 _SETTLED = 0.05  # rms change of the outputs by a sweep, in the sensors' noise
 _WILD = 1e4  # times what was measured: Newton's method has lost the motion
 _RIDGE = 1e-11  # relative, on the normalised free responses
+_AS_MEASURED: FloatArray = np.zeros((2, 1, 1, 1))  # no noise of the drives is taken from the elements' motion
 _MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
 
 
@@ -143,9 +144,13 @@ class LawWindows:
         return SpringDamper(steps.values.stiffness[:, at].numpy(), steps.values.damping[:, at].numpy())
 
     def settle(
-        self, point: WindowPoint, steps: Steps, data: WindowBatch, smooth: FloatArray, flow: Flow | None = None
+        self, point: WindowPoint, steps: Steps, data: WindowBatch, flow: Flow | None = None
     ) -> tuple[WindowPoint, Moved, Flow]:
-        """Bring forces and motion together; flow: of a motion nearby, by default of the one that they begin with."""
+        """Bring forces and motion together; flow: of a motion nearby, by default of the one that they begin with.
+
+        Drives are taken as measured: what a residual tells of their noise when laws are left out is wrong by as much as
+        these make it larger, and would come back as motion.
+        """
         force, moving = point.force.clone(), torch.arange(len(point.force))
         for _ in range(_SWEEPS):
             if not len(moving):
@@ -153,13 +158,12 @@ class LawWindows:
             everything = len(moving) == len(force)
             some = replace(point if everything else point.take(moving), force=force[moving])
             their_steps, theirs = (steps, data) if everything else (steps.take(moving), data.take(moving))
-            their_smooth = smooth if everything else smooth[:, moving.numpy()]
             states, outputs = self.simulate(their_steps, some.force, some.x0, theirs)
             if bool((wild := self._wild(outputs, theirs)).any()):
                 force[moving[wild]] = point.force[moving[wild]]
                 moving = moving[~wild]
                 continue
-            along = self.along(states, theirs, their_smooth, some, their_steps)
+            along = self.along(states, theirs, _AS_MEASURED, some, their_steps)
             if flow is None:
                 flow = self.flow(along, some, their_steps).spread(moving, len(force))
             near = flow if everything else flow.take(moving)
@@ -174,7 +178,7 @@ class LawWindows:
             states, outputs = self.simulate(steps, force, point.x0, data)
         point = replace(point, force=force)
         if flow is None:
-            flow = self.flow(self.along(states, data, smooth, point, steps), point, steps)
+            flow = self.flow(self.along(states, data, _AS_MEASURED, point, steps), point, steps)
         return point, Moved(states, outputs), flow
 
     def _wild(self, outputs: Tensor, data: WindowBatch) -> Tensor:

@@ -48,7 +48,17 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
 
     Sensor noise reaches the fitted motion, at the least, as the motion that it cannot be told from.
     """
-    s, kind = model.simulator, transfer.compliance.dtype
+    of_drives, direct = moved_by_drives(model, values, transfer.compliance)
+    kind = of_drives.dtype
+    of_sensors = torch.linalg.pinv(model.signal_rows(data, kind) @ model.frequency.sensing(values))
+    beside = (direct * model.drive_noise[:, None]).expand(*of_drives.shape[:2], *direct.shape)
+    none = beside.new_zeros(*beside.shape[:3], of_sensors.shape[3])
+    return torch.cat([of_drives * model.drive_noise[:, None], of_sensors], dim=3), torch.cat([beside, none], dim=3)
+
+
+def moved_by_drives(model: WindowModel, values: ElementValues, compliance: Tensor) -> tuple[Tensor, Tensor]:
+    """What a unit of every drive moves: coordinates (B, F, n, W/2), and deflections (E, W/2) by its supports beside."""
+    s, kind = model.simulator, compliance.dtype
     dynamic = model.frequency.dynamic(values)
     load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)
     direct = torch.zeros(s.H.shape[0], s.W // 2, dtype=kind)
@@ -57,11 +67,7 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
         direct[:, s.supports // 2] = s.G.to(kind)
     if len(s.forces):
         load[..., s.forces // 2] = s.F.to(kind)
-    of_drives = (transfer.compliance @ load) * model.drive_noise[:, None]
-    of_sensors = torch.linalg.pinv(model.signal_rows(data, kind) @ model.frequency.sensing(values))
-    beside = (direct * model.drive_noise[:, None]).expand(*of_drives.shape[:2], *direct.shape)
-    none = beside.new_zeros(*beside.shape[:3], of_sensors.shape[3])
-    return torch.cat([of_drives, of_sensors], dim=3), torch.cat([beside, none], dim=3)
+    return compliance @ load, direct
 
 
 def _of_inertia(model: WindowModel, values: ElementValues, per_load: Tensor, motion: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ from pathlib import Path
 from sprung.model.exchange.fmu import write_fmu
 from sprung.model.exchange.modelica import write_modelica
 from sprung.model.exchange.statespace import ExchangeError, state_space, write_mat, write_npz
-from sprung.model.exchange.tables import write_tables
+from sprung.model.exchange.tables import without_curve, write_tables
 from sprung.model.laws import ElementLaw, SensorLaw
 from sprung.model.laws.in_place import is_linear
 from sprung.model.laws.placed import PlacedLaw
@@ -46,7 +46,9 @@ def left_out(system: System, out: Path) -> list[str]:
     suffix = out.suffix.lower()
     if suffix in (".yaml", ".yml"):
         return []
-    return [f"{placed.location}.{placed.law.name}" for placed in system.laws if not _held(placed, suffix)]
+    without = without_curve(system) if suffix == "" else []
+    laws = [placed for placed in system.laws if not _held(placed, suffix) or set(placed.places) & set(without)]
+    return [f"{placed.location}.{placed.law.name}" for placed in laws]
 
 
 def _held(placed: PlacedLaw, suffix: str) -> bool:

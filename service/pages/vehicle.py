@@ -54,6 +54,7 @@ async def vehicle_page(core: CoreOf, id: str) -> HTMLResponse:
                 report_dict(r) | {"usable": (core.settings.reports / r.id / IMPROVED).is_file()}
                 for r in lists.list_reports(connection, SHOWN, vehicle_id=id)
             ],
+            "diagnosis": next(iter(lists.list_jobs(connection, 1, kind="diagnosis", vehicle_id=id)), None),
             "reasons": status.reasons_of(connection, id, served.model_id),
             "models": models_answer(core, connection, id),
             "system": served.engine.system,

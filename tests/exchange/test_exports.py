@@ -26,6 +26,7 @@ from sprung.model.exchange.tables import write_tables
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System, load_system, parse_system
 from sprung.service.cli import main
+from sprung.service.cli.export import left_out
 
 RATE = 500.0
 TEXT = """
@@ -219,10 +220,17 @@ def test_tables_hold_the_forces_of_spring_damper_and_laws(tmp_path: Path) -> Non
     np.testing.assert_allclose(force, 2e4 * d + 1e8 * d**3, rtol=1e-7, atol=1e-6)
     v, force = np.loadtxt(tmp_path / "strut-v.csv", delimiter=",", skiprows=1).T
     np.testing.assert_allclose(force, 1500 * v + 40 * np.tanh(v / 0.05), rtol=1e-7, atol=1e-6)
-    with pytest.raises(ExchangeError, match="memory"):
-        write_tables(tmp_path / "none", system(LAWS["hysteresis"]), 0.02, 0.5)
-    with pytest.raises(ExchangeError, match="changes over time"):
-        write_tables(tmp_path / "none", system(", laws: [{time_varying_stiffness: {p: 0.2, tau: 30}}]"), 0.02, 0.5)
+
+
+@pytest.mark.parametrize("law", [LAWS["hysteresis"], ", laws: [{time_varying_stiffness: {p: 0.2, tau: 30}}]"])
+def test_an_element_whose_force_is_no_curve_has_no_tables(law: str, tmp_path: Path) -> None:
+    vehicle = system(law)
+    assert {p.name for p in write_tables(tmp_path, vehicle, 0.02, 0.5)} == {"tyre-d.csv", "tyre-v.csv"}
+    assert left_out(vehicle, tmp_path) == [f"strut.{placed.law.name}" for placed in vehicle.laws]
+    strut = vehicle.file.elements["strut"].model_copy(update={"lower": vehicle.file.elements["tyre"].lower})
+    alone = System(vehicle.file.model_copy(update={"elements": {"strut": strut}}))
+    with pytest.raises(ExchangeError, match="no curve is left"):
+        write_tables(tmp_path / "none", alone, 0.02, 0.5)
     assert not (tmp_path / "none").exists()
 
 

@@ -57,10 +57,10 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
 
     def shown(point: WindowPoint) -> torch.Tensor:
         for _ in range(2):  # each call takes a few steps of Newton's method
-            point, motion, _ = model.settle(point, model.steps(point, data), data, still)
+            point, motion, _ = model.settle(point, model.steps(point, data), data)
         return motion.outputs / torch.as_tensor(bare.sensor_noise)
 
-    point, motion, _ = model.settle(start, model.steps(start, data), data, still)
+    point, motion, _ = model.settle(start, model.steps(start, data), data)
     steps = model.steps(point, data)
     along = model.along(motion.states, data, still, point, steps)
     columns = model.shown(point, steps, motion, data, still, along, model.flow(along, point, steps))

@@ -22,10 +22,10 @@ from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
 from sprung.service.pages.drawing import Mark, plan_view, side_view
 from sprung.service.settings import Settings
-from sprung.service.store import retention
+from sprung.service.store import retention, work
 from sprung.service.store.schema import audit, metadata
 from sprung.service.times import from_iso
-from tests.service_fakes import make_window
+from tests.service_fakes import START, FakeIdentifier, make_window
 
 
 def deeds(core: Core) -> list[str]:
@@ -270,6 +270,21 @@ def test_pages_show_states_and_what_to_do(client: TestClient, core: Core, system
     assert "Most windows are dropped" in client.get("/pages/vehicles/lossy").text
     assert "acknowledge" in client.get("/pages/alarms").text
     assert client.get("/pages/work").status_code == 200
+
+
+def test_a_misfit_tells_what_became_of_its_diagnosis(
+    client: TestClient, core: Core, system: System, identifier: FakeIdentifier
+) -> None:
+    identifier.chi_square = 5.0
+    core.pipeline.process("a", [make_window(system, i) for i in range(12)])
+    assert "no diagnosis yet" in client.get("/pages/vehicles/a").text
+    row = work.JobRow("one", "diagnosis", "running", None, "a", 0.1, None, None, START, START)
+    with core.store.write() as connection:
+        work.add_job(connection, row)
+    assert "diagnosis running" in client.get("/pages/vehicles/a").text
+    with core.store.write() as connection:
+        work.update_job(connection, "one", START, state="failed", error="the job took longer than 600 s")
+    assert "diagnosis failed</a>: the job took longer than 600 s" in client.get("/pages/vehicles/a").text
 
 
 def test_data_in_pages_cannot_break_out(client: TestClient, broken: str) -> None:

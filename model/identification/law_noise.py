@@ -1,0 +1,49 @@
+"""What noise of the drives does to the values of windows through their laws.
+
+Whitening knows how the linear system carries that noise to the sensors.  A law carries it, too, by its slope where it
+acts: a stop that is five times as stiff as its spring passes six times the noise while it is met.  The step to the
+minimum is linear in forces that are added to the laws': followed backwards through the motion (adjoint sensitivities)
+it says how far the noise moves the values.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from sprung.model.identification.law_flow import Flow
+from sprung.model.identification.law_point import Columns, Steps
+from sprung.model.identification.law_window import LawWindows
+from sprung.model.identification.noise_share import moved_by_drives
+from sprung.model.signals import BoolArray
+
+
+def by_noise(w: LawWindows, columns: Columns, steps: Steps, flow: Flow, present: BoolArray) -> Tensor:
+    """Covariance of the unknowns (B, U, U) that noise of the drives adds through the laws."""
+    gain = columns.covariance @ (columns.sensitivities - columns.across.mT @ columns.free)
+    (B, U, _), (F, R) = gain.shape, columns.whiten.shape[1:3]
+    by_residual = torch.view_as_complex(gain.view(B, U, F, R, 2)).permute(0, 2, 3, 1)  # the step, (B, F, R, U)
+    by_signal = columns.whiten.mH @ by_residual
+    by_force, by_memory = flow.back(*_by_motion(w, by_signal, steps, present))
+    by_deflection, by_rate = flow.along_back(by_force, by_memory)  # (B, T, L, U)
+    jw = w.model.frequency.jw[:, None, None]
+    spectrum = w.model.spectra(by_deflection).conj() + jw * w.model.spectra(by_rate).conj()  # (B, F, L, U)
+    moved, direct = moved_by_drives(w.model, steps.values, columns.compliance)
+    site = w.weights.to(moved.dtype) @ (w.model.simulator.H.to(moved.dtype) @ moved + direct)  # (B, F, L, W/2)
+    share = 2 / w.model.samples  # of a bin in a signal
+    through = share * (spectrum.mT @ site) * w.model.drive_noise[:, None]  # (B, F, U, W/2)
+    linear = by_signal.mH @ columns.carried
+    both = ((linear + through / 2) @ through.mH).real.sum(dim=1) / share
+    return both + both.mT
+
+
+def _by_motion(w: LawWindows, by_signal: Tensor, steps: Steps, present: BoolArray) -> tuple[Tensor, Tensor]:
+    """The step by states (B, T, N, U) and by the laws' forces at once (B, T, L, U).
+
+    by_signal: by bins of the compressed signals, (B, F, R, U).
+    """
+    B, _, R, U = by_signal.shape
+    signals = w.model.signals(by_signal.flatten(2)) * (w.model.samples / 2)
+    by_output = w.model.compression.matrix(present).mT @ signals.view(B, -1, R, U)  # (B, T, S', U)
+    at_once = (steps.shown @ w.weights.T) - steps.direct @ w.pull.T  # (B, S', L)
+    return steps.discrete.C.mT.unsqueeze(1) @ by_output, at_once.mT.unsqueeze(1) @ by_output
