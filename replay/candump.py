@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.frames import FrameBlock
-from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, integer, line_batches
+from sprung.replay.textframes import LineFrames, decimal_ns, frame_id, integer, line_batches, told_cut
 
 ERROR_FLAG = 0x2000_0000
 
@@ -36,8 +36,8 @@ def frames(path: Path, account: Account) -> Iterator[FrameBlock]:
         first = False
         if damaged:
             account.corrupt(damaged, "line is no frame")
-            cut = "; the file ends inside a line" if not lines[-1].endswith(b"\n") else ""
-            account.problem(f"{damaged} lines near {_near(batch)} are no frames{cut}")
+            account.problem(f"{damaged} lines near {_near(batch)} are no frames")
+        told_cut(lines, account)
         if batch.time:
             yield batch.block(account)
 

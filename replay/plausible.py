@@ -39,6 +39,8 @@ RANGES = {  # what a channel of a rail vehicle can measure when the system file 
 }
 ANYTHING = (-1e12, 1e12)  # in other units
 AMBIGUOUS = ("N", "Pa", "kg")  # units in which a sentinel may be an ordinary value, as it may in counts
+FEWEST_ZEROS = 3  # of a channel: one may be chance
+ZERO_APART = 6.0  # usual steps from one sample to the next by which both neighbours of a single 0 must lie off it
 STANDS_OUT = 10.0  # median deviations of the other values by which a sentinel must then lie outside them
 
 
@@ -66,6 +68,10 @@ class Screen:
         self._bad = np.zeros(len(channels), dtype=np.int64)  # values taken as missing
         self._examples: dict[int, float] = {}  # channel -> the first of them, as recorded
         self._late = 0  # samples without a possible time
+        self._twice = np.zeros(len(channels), dtype=np.int64)  # samples that are there twice
+        self._zeros = np.zeros(len(channels), dtype=np.int64)  # single values of 0 where they should not be
+        self._first: dict[str, int] = {}  # time of the first of either kind, ns
+        self._begun: int | None = None  # ns, the first time
 
     def check(self, block: SampleBlock) -> SampleBlock:
         """The block in the channels' units, bad values NaN, samples without a possible time left out."""
@@ -77,6 +83,7 @@ class Screen:
         with np.errstate(invalid="ignore", over="ignore"):
             physical = self._convert(block)
             value, channel = physical.value, physical.channel
+            self._repeated(physical)
             bad = (value < self._low[channel]) | (value > self._high[channel])
             if (np.abs(block.value) >= SMALLEST_SENTINEL).any():
                 bad |= self._sentinels(block.value, channel)
@@ -102,8 +109,49 @@ class Screen:
                 found &= ~own | apart
         return found
 
+    def _repeated(self, block: SampleBlock) -> None:
+        """Count what would pass in silence: copies of a sample, and zeros that stand for a missing value.
+
+        Neither is changed: a copy says nothing new, and a 0 may be one.
+        """
+        if not len(block.time):
+            return
+        if self._begun is None:
+            self._begun = int(block.time.min())
+        order = np.argsort(block.channel.astype(np.int16), kind="stable")  # 10 000 columns at most: sorted by counting
+        time, channel, value = block.time[order], block.channel[order], block.value[order]
+        same = channel[1:] == channel[:-1]
+        twice = same & (time[1:] == time[:-1]) & (value[1:] == value[:-1])
+        for index in np.unique(channel[1:][twice]).tolist():
+            if np.ptp(value[channel == index]) > 0:  # what never changes is the same at coarse times, too
+                own = twice & (channel[1:] == index)
+                self._count("twice", self._twice, channel[1:][own], time[1:][own])
+        zero = np.flatnonzero((value[1:-1] == 0.0) & same[1:] & same[:-1] & (value[:-2] * value[2:] > 0.0)) + 1
+        for index in np.unique(channel[zero]).tolist():
+            own = zero[channel[zero] == index]
+            steps = np.abs(np.diff(value[channel == index]))
+            usual = float(np.median(steps[np.isfinite(steps)]))
+            off = np.minimum(np.abs(value[own - 1]), np.abs(value[own + 1])) > ZERO_APART * usual
+            self._count("zero", self._zeros, channel[own][off], time[own][off])
+
+    def _count(self, kind: str, counts: IntArray, channel: NDArray[np.int32], time: IntArray) -> None:
+        if len(time):
+            counts += np.bincount(channel, minlength=len(counts))
+            self._first.setdefault(kind, int(time.min()))
+
+    def _told(self, kind: str, counts: IntArray, least: int, what: str) -> None:
+        """One line on all channels that have at least so many."""
+        found = np.flatnonzero(counts >= least)
+        if len(found):
+            names = ", ".join(self._channels[index].name for index in found[:3].tolist())
+            more = f" and {len(found) - 3} more" if len(found) > 3 else ""
+            after = (self._first[kind] - (self._begun or 0)) / 1e9
+            self._account.note(f"{what}: {counts[found].sum()}, the first after {after:.2f} s ({names}{more})")
+
     def tell(self) -> None:
         """At the end of the recording."""
+        self._told("twice", self._twice, 1, "samples that are there twice")
+        self._told("zero", self._zeros, FEWEST_ZEROS, "single values of 0 between others far from it")
         if self._late:
             self._account.problem(f"{self._late} samples left out: their time stamps are such as no clock shows")
         for index in np.flatnonzero(self._bad).tolist():

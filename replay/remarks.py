@@ -28,6 +28,19 @@ def remarks(windower: Windower, windows: int) -> list[str]:
     return lines
 
 
+def pauses(windower: Windower) -> list[str]:
+    """One line where nothing came for a while, or the clock leapt ahead; nothing that was recorded is missing."""
+    found = [jump for jump in windower.jumps if 0 < jump.seconds <= LONGEST_PAUSE]
+    if not found:
+        return []
+    longest = max(found, key=lambda jump: jump.seconds)
+    times = "once" if len(found) == 1 else f"{len(found)} times"
+    which = "" if len(found) == 1 else "the longest "
+    return [
+        f"nothing for more than {windower.pause:g} s, {times}: {which}{_span(longest.seconds)} until {_iso(longest.at)}"
+    ]
+
+
 def _none(windower: Windower) -> str:
     """Why no window could be made at all."""
     needed = windower.window / windower.sample_rate

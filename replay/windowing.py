@@ -60,7 +60,7 @@ class Windower:
         self.longest_gap = longest_gap
         self.largest_share = largest_share
         self.order = Order(delay, pause, confirm=max(8, 2 * len(names)))
-        self.delay = delay
+        self.delay, self.pause = delay, pause
         self.stamped = stamped
         self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason
         self.jumps: list[ClockJump] = []  # of the clock, and pauses; the first ones

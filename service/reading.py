@@ -14,7 +14,7 @@ from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.model.system import System
 from sprung.replay.beside import Beside
 from sprung.replay.pacing import paced
-from sprung.replay.remarks import remarks
+from sprung.replay.remarks import pauses, remarks
 from sprung.replay.windowing import Windower
 from sprung.service.opening import open_stream
 from sprung.service.worker import Emit, ProcessLimits, Worker
@@ -140,7 +140,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     return Ending(
         recording.tally,
         recording.vehicle,
-        [*said, *recording.problems],
+        [*said, *recording.problems, *pauses(windower)],
         recording.incomplete or bool(said),
         windower.expected,
         windower.lost,
