@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 from sprung.model.units import RAW, known
 from sprung.replay.stamps import is_written
@@ -16,6 +17,7 @@ MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "-nan", "#n/a"
 SAMPLE = 200  # lines of data that are looked at
 _NUMBER = re.compile(r"^[+-]?(?:\d+\.?\d*|\.\d+)(?:[eEdD][+-]?\d+)?$", re.ASCII)
 _SPECIAL = re.compile(r"^[+-]?(?:inf|infinity)$", re.IGNORECASE)
+_RISES = 0.9  # of the steps of a column of times, that go forwards: some clocks are set back
 _QUANTITIES = ("m", "m/s", "m/s^2", "rad/s", "N", "Pa", "kg", "s")
 _OTHER_UNITS = frozenset({"degc", "°c", "c", "k", "hz", "deg", "rad", "nm", "w", "kw", "db", "strain", "um/m", "-"})
 _IN_NAME = re.compile(
@@ -34,6 +36,7 @@ class TableLayout:
     units: tuple[str | None, ...]  # of the columns, as a row of units or the header says
     headed: bool
     numeric: tuple[bool, ...]  # which columns hold numbers or times
+    timed: bool = False  # without a header: whether the first column rises, as times do
 
 
 def cells(line: str, separator: str | None) -> list[str]:
@@ -134,8 +137,10 @@ def _layout(
     ]
     heads = above or [(i, row) for i, row in marked if len(row) == width]
     if not heads:
+        names = [str(c + 1) for c in range(width)]
+        begin = [row[0] for row in rows[first:] if len(row) == width]
         return TableLayout(
-            separator, comma, first, tuple(str(c + 1) for c in range(width)), (None,) * width, False, numeric
+            separator, comma, first, tuple(names), (None,) * width, False, numeric, timed=_rises(begin, comma)
         )
     names = heads[-1][1]
     units: list[str | None] = [None] * width
@@ -145,6 +150,13 @@ def _layout(
         names, units = heads[-3][1], [_bare(cell) for cell in heads[-2][1]]
     units = [unit or unit_in(name)[1] for name, unit in zip(names, units, strict=True)]
     return TableLayout(separator, comma, first, tuple(names), tuple(units), True, numeric)
+
+
+def _rises(column: list[str], comma: bool) -> bool:
+    """Whether the numbers of a column hardly ever fall; dates are taken to."""
+    values = [number(cell, comma) for cell in column if is_number(cell, comma)]
+    rising = sum(a <= b for a, b in pairwise(values))
+    return len(values) < 2 or (rising >= _RISES * (len(values) - 1) and values[0] < values[-1])
 
 
 def _are_units(row: list[str]) -> bool:

@@ -23,7 +23,7 @@ def blocks(
 ) -> Iterator[SampleBlock]:
     """Blocks of some thousand rows; empty and NaN cells are missing values, unreadable rows corrupt."""
     layout, head = read_layout(path)
-    rows = Rows(path, layout.names, layout.units, channels, time, account, headed=layout.headed, csv=True)
+    rows = Rows(path, layout.names, layout.units, channels, time, account, timed=layout.timed, csv=True)
     reader = _Reader(layout, rows, account)
     if layout.comma:
         account.note("the decimal sign is a comma")

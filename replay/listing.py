@@ -70,7 +70,7 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
     if extension in TEXT_TABLES:
         layout, _ = csvtable.read_layout(path)
         names = [n if layout.names.count(n) == 1 else str(i + 1) for i, n in enumerate(layout.names)]
-        times = time_name(layout.names, time, layout.headed)
+        times = time_name(layout.names, time, layout.timed)
         every = list(zip(names, layout.units, layout.numeric, strict=True))
         listed = [(name, unit) for name, unit, numeric in every if numeric]
         others = [name for name, _, numeric in every if not numeric]

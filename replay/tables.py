@@ -60,12 +60,15 @@ def whole(name: str, values: NDArray[Any], unit: str | None = None, clock: EvenT
     return Column(name, len(values), lambda a, b: values[a:b], unit, clock)
 
 
-def time_name(names: Sequence[str], time: TimeColumn, headed: bool = True) -> str | None:
-    """The column that holds the time; None when there is none."""
+def time_name(names: Sequence[str], time: TimeColumn, timed: bool = False) -> str | None:
+    """The column that holds the time; None when there is none.
+
+    timed: whether the first one does, of a table without a header.
+    """
     if time.name is not None or time.rate is not None:
         return time.name
-    if not headed:
-        return names[0] if names else None
+    if timed:
+        return names[0]
     plain = {unit_in(name)[0].strip().lower().replace("-", " "): name for name in reversed(names)}
     plain |= {name.strip().lower(): name for name in reversed(names)}
     return next((plain[word] for word in TIME_NAMES if word in plain), None)
@@ -157,7 +160,7 @@ class Rows:
         time: TimeColumn,
         account: Account,
         *,
-        headed: bool = True,
+        timed: bool = False,
         csv: bool = False,
     ) -> None:
         if len(names) > MOST_COLUMNS:
@@ -167,7 +170,7 @@ class Rows:
         self.account, self.rate = account, time.rate
         self.time: int | None = None
         if time.rate is None:
-            named = time_name(names, time, headed)
+            named = time_name(names, time, timed)
             self.time = None if named is None else position(named, list(names))
             if self.time is None:
                 raise no_time(path, names, time)

@@ -109,6 +109,17 @@ def test_a_table_without_header_is_addressed_by_numbers(tmp_path: Path) -> None:
     check(tmp_path / "a.csv", numbered, TimeColumn("1"))
 
 
+def test_a_first_column_that_does_not_rise_is_no_time(tmp_path: Path) -> None:
+    """A table of signals alone: its rate has to be said."""
+    rows = "\n".join(f"{np.sin(0.3 * i):.6f} {np.cos(0.3 * i):.6f}" for i in range(400))
+    (tmp_path / "a.txt").write_text(rows)
+    channels = [Channel("x", "m", 1.0, column="1")]
+    with pytest.raises(UnreadableRecording, match="no column of times is recognised"):
+        load_record(tmp_path / "a.txt", channels, 200.0)
+    record = load_record(tmp_path / "a.txt", channels, 200.0, time=TimeColumn(rate=200.0))
+    assert len(record.values) == 400
+
+
 def test_two_columns_of_one_name_are_told_apart_by_number(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(table(before="time,x,x\n"))
     with pytest.raises(

@@ -60,11 +60,14 @@ def in_order(state: Investigation, term: Term) -> bool:
     return bool(state.calibrations) and within_sheet(state, term)
 
 
-def within_sheet(state: Investigation, term: Term) -> bool:
-    """Whether a fault is no more than the data sheet of its channel leaves."""
+def within_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool:
+    """Whether a fault is no more than the data sheet of its channel leaves.
+
+    instruments: as bad ones at most; what one sensor shows is told against what drives everything, which is another.
+    """
     spread = expected(state.system, state.signals, term.law, term.location)
     off = abs(term.parameters[0] - term.law.absent[0]) if spread > 0 else np.inf
-    return bool(off <= state.options.rules.plausible.calibration * spread)
+    return bool(off <= instruments * state.options.rules.plausible.calibration * spread)
 
 
 def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:

@@ -240,7 +240,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     p_value = max(chosen.p_value(tests), min(1.0, chosen.candidate.p_single * tests))
     if p_value > options.rules.acceptance.alpha:
         return state
-    if state.calibrations is None and within_sheet(state, chosen.term):
+    if state.calibrations is None and within_sheet(state, chosen.term, instruments=2):
         state = calibrated(state, chosen.term)
         if state.calibrations:
             return state

@@ -80,6 +80,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             runner_up=None if rival is None else (rival.term.law.name, rival.delta_bic()),
             runner_up_location=None if rival is None else rival.term.location,
             family=family,
+            elsewhere=_elsewhere(found, course.options.rules.report),
             advice=advice,
             look_alikes=_beaten(found),
             formula=formula_of(term)[0],
@@ -111,6 +112,17 @@ def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | No
         return None, None
     names = " or ".join([best.term.law.name, *dict.fromkeys(t.term.law.name for t in near)])
     return names, f"{names} fit this recording almost equally well; {_experiment(best.term)} would tell them apart"
+
+
+def _elsewhere(found: Found, rules: ReportRules) -> tuple[str, ...]:
+    """Other places at which the chosen law explains the recording almost equally well.
+
+    Where no force is measured, a body that is heavier than its mass says is the other one lighter.
+    """
+    best = found.trial
+    near = [t for t in found.trials if t.finished and t.evidence > best.evidence - rules.naming_margin]
+    places = [t.term.location for t in near if t.term.law.name == best.term.law.name]
+    return tuple(dict.fromkeys(place for place in places if place != best.term.location))
 
 
 def _beaten(found: Found) -> dict[str, float]:

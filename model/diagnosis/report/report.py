@@ -110,6 +110,7 @@ class Finding:
     runner_up: tuple[str, float] | None = None  # (effect, delta_bic) of the next best law
     runner_up_location: str | None = None
     family: str | None = None  # where no single law beats its look-alikes
+    elsewhere: tuple[str, ...] = ()  # other places at which the same law does almost equally well
     advice: str | None = None  # what would separate the look-alikes
     sentence: str = ""
     quoted: tuple[LawParameter, ...] = ()  # what engineers quote of it: yield force, loop area, forces at given rates
@@ -134,7 +135,7 @@ class Finding:
             effect, delta_bic = self.runner_up
             place = {} if self.runner_up_location is None else {"location": self.runner_up_location}
             result["runner_up"] = {"effect": effect, "delta_bic": plain(delta_bic)} | place
-        names = ("formula", "memory", "family", "advice", "quoted", "look_alikes")
+        names = ("formula", "memory", "family", "elsewhere", "advice", "quoted", "look_alikes")
         more = {name: getattr(self, name) for name in names}
         return result | {name: plain(value) for name, value in more.items() if value}
 

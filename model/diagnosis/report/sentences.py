@@ -21,6 +21,9 @@ def sentence_of(outcome: Outcome, term: Term, finding: Finding) -> str:
         words += f", along {term.variant}"
     if finding.family is not None:
         words = f"{finding.family.replace('_', ' ')}, which this recording does not tell apart; as the first, {words}"
+    if finding.elsewhere:
+        others = " or ".join(place.replace("|", " and ") for place in finding.elsewhere)
+        words += f" (or as much at {others}, which this recording does not tell apart)"
     sentence = f"{term.location.replace('|', ' and ')}: {words}"
     found = outcome.investigation.found
     bias = _worst_bias(outcome, "without it" if len(found) == 1 else "without these findings")

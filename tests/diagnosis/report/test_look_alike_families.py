@@ -6,13 +6,15 @@ from types import SimpleNamespace
 from typing import Any
 
 from sprung.model.diagnosis.investigation.course import Found
-from sprung.model.diagnosis.report.findings import _look_alikes
+from sprung.model.diagnosis.report.findings import _elsewhere, _look_alikes
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_BLOWOFF
 
 
 def trial(law: Any, evidence: float, location: str = "strut") -> Any:
-    return SimpleNamespace(evidence=evidence, named=True, term=SimpleNamespace(law=law, location=location))
+    return SimpleNamespace(
+        evidence=evidence, named=True, finished=True, term=SimpleNamespace(law=law, location=location)
+    )
 
 
 def test_a_name_that_says_less_than_an_implausible_one_is_not_told_alone() -> None:
@@ -22,3 +24,9 @@ def test_a_name_that_says_less_than_an_implausible_one_is_not_told_alone() -> No
         assert _look_alikes(Found(chosen, (), None, 1e-9, (other,)), RULES.report)[0] == family
     near = Found(chosen, (trial(DAMPER_BLOWOFF, 97.0),), None, 1e-9)
     assert _look_alikes(near, RULES.report)[0] == "coulomb_friction or damper_blowoff"
+
+
+def test_other_places_at_which_the_same_law_does_as_well_are_told() -> None:
+    chosen = trial(COULOMB_FRICTION, 100.0)
+    rivals = (trial(COULOMB_FRICTION, 99.0, "tyre"), trial(COULOMB_FRICTION, 60.0, "bush"))
+    assert _elsewhere(Found(chosen, (chosen, *rivals), None, 1e-9), RULES.report) == ("tyre",)
