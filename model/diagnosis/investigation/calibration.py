@@ -17,13 +17,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.special import stdtr
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
@@ -70,18 +70,19 @@ def within_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool
     return bool(off <= instruments * state.options.rules.plausible.calibration * spread)
 
 
-def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
-    """Whether a fault is off by several times as much as any other gain or zero, if there are enough of them.
+def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], chance: float) -> bool:
+    """Whether a fault is further off the others of its kind than instruments of one kind scatter (Student's t).
 
-    In units of what data sheets leave, and from the median of its kind: all may share what the file has too large.
+    In units of what data sheets leave; all may share what the file has too large.
     """
-    if len(terms) <= rules.few or all(term.key[:2] != key[:2] for term in terms):  # a lag's form is told by little
+    place, effect, _ = key  # a lag's form is told by little
+    own = [_off(term) for term in terms if term.key[:2] == (place, effect)]
+    others = np.array([_off(term) for term in terms if term.law.name == effect and term.location != place])
+    if not own or len(others) < 2:
         return False
-    kinds = {term.law.name for term in terms}
-    middles = {kind: float(np.median([_off(term) for term in terms if term.law.name == kind])) for kind in kinds}
-    away = {term.key[:2]: abs(_off(term) - middles[term.law.name]) for term in terms}
-    own = away.pop(key[:2])
-    return own > rules.alone * max(away.values())
+    spread = float(np.std(others, ddof=1)) * np.sqrt(1 + 1 / len(others))
+    distance = abs(own[0] - float(np.mean(others))) / max(spread, 1e-300)
+    return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < chance)
 
 
 def _off(term: Term) -> float:
@@ -103,7 +104,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = fit.point.terms[len(file) : len(file) + len(terms)]
-        if stands_alone(fitted, shown.key, state.options.rules.plausible):
+        if stands_alone(fitted, shown.key, state.options.rules.plausible.alone):
             return replace(state, calibrations=0)
         terms = tuple(term for term in fitted if within_sheet(state, term))
         if len(terms) == len(fitted):
