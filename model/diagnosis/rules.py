@@ -158,7 +158,10 @@ class PlausibleRules:
     calibration: float = rule(
         1.5, "deviations of a data sheet, up to which a gain or zero is in order; chosen: 2.2 % by default", 1.0, 2.0
     )
-    alone: float = rule(0.02, "chance that one gain of a rig is as far off; derived: a rig in 50", 0.01, 0.05)
+    alone: float = rule(
+        3.0, "times the next largest, that one gain or zero is off alone; derived: of 8, one rig in 90", 2.0, 5.0
+    )
+    by_chance: float = rule(0.02, "chance that it is as far off its kind; derived: of few, one rig in 50", 0.01, 0.05)
     simulated: float = rule(
         1e-3, "of a law's parameter, that simulating kinks leaves; derived: 4 steps per sample", 3e-4, 3e-3
     )

@@ -24,6 +24,7 @@ from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.investigation.course import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.laws import Law, SensorLaw
@@ -70,19 +71,24 @@ def within_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool
     return bool(off <= instruments * state.options.rules.plausible.calibration * spread)
 
 
-def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], chance: float) -> bool:
-    """Whether a fault is further off the others of its kind than instruments of one kind scatter (Student's t).
+def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
+    """Whether a fault is further off than anything else, and than its kind scatters (Student's t).
 
-    In units of what data sheets leave; all may share what the file has too large.
+    In units of what data sheets leave, and from what is usual of its kind: all may share what the file has too large.
     """
     place, effect, _ = key  # a lag's form is told by little
-    own = [_off(term) for term in terms if term.key[:2] == (place, effect)]
-    others = np.array([_off(term) for term in terms if term.law.name == effect and term.location != place])
-    if not own or len(others) < 2:
+    kinds, away = {term.law.name for term in terms}, dict[tuple[str, str], float]()
+    for kind in kinds:
+        of_kind = {term.location: _off(term) for term in terms if term.law.name == kind}
+        middle = float(np.median(list(of_kind.values())))
+        away |= {(location, kind): off - middle for location, off in of_kind.items()}
+    own = away.pop((place, effect), None)
+    others = np.array([off for (_, kind), off in away.items() if kind == effect])
+    if own is None or len(others) < 2 or abs(own) <= rules.alone * max(map(abs, away.values())):
         return False
     spread = float(np.std(others, ddof=1)) * np.sqrt(1 + 1 / len(others))
-    distance = abs(own[0] - float(np.mean(others))) / max(spread, 1e-300)
-    return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < chance)
+    distance = abs(own - float(np.mean(others))) / max(spread, 1e-300)
+    return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < rules.by_chance)
 
 
 def _off(term: Term) -> float:
@@ -104,7 +110,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = fit.point.terms[len(file) : len(file) + len(terms)]
-        if stands_alone(fitted, shown.key, state.options.rules.plausible.alone):
+        if stands_alone(fitted, shown.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
         terms = tuple(term for term in fitted if within_sheet(state, term))
         if len(terms) == len(fitted):
