@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.interpolate import CubicSpline
-from scipy.signal import firwin, upfirdn
+from scipy.signal import firwin
 
 from sprung.model.laws import ElementLaw, Motion, SpringDamper
 from sprung.model.laws.placed import PlacedLaw
@@ -310,17 +310,24 @@ def _hidden(rate: FloatArray, step: float, parts: int) -> FloatArray:
 
 
 @lru_cache(maxsize=4)
-def _low_pass(parts: int) -> FloatArray:
-    """Taps of a filter at half the sample rate, on a grid `parts` times finer."""
-    return np.asarray(firwin(2 * _REACH * parts + 1, 1 / parts, window=("kaiser", 6.0)))
+def _low_pass(parts: int) -> tuple[FloatArray, float]:
+    """Taps of a filter at half the sample rate, on a grid `parts` times finer: (parts, samples), and the last one."""
+    taps = np.asarray(firwin(2 * _REACH * parts + 1, 1 / parts, window=("kaiser", 6.0)))
+    return taps[:-1].reshape(2 * _REACH, parts).T.copy(), float(taps[-1])
 
 
 def band_limited(fine: FloatArray, parts: int) -> FloatArray:
-    """Signals (..., fine grid) behind a filter at half the sample rate, at the samples (..., T)."""
-    reach = _REACH * parts
-    taps = _low_pass(parts)
+    """Signals (..., fine grid) behind a filter at half the sample rate, at the samples (..., T).
+
+    What a sample's stretch of the fine grid gives to each of the samples around it is one product of matrices.
+    """
+    reach, samples = _REACH * parts, (fine.shape[-1] - 1) // parts + 1
     padded = np.concatenate(
         [2 * fine[..., :1] - fine[..., reach:0:-1], fine, 2 * fine[..., -1:] - fine[..., -2 : -reach - 2 : -1]], -1
     )
-    shown = upfirdn(taps, padded, down=parts, axis=-1)[..., 2 * _REACH :]
-    return np.asarray(shown[..., : (fine.shape[-1] - 1) // parts + 1])
+    by_stretch, last = _low_pass(parts)
+    stretches = padded[..., : (samples + 2 * _REACH - 1) * parts].reshape(*fine.shape[:-1], -1, parts) @ by_stretch
+    shown: FloatArray = last * padded[..., 2 * reach :: parts][..., :samples]
+    for k in range(2 * _REACH):
+        shown += stretches[..., k : k + samples, k]
+    return shown
