@@ -328,21 +328,23 @@ def _makes_way(state: Investigation, leader: Trial, formula: Trial) -> bool:
 def _led_by(state: Investigation, plain: list[Trial]) -> Trial | None:
     """The trial whose force a formula may be of; None: there is none.
 
-    The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much,
+    The unnamed one that leads by evidence, or the best force of an element where the leader has a name and leaves much
+    (but not the leader itself where nothing of that follows its motion: then it is of another place),
     or says less than that force by more than chance; a named force itself where what it leaves follows its motion.
     """
     leader, rules = plain[0], state.options.rules.formula
     if not leader.named:
         return leader
     forces = [one for one in plain if is_waveform(one.term) and one.term.location in state.system.elements]
+    own = any(leader is one for one in forces)
     if left(state.problem, leader.fit) > rules.leaves * left(state.problem, state.fit):
-        return next(iter(forces), None)
+        best = next(iter(forces), None)  # unless what is left has to do with another place
+        return None if best is leader and missing(state.problem, leader.fit) <= rules.missing else best
     for force in forces:
         if not force.named and leader.gain < rules.says * force.gain:
             luck = chance(force.gain - leader.gain, max(1, force.freedom - leader.freedom), 1)
             return force if luck < state.options.rules.acceptance.alpha else None
-    follows = any(leader is one for one in forces) and missing(state.problem, leader.fit) > rules.missing
-    return leader if follows else None
+    return leader if own and missing(state.problem, leader.fit) > rules.missing else None
 
 
 def _smoother(state: Investigation, fit: Fit) -> Fit:
