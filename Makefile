@@ -16,7 +16,7 @@ PYTEST ?=
 JOBS ?= auto
 
 .DELETE_ON_ERROR:
-.PHONY: pictures lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit install-fleet fleet-demo
+.PHONY: pictures lock licences schemathesis docs drawing help install install-dev demo test test-slow matrix ci lint format bench clean sbom audit bandit fuzz install-fleet fleet-demo
 
 help:
 	@echo "make demo       install, replay a piece of a working day, leave the service running"
@@ -35,8 +35,8 @@ install-dev: $(VENV)/.installed-dev
 
 install-fleet: $(VENV)/.installed-fleet
 
-$(VENV)/.installed-fleet: $(VENV)/.installed
-	$(PIP) --constraint requirements.lock --editable ".[fleet]"
+$(VENV)/.installed-fleet: $(VENV)/.installed requirements-fleet.lock requirements-fleet.hashes.lock
+	$(PIP) --no-deps --require-hashes -r requirements-fleet.hashes.lock
 	@touch $@
 
 # torch comes first and by itself: with the exact CPU build there, nothing pulls the CUDA packages
@@ -91,11 +91,11 @@ sbom: install
 	.sbom/bin/python -m pip --disable-pip-version-check install --quiet "cyclonedx-bom>=7,<8"
 	.sbom/bin/cyclonedx-py environment $(BIN)/python --of JSON -o sbom.json
 
-# the SHA-256 of every file of the packages in both locks; torch comes from an index of the user's choice
+# the SHA-256 of every file of the packages in the locks; torch comes from an index of the user's choice
 # (needs only uv: works also before what was added to a lock is installed)
 lock: install
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "uv>=0.5,<1"
-	for lock in requirements requirements-dev; do \
+	for lock in requirements requirements-dev requirements-fleet; do \
 		grep -v -e "^torch==" -e "^#" $$lock.lock > .lock.in; \
 		(grep "^#" $$lock.hashes.lock; $(BIN)/uv pip compile .lock.in --no-deps --generate-hashes --no-annotate --no-header \
 			--quiet --python-version 3.11) > .lock.out && mv .lock.out $$lock.hashes.lock || exit 1; \
@@ -110,9 +110,17 @@ licences: install-dev
 schemathesis: install-dev
 	$(BIN)/python -m pytest -q -m "slow or not slow" tests/deploy/test_schemathesis.py
 
+# readers under coverage-guided fuzzing, FUZZ_SECONDS each; needs Linux
+FUZZ_SECONDS ?= 60
+fuzz: install-dev
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet "atheris>=3,<4"
+	$(BIN)/python -m tests.fuzz.guided --seconds $(FUZZ_SECONDS)
+
 audit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "pip-audit>=2.7,<3"
-	$(BIN)/pip-audit --strict --requirement requirements.lock --no-deps
+	for lock in requirements requirements-fleet; do \
+		$(BIN)/pip-audit --strict --disable-pip --require-hashes --requirement $$lock.hashes.lock || exit 1; \
+	done
 
 bandit: install-dev
 	$(BIN)/python -m pip --disable-pip-version-check install --quiet "bandit>=1.8,<2"

@@ -235,7 +235,7 @@ def test_the_steps_of_the_image_make_a_service_that_answers(tmp_path: Path) -> N
         assert process.wait(30) == 0
 
 
-@pytest.mark.parametrize("lock", ["requirements", "requirements-dev"])
+@pytest.mark.parametrize("lock", ["requirements", "requirements-dev", "requirements-fleet"])
 def test_the_lock_with_hashes_is_the_lock(lock: str) -> None:
     def pinned(name: str) -> list[str]:
         lines = (ROOT / name).read_text(encoding="utf-8").splitlines()

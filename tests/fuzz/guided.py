@@ -21,7 +21,11 @@ from typing import Any
 
 KEPT = Path(__file__).parents[1] / "data" / "guided"
 OURS = ["sprung.replay", "sprung.model.system", "sprung.model.systemfile", "sprung.model.schema"]
-THEIRS = {"mf4": ["asammdf"], "tdms": ["nptdms"], "dbc": ["cantools"]}  # parsers in Python, which show their branches
+THEIRS = {
+    "mf4": ["asammdf.blocks.v4_blocks"],
+    "tdms": ["nptdms"],
+    "dbc": ["cantools"],
+}  # parsers in Python, which show their branches
 LONGEST = 40_000  # bytes of an input
 MEMORY = 1_500  # MB that a process may hold
 PATIENCE = 900  # s by the clock: what an input may take is counted in processor time (`harness.SECONDS`)

@@ -13,7 +13,9 @@ import pytest
 from sprung.replay import UnreadableRecording, open_recording
 from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
-from tests.fuzz.harness import run
+from sprung.service.cli import main
+from tests.fuzz.guided import KEPT
+from tests.fuzz.harness import MutantOutcome, read_one, run
 from tests.fuzz.hostile import ROWS
 from tests.fuzz.seeds import NEEDS, SEEDS, TABLE
 from tests.replay_files import database
@@ -73,3 +75,25 @@ def test_a_hostile_file_costs_little_and_its_good_samples_are_kept(path: Path) -
 
 def test_the_corpus_is_small() -> None:
     assert sum(path.stat().st_size for path in HOSTILE) < 600_000
+
+
+@pytest.mark.parametrize("kind", sorted(folder.name for folder in KEPT.iterdir() if folder.name in SEEDS))
+def test_what_guided_fuzzing_kept_is_read_or_refused(kind: str, tmp_path: Path) -> None:
+    if kind in NEEDS and importlib.util.find_spec(NEEDS[kind]) is None:
+        pytest.skip(f"{NEEDS[kind]} is not installed")
+    outcome, path = MutantOutcome(kind), tmp_path / SEEDS[kind][0]
+    for kept in sorted((KEPT / kind).iterdir()):
+        path.write_bytes(kept.read_bytes())
+        read_one(path, database(), False, outcome)
+    assert not outcome.faults and outcome.read + outcome.refused >= 1
+
+
+@pytest.mark.slow
+def test_a_file_that_crashes_the_library_that_reads_it_is_one_line(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Found by guided fuzzing: libhdf5 ends by SIGSEGV, in a process of its own."""
+    monkeypatch.setenv("SPRUNG_ISOLATE_READING", "true")
+    pytest.importorskip("h5py")
+    assert main(["inspect", str(KEPT.parent / "crashes" / "libhdf5-segv.h5")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
