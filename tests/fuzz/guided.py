@@ -112,7 +112,7 @@ def _here(kind: str, seconds: int, seed: int, keep: Path) -> None:
                 return INSIDE[kind](data, np.random.default_rng(number))[:most]
             except Exception:  # what was changed before has no inside any more
                 return atheris.Mutate(data, len(data) + 1)[:most]
-        return atheris.Mutate(data, most)  # type: ignore[no-any-return]
+        return atheris.Mutate(data, most)
 
     options = [f"-max_total_time={seconds}", f"-max_len={LONGEST}", f"-seed={seed}", f"-rss_limit_mb={MEMORY}"]
     options += [f"-timeout={PATIENCE}", "-print_final_stats=1", f"-artifact_prefix={keep}/{kind}-", "-verbosity=1"]
