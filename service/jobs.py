@@ -1,4 +1,4 @@
-"""Work that goes on after its request was answered: one thread, a bounded queue, everything in the store.
+"""Work that goes on after its request was answered: a thread for each kind, a bounded queue, everything in the store.
 
 What was accepted survives: a job that a stop interrupts is queued again and goes on at the next start (windows are
 stored once, so doing a part twice changes nothing).  A job that was at work when its process died is tried once more,
@@ -86,18 +86,21 @@ class Kind:
 
 
 class Jobs:
-    """Accepts jobs and works through them in order."""
+    """Accepts jobs and works through those of a kind in order; a recording does not wait for a diagnosis of minutes."""
 
     def __init__(self, store: Store, kinds: Mapping[str, Kind], queue_size: int) -> None:
         self._store = store
         self._kinds = kinds
         self._limit = queue_size
-        self._queue: queue.Queue[str | None] = queue.Queue()
+        self._queues: dict[str, queue.Queue[str | None]] = {kind: queue.Queue() for kind in kinds}
         self._waiting = 0
         self._lock = threading.Lock()
         self._stopping = threading.Event()
-        self._current: tuple[str, Progress] | None = None
-        self._thread = threading.Thread(target=self._run, name="sprung-jobs", daemon=True)
+        self._current: dict[str, Progress] = {}  # of the jobs that run
+        self._threads = [
+            threading.Thread(target=self._run, args=(waiting,), name=f"sprung-jobs-{kind}", daemon=True)
+            for kind, waiting in self._queues.items()
+        ]
 
     @property
     def waiting(self) -> int:
@@ -109,8 +112,9 @@ class Jobs:
         with self._store.write() as connection:
             left = [job for job in work.unfinished_jobs(connection) if not self._poisonous(connection, job)]
         for job in left:
-            self._enqueue(job.id)
-        self._thread.start()
+            self._enqueue(job)
+        for thread in self._threads:
+            thread.start()
 
     def reserve(self) -> None:
         """Raise Busy when no further job can be accepted now."""
@@ -134,7 +138,7 @@ class Jobs:
                     return waiting
             job = work.JobRow(work.new_id(), kind, "queued", recording_id, vehicle, 0.0, None, None, now, now)
             work.add_job(connection, job)
-        self._enqueue(job.id)
+        self._enqueue(job)
         return job
 
     def cancel(self, job_id: str, by: str) -> work.JobRow:
@@ -145,18 +149,20 @@ class Jobs:
                 raise NotFound(f"no job {job_id[:36]!r}")
             if job.state in work.UNFINISHED:
                 work.update_job(connection, job_id, now_ns(), state="failed", error=f"cancelled by {by}"[:500])
-        current = self._current
-        if current is not None and current[0] == job_id:
-            current[1].cancel()
+        running = self._current.get(job_id)
+        if running is not None:
+            running.cancel()
         with self._store.read() as connection:
             return work.get_job(connection, job_id) or job
 
     def close(self) -> None:
-        """Interrupt the running job; it and the waiting ones stay queued in the store."""
+        """Interrupt the running jobs; they and the waiting ones stay queued in the store."""
         self._stopping.set()
-        self._queue.put(None)
-        if self._thread.is_alive():
-            self._thread.join()
+        for waiting in self._queues.values():
+            waiting.put(None)
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join()
 
     def _poisonous(self, connection: Connection, job: work.JobRow) -> bool:
         """Fail a job that was at work each time when the process died."""
@@ -167,14 +173,15 @@ class Jobs:
         work.update_job(connection, job.id, now_ns(), state="failed", error=error)
         return True
 
-    def _enqueue(self, job_id: str) -> None:
+    def _enqueue(self, job: work.JobRow) -> None:
         with self._lock:
             self._waiting += 1
-        self._queue.put(job_id)
+        # one of a kind that this version does not know fails wherever it is taken up
+        self._queues.get(job.kind, next(iter(self._queues.values()))).put(job.id)
 
-    def _run(self) -> None:
+    def _run(self, waiting: queue.Queue[str | None]) -> None:
         while not self._stopping.is_set():
-            job_id = self._queue.get()
+            job_id = waiting.get()
             if job_id is None:
                 return
             try:
@@ -182,7 +189,9 @@ class Jobs:
             except Exception:  # the thread must outlive a store that does not answer
                 log.exception("job %s could not be begun; it is tried again", job_id)
                 self._stopping.wait(RETRY_SECONDS)
-                self._enqueue(job_id)
+                with self._lock:
+                    self._waiting += 1
+                waiting.put(job_id)
             finally:
                 with self._lock:
                     self._waiting -= 1
@@ -195,12 +204,12 @@ class Jobs:
             work.update_job(connection, job_id, now_ns(), state="running", attempts=job.attempts + 1)
         kind = self._kinds.get(job.kind)
         progress = Progress(lambda share: self._note(job_id, share), self._stopping, kind.seconds if kind else 0.0)
-        self._current = (job_id, progress)
+        self._current[job_id] = progress
         started = time.monotonic()
         try:
             values = self._outcome(kind, job, progress)
         finally:
-            self._current = None
+            del self._current[job_id]
         self._finish(job_id, values)
         log.info(
             "job ended",

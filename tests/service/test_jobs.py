@@ -110,6 +110,22 @@ def test_jobs_are_cancelled_while_they_run_and_while_they_wait(store: Store) -> 
     jobs.close()
 
 
+def test_a_short_job_does_not_wait_for_a_long_one_of_another_kind(store: Store) -> None:
+    end = threading.Event()
+
+    def slow(_job: JobRow, _progress: Progress) -> dict[str, Any]:
+        return {"ended": end.wait(30)}
+
+    jobs = Jobs(store, {"slow": Kind(slow, 60), "quick": Kind(nothing, 60)}, 4)
+    jobs.start()
+    long, short = jobs.submit("slow"), jobs.submit("quick")
+    eventually(lambda: stored(store, short.id).state == "done")
+    assert stored(store, long.id).state == "running"
+    end.set()
+    eventually(lambda: stored(store, long.id).state == "done")
+    jobs.close()
+
+
 def test_a_store_that_refuses_the_end_of_a_job_is_asked_again(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sprung.service.jobs.RETRY_SECONDS", 0.05)
     refusals = 3
