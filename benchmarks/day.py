@@ -23,7 +23,7 @@ from sprung.benchmarks.generator.ride import SYSTEM
 from sprung.benchmarks.generator.running import run_day
 from sprung.benchmarks.generator.timetable import MONTH, REFERENCE, Service, channel_names, draw_timetable
 from sprung.benchmarks.generator.vehicle import read_vehicle
-from sprung.benchmarks.hours import full_hours
+from sprung.benchmarks.hours import HOUR, full_hours
 from sprung.benchmarks.keeping import keep, kept
 from sprung.model.identification.deviations import CARGO, OWN, deviations
 from sprung.model.identification.identify import Identifier
@@ -250,12 +250,15 @@ def run(
     hours: int = 0,
     folder: Path | None = None,
     part: str = "1/1",
+    seconds: float = HOUR,
+    cruise: str = "20-50",
 ) -> Iterator[dict[str, Any]]:
     """Healthy vehicles for `months` in all, a month each, every other with its temperature measured; then `faults`
     vehicles with a hidden one each; then `hours` of full simulation, see `benchmarks.hours`.
 
     folder: where vehicles that are done are kept; the same command goes on with the others (empty it when the code
-    changed).  part: "2/3": only every third vehicle, the second first, for processes beside each other with one folder.
+    changed).  seconds: of a full hour; cruise: m/s between its stops, "9-13" for a train that is never faster.
+    part: "2/3": only every third vehicle, the second first, for processes beside each other with one folder.
     """
     system = load_system()
     which, of = (int(x) for x in part.split("/"))
@@ -264,7 +267,9 @@ def run(
         yield from _healthy(lives, months)
         yield from _hidden(lives, faults)
     if hours:
-        yield from full_hours((number for number in range(hours) if number % of == which - 1), seed, folder)
+        slow, fast = (float(x) for x in cruise.split("-"))
+        ours = (number for number in range(hours) if number % of == which - 1)
+        yield from full_hours(ours, seed, folder, seconds=seconds, cruise=(slow, fast))
 
 
 def _healthy(some: Lives, months: float) -> Iterator[dict[str, Any]]:

@@ -29,14 +29,25 @@ SETTLED = 60.0  # s of the day after which values are held against the truth
 SILENT = 3.0  # stated deviations
 
 
-def full_hours(numbers: Iterable[int], seed: int, folder: Path | None = None) -> Iterator[dict[str, Any]]:
-    """One vehicle each; a row as each is done, taken from `folder` where it has run before."""
+def full_hours(
+    numbers: Iterable[int],
+    seed: int,
+    folder: Path | None = None,
+    *,
+    seconds: float = HOUR,
+    cruise: tuple[float, float] = Service.cruise,
+) -> Iterator[dict[str, Any]]:
+    """One vehicle each; a row as each is done, taken from `folder` where it has run before.
+
+    seconds: of each; cruise: m/s, slowest and fastest between stops.
+    """
     for number in numbers:
         file = None if folder is None else folder / f"hour-{seed}-{number}.json"
-        told = kept(file, [seed, number])
+        settings = [seed, number, seconds, list(cruise)]
+        told = kept(file, settings)
         if told is None:
-            told = _hour(number, seed)
-            keep(file, [seed, number], told)
+            told = _hour(number, seed, seconds, cruise)
+            keep(file, settings, told)
         yield told
 
 
@@ -45,10 +56,10 @@ def _product() -> tuple[Engine, Vehicle]:
     return load_engine(settings_with({})), read_vehicle(SYSTEM)
 
 
-def _hour(number: int, seed: int) -> dict[str, Any]:
+def _hour(number: int, seed: int, seconds: float, cruise: tuple[float, float]) -> dict[str, Any]:
     begin = time.process_time()
     engine, vehicle = _product()
-    timetable = draw_timetable(vehicle, Service(), HOUR, 10_000 * seed + number, start=6 * HOUR)
+    timetable = draw_timetable(vehicle, Service(cruise=cruise), seconds, 10_000 * seed + number, start=6 * HOUR)
     ran, fast, scores, loads, state = 0, 0, [], [], None
     unused = {RUNNING: 0, EXCITED: 0}  # windows at these speeds or more
     for moment in through(engine, vehicle, timetable):

@@ -25,7 +25,7 @@ from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.law_flow import Flow
 from sprung.model.identification.law_forces import Acting, Along, shake, sharpened, slopes_of
 from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
-from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra
+from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra, normalised
 from sprung.model.laws import SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE
 from sprung.model.signals import FloatArray
@@ -250,8 +250,7 @@ class LawWindows:
         white = torch.where(sound[:, None, None], white, 0.0)
         N = point.x0.shape[1]
         free, J = white[:, :N], white[:, N:]
-        free_scale = free.square().sum(dim=2).sqrt().clamp_min(1e-300)
-        free = free / free_scale.unsqueeze(2)
+        free, free_scale = normalised(free)
         products = free @ free.mT
         factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(N, dtype=torch.float64))
         across_products = free @ J.mT

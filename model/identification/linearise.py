@@ -22,6 +22,7 @@ from sprung.model.system import System
 BAND = 0.3  # share of the sample rate up to which Hermite interpolation errs by less than 4 %
 PRIOR_STD = 1.0  # of a log-ratio: a factor e either way; weak beside any window that tells something
 _RIDGE = 1e-11  # relative, on the normalised free responses
+_UNSEEN = 1e-13  # of the largest free response: below is rounding; those that are seen differ by 1e-4, units included
 
 
 class WindowModel:
@@ -80,8 +81,7 @@ class WindowModel:
         white_residual = whiten @ self.spectra(residual).unsqueeze(3)  # (B, F, R, 1)
         white_free = whiten @ self.spectra(free)  # (B, F, R, N)
         r, basis = as_rows(white_residual), as_rows(white_free)  # (B, 1, K), (B, N, K)
-        free_scale = basis.square().sum(dim=2).sqrt().clamp_min(1e-300)
-        basis = basis / free_scale.unsqueeze(2)
+        basis, free_scale = normalised(basis)
         products = basis @ basis.mT
         factor = torch.linalg.cholesky(products + _RIDGE * torch.eye(products.shape[1], dtype=x.dtype))
         along = basis @ r.mT  # (B, N, 1)
@@ -350,6 +350,17 @@ def _inverse(stiffness: Tensor) -> Tensor:
         found = torch.where((failed != 0)[..., None, None], torch.linalg.pinv(stiffness), found)
     result: Tensor = found
     return result
+
+
+def normalised(free: Tensor) -> tuple[Tensor, Tensor]:
+    """Free responses (B, N, K) brought to length one, and what they were divided by, (B, N).
+
+    What no sensor shows, of a body without any, is rounding, and nothing here; of length one it would drown the others.
+    """
+    norm = free.square().sum(dim=2).sqrt()
+    seen = norm > _UNSEEN * norm.amax(dim=1, keepdim=True)
+    scale = torch.where(seen, norm, torch.ones_like(norm))
+    return torch.where(seen.unsqueeze(2), free / scale.unsqueeze(2), 0.0), scale
 
 
 def as_rows(spectra: Tensor) -> Tensor:

@@ -231,7 +231,7 @@ def measurement_lines(found: dict[str, Any]) -> list[str]:
         for one in found.get("built", [])
     ]
     loads = found.get("load") or {}
-    before = f", as of {found['load_as_of']}, before it stood" if found.get("load_as_of") else ""
+    before = f", as of {found['load_as_of']}; nothing since tells of it" if found.get("load_as_of") else ""
     return lines + [
         f"load: {body} {mass:+.0f} ± {std:.0f} kg against nominal{before}" for body, (mass, std) in loads.items()
     ]

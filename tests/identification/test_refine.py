@@ -109,6 +109,19 @@ def test_a_missing_sensor_widens_the_uncertainty_and_nothing_breaks(vehicle: tup
     assert np.allclose(refined.log_ratio[24:], whole.log_ratio[24:], atol=1e-6)
 
 
+@pytest.mark.parametrize("count", [3, 4, 8])  # sums are in another order from batch to batch
+def test_a_body_without_any_sensor_leaves_the_windows_of_the_others(
+    vehicle: tuple[System, FloatArray, Runs], count: int
+) -> None:
+    system, truth, runs = vehicle
+    windows = runs.values[:count].copy()
+    windows[:, :, [c.name.startswith("bogie2") for c in system.channels]] = np.nan
+    refined = Refiner(system).refine(windows)
+    assert refined.converged.all()
+    assert refined.chi_square.max() < 1.5
+    assert np.abs(scores(refined, truth[:count])).max() < 5
+
+
 def test_a_standing_vehicle_tells_nothing_and_says_so() -> None:
     system = load_system()
     noise = np.array([c.noise for c in system.channels])
