@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+NO_THREAD = "can't start new thread"  # what Python says when there is no memory for another stack
+
 
 class UserError(ValueError):
     """Input that cannot be used; the message is one line: what, where, what to do."""

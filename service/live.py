@@ -22,7 +22,7 @@ from sprung.model.signals import SampleBlock, Tally, Window
 from sprung.replay.beside import Beside
 from sprung.service.compute import Priority
 from sprung.service.engine import Engine
-from sprung.service.errors import Busy
+from sprung.service.errors import NO_THREAD, Busy
 from sprung.service.feed import OnTally
 from sprung.service.reading import windower_of
 
@@ -230,44 +230,58 @@ class LiveFeed:
                 self._pipeline.process(self.vehicle, windows, None, Priority.LIVE)
                 self._refused, self._failed_in_a_row = "", 0
                 return
-            except PASSING as error:
+            except Exception as error:
+                if not _passes(error):
+                    self._leave_out(windows, error)
+                    return
                 if not self._refused:
                     log.error("%s: windows cannot be stored (%s); trying again", self.source.name, _line(error))
                 self._refused = _line(error)
                 if self._stopping.wait(retry):
                     return  # said above; the service may not wait for a store that is gone
                 retry = min(2.0 * retry, LAST_RETRY)
-            except Exception as error:
-                if len(windows) > 1:  # which of them?
-                    for window in windows:
-                        self._store([window])
-                    return
-                self._failed += 1
-                self._failed_in_a_row += 1
-                self._failure = _line(error)
-                log.exception("%s: a window could not be identified and is left out", self.source.name)
-                return
+
+    def _leave_out(self, windows: list[Window], error: Exception) -> None:
+        """Count the window that the numerics cannot take; of several, find out which."""
+        if len(windows) > 1:
+            for window in windows:
+                self._store([window])
+            return
+        self._failed += 1
+        self._failed_in_a_row += 1
+        self._failure = _line(error)
+        log.error("%s: a window could not be identified and is left out", self.source.name, exc_info=error)
 
     def _watch(self) -> None:
-        """Start the reader or the writer anew when it has died or hangs."""
+        """Start the reader or the writer anew when it has died or hangs; again, where there is no thread for it."""
         while not self._stopping.wait(WATCH_SECONDS):
-            if not self._keeping.is_alive():
-                self._restarts += 1
-                self._keeping = self._thread(self._keep)
-                self._keeping.start()
-            beat = getattr(self.source, "beat", time.monotonic())
-            if self._ended or (self._reading.is_alive() and time.monotonic() - beat < HUNG_SECONDS):
-                self._hung = self._hung and beat <= self._begun  # until the one that was started gives a sign
-                continue
-            log.error("the reader of %s gives no sign; another one is started", self.source.name)
+            try:
+                self._look()
+            except Exception as error:
+                log.error("%s: what has ended could not be started anew (%s)", self.source.name, _line(error))
+
+    def _look(self) -> None:
+        if not self._keeping.is_alive():
             self._restarts += 1
-            self._hung = True
-            self._turn += 1
-            self._begun = time.monotonic()
-            if hasattr(self.source, "beat"):
-                self.source.beat = self._begun
-            self._reading = self._thread(self._read)
-            self._reading.start()
+            self._keeping = self._thread(self._keep)
+            self._keeping.start()
+        beat = getattr(self.source, "beat", time.monotonic())
+        if self._ended or (self._reading.is_alive() and time.monotonic() - beat < HUNG_SECONDS):
+            self._hung = self._hung and beat <= self._begun  # until the one that was started gives a sign
+            return
+        log.error("the reader of %s gives no sign; another one is started", self.source.name)
+        self._restarts += 1
+        self._hung = True
+        self._turn += 1
+        self._begun = time.monotonic()
+        if hasattr(self.source, "beat"):
+            self.source.beat = self._begun
+        self._reading = self._thread(self._read)
+        self._reading.start()
+
+
+def _passes(error: Exception) -> bool:
+    return isinstance(error, PASSING) or str(error) == NO_THREAD
 
 
 def _line(error: Exception) -> str:

@@ -10,7 +10,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import inf
 from pathlib import Path
 from types import FrameType
@@ -29,7 +29,7 @@ from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
 from sprung.service.live import LiveFeed
 from sprung.service.lock import held
 from sprung.service.numerics import numerics
-from sprung.service.recordings import file_row, finish_row
+from sprung.service.recordings import file_row, finish_row, reading_limits
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
 from sprung.service.store.work import add_recording
@@ -166,6 +166,12 @@ def live_feed(core: Core, text: str, vehicle: str | None) -> LiveFeed:
     return LiveFeed(core.pipeline, bus, name, core.stopping, core.tally_counter(bus.name))
 
 
+def _limits(settings: Settings, path: Path, speed: float) -> ProcessLimits:
+    """What reading a file that is replayed may use: as of an upload, but it may take as long as its ride did."""
+    limits = reading_limits(settings, path)
+    return replace(limits, seconds=inf, silence_seconds=inf if speed else limits.silence_seconds)
+
+
 def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
     def check() -> None:
         if core.stopping.is_set():
@@ -184,7 +190,7 @@ def _feed_files(core: Core, feeds: Feeds, watch: Watch) -> None:
                 recording_id=row.id,
                 batch_windows=core.settings.batch_windows,
                 speed=feeds.speed,
-                limits=ProcessLimits(inf, inf, core.settings.worker_memory_bytes),
+                limits=_limits(core.settings, path, feeds.speed),
                 on_batch=on_batch,
                 on_tally=core.tally_counter("file"),
                 check=check,

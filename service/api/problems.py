@@ -19,13 +19,12 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
 
-from sprung.service.errors import Busy, NoSpace, NotFound, UserError
+from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, UserError
 from sprung.service.pages.render import render
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers
 
-NO_THREAD = "can't start new thread"  # what Python says when there is no memory for another stack
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 WAIT = {"Retry-After": "10"}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import threading
 import time
 from collections.abc import Iterator
@@ -24,7 +25,7 @@ from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
 from sprung.service.feed import feed_file, vehicle_of
 from sprung.service.live import LiveFeed
-from sprung.service.main import Feeds, live_feed
+from sprung.service.main import Feeds, _limits, live_feed
 from sprung.service.pipeline import Pipeline
 from sprung.service.reading import prefetched
 from sprung.service.settings import Settings
@@ -365,3 +366,11 @@ def test_no_recent_samples_is_told(core: Core) -> None:
     with pytest.raises(UserError, match="no recent samples"):
         core.diagnoses.from_excerpt("nobody")
     core.close()
+
+
+@pytest.mark.parametrize(("speed", "silence"), [(0.0, 60.0), (1.0, math.inf)])
+def test_a_replayed_file_is_bounded_in_processor_time_and_silence(tmp_path: Path, speed: float, silence: float) -> None:
+    """At the speed of the ride a pause of the recording is a silence."""
+    (tmp_path / "a.csv").write_bytes(bytes(10_000_000))
+    limits = _limits(Settings(data_dir=tmp_path), tmp_path / "a.csv", speed)
+    assert (limits.silence_seconds, limits.seconds, limits.cpu_seconds) == (silence, math.inf, 160)

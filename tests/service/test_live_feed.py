@@ -152,6 +152,34 @@ def test_a_window_that_the_numerics_cannot_take_costs_itself_only(
     assert feed.status().state == "receiving"
 
 
+def test_no_thread_to_be_had_loses_no_window_and_no_watchdog(
+    core: Core, feed: LiveFeed, identifier: FakeIdentifier, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, short = identifier.identify, threading.Event()
+    short.set()
+
+    def scarce(*arguments: Any, **named: Any) -> Any:
+        if short.is_set():
+            raise RuntimeError("can't start new thread")
+        return real(*arguments, **named)
+
+    def look() -> None:
+        if short.is_set():
+            looked.set()
+            raise RuntimeError("can't start new thread")
+
+    looked = threading.Event()
+    monkeypatch.setattr("sprung.service.live.WATCH_SECONDS", 0.05)
+    monkeypatch.setattr(identifier, "identify", scarce)
+    monkeypatch.setattr(feed, "_look", look)
+    feed.start()
+    assert looked.wait(5)
+    eventually(lambda: feed.status().state == "failing" and "new thread" in feed.status().detail)
+    short.clear()
+    eventually(lambda: len(stored(core)) > 3 and feed.status().state == "receiving")
+    assert feed.status().failed_windows == 0 and feed._watching.is_alive()
+
+
 def test_a_feed_whose_every_window_fails_is_not_ready(
     core: Core, feed: LiveFeed, identifier: FakeIdentifier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
