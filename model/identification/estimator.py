@@ -29,6 +29,7 @@ from sprung.model.system import System
 WEIGHTS = Path(__file__).parents[1] / "weights"
 FORMAT = 1
 _LOWEST_RATIO = 0.05
+_LOST = 2.0  # log-ratio of an estimate at the bounds of its normal equations, 2.3; the network adds some
 
 
 class ModelError(ValueError):
@@ -167,6 +168,15 @@ class Estimator:
 
         parts = share(work, chunks(np.arange(len(windows))), workers)
         return EstimatorOutput(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+
+    def start(self, windows: FloatArray, workers: int = 1, *, loads: bool = False) -> FloatArray:
+        """Log-ratios to refine from, as `estimate` has them; nominal where it is at its bounds.
+
+        There its normal equations hold nothing of some parameter, as of a bogie without any sensor.
+        """
+        found = self.estimate(windows, workers, loads=loads).log_ratio
+        lost = (np.abs(found[:, : len(self.system.parameters)]) > _LOST).any(axis=1)
+        return np.where(lost[:, None], 0.0, found)
 
 
 def new_estimator(system: System, seed: int = 0) -> EstimatorNet:

@@ -68,7 +68,7 @@ class Identifier:
         begin = time.perf_counter()
         loads = bool(self.system.loads) if explain else any(load.declared for load in self.system.loads)
         if start is None and self.estimator is not None and windows.shape[1] == self.estimator.samples:
-            start = self.estimator.estimate(windows, self.workers, loads=loads).log_ratio
+            start = self.estimator.start(windows, self.workers, loads=loads)
         between = time.perf_counter()
         refiner, built = self._refiner(windows.shape[1]), explain and bool(self.system.built)
         refined = refiner.refine(windows, start, states=states, loads=loads, built=built, weigh=weigh)
@@ -141,7 +141,7 @@ class Identifier:
             estimator = self.estimator
             fitting = estimator is not None and estimator.samples == samples
             loads = bool(self.system.loads)
-            start = (lambda w: estimator.estimate(w, loads=loads).log_ratio) if estimator and fitting else None
+            start = (lambda w: estimator.start(w, loads=loads)) if estimator and fitting else None
             self._explainers[samples] = Explainer(self.system, samples, self._refiner, start)
         return self._explainers[samples]
 

@@ -179,3 +179,14 @@ def test_linear_changes_of_masses_become_the_terms_of_a_load() -> None:
     along, aside = (coupling[0, 0, at] * (factors[0] * factors[at]).sqrt() for at in (2, 1))
     linear = torch.stack([factors[0] - 1, factors[1] - factors[0], factors[2] - factors[0], along, aside])[None]
     np.testing.assert_allclose(loading.terms_of(linear).numpy(), terms.numpy(), atol=1e-12)
+
+
+@pytest.mark.parametrize("body", ["bogie2", "car"])
+def test_a_body_without_any_sensor_does_not_lead_the_refinement_astray(body: str) -> None:
+    system = load_system()
+    rng = np.random.default_rng(6)
+    truth = np.log(rng.uniform(0.9, 1.1, (4, 24)))
+    windows = simulate_runs(system, truth, system.window, rng).values
+    windows[:, :, [c.name.startswith(body) for c in system.channels]] = np.nan
+    found = load_identifier(system).examine(windows, np.ones(4, dtype=bool))
+    assert all(e.adequate and e.iterations < 5 for e in found)
