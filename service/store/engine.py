@@ -15,6 +15,7 @@ from typing import Any
 
 from alembic import command
 from alembic.config import Config
+from alembic.util import CommandError
 from pydantic_core import to_json
 from sqlalchemy import URL, Connection, Engine, Table, create_engine, event, text
 from sqlalchemy.dialects import postgresql, sqlite
@@ -114,6 +115,8 @@ def open_store(url: str, migrated: bool = False) -> Store:
         raise UserError(f"store {shown}: {error.name} is missing; pip install 'sprung[fleet]'") from error
     except (ArgumentError, NoSuchModuleError) as error:
         raise UserError(f"store {shown}: not a usable database URL ({_first_line(error)})") from error
+    except CommandError as error:  # a revision that this version does not know
+        raise UserError(f"store {shown}: a newer version of Sprung has written it; nothing was changed") from error
     except (DatabaseError, OSError) as error:
         raise UserError(f"store {shown}: cannot be opened ({_first_line(error)})") from error
     return store

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -60,6 +61,18 @@ def test_sqlite_runs_in_wal_mode_with_foreign_keys(store: Store) -> None:
         assert connection.execute(text("PRAGMA journal_mode")).scalar_one() == "wal"
         assert connection.execute(text("PRAGMA foreign_keys")).scalar_one() == 1
         assert connection.execute(text("PRAGMA synchronous")).scalar_one() == 2  # FULL
+
+
+def test_a_store_of_a_newer_version_is_refused_in_words_and_left_alone(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    open_store(str(path)).close()
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("update alembic_version set version_num = '9999'")
+        connection.commit()
+        before = list(connection.iterdump())
+        with pytest.raises(UserError, match="newer version of Sprung"):
+            open_store(str(path))
+        assert list(connection.iterdump()) == before
 
 
 def test_opening_again_changes_nothing(tmp_path: Path) -> None:
