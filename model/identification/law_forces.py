@@ -26,7 +26,7 @@ from sprung.model.laws.trajectory import phi, recall
 from sprung.model.signals import FloatArray
 
 FINE = 16  # steps per sample of laws without memory
-_FINE_MEMORY = 2  # of those with, whose steps are of fourth order
+_FINE_MEMORY = 4  # of those with, whose steps are of fourth order; with 2, hysteresis that yields within a step is off
 _NODES = 4  # samples whose deflections and rates tell the motion between two of them
 _REACH = 8  # samples of the filter to each side
 _NEAR = 1e-4  # of the rms motion, for slopes
