@@ -96,7 +96,7 @@ class Attribution:
             alarms = self._with_sensor(alarms, state, jump, now)
         alarms = self._with_crept(alarms, crept, state, now)
         alarms = self._with_stuck(alarms, state, now)
-        alarms = self._with_common(alarms, common, now)
+        alarms = self._with_common(alarms, common, drift, now)
         alarms = self._with_changes(alarms, state, drift, now)
         alarms += [
             self._overload(Alarm("load", f"{body}.load", now, now, "warning"), excess, std)
@@ -164,14 +164,21 @@ class Attribution:
         prefix = "".join(c[0] for c in takewhile(lambda column: len(set(column)) == 1, letters))
         return f"{prefix.rstrip('0123456789')}*.{quantity}"
 
-    def _with_common(self, alarms: list[Alarm], common: list[tuple[str, float, float]], now: int) -> list[Alarm]:
+    def _with_common(
+        self, alarms: list[Alarm], common: list[tuple[str, float, float]], drift: Drift, now: int
+    ) -> list[Alarm]:
         """Opens one alarm for a kind that moved together."""
         opened = [a.parameter or "" for a in alarms if a.closed is None and a.kind == "change"]
-        fresh = [c for c in common if not any(fnmatchcase(c[0], name) for name in opened)]
-        return alarms + [
-            self._followed(Alarm("change", name, now, now, "warning", 0.0, 0.0, 0.0), change, std)
-            for name, change, std in fresh
-        ]
+        whole = replace(drift, change=drift.whole)
+        out = list(alarms)
+        for name, change, std in common:
+            if any(fnmatchcase(name, other) for other in opened):
+                continue
+            members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
+            heavier = self._masses_of(members.tolist(), whole)
+            alarm = Alarm("change", name, now, now, "warning", 0.0, 0.0, 0.0, alternatives=heavier)
+            out.append(self._followed(alarm, change, std))
+        return out
 
     def _overloads(self, state: TrackerState, certain: float = CERTAIN) -> dict[str, tuple[float, float]]:
         """Bodies that carry more, or less, than they may: by how much of the empty mass, and its standard deviation."""
@@ -212,11 +219,14 @@ class Attribution:
             others = self._alternatives(int(i), state, drift, int(since[i]), now)
             if others is None:
                 continue
-            heavier = self._masses_of(int(i), whole)
-            others = (*others, *heavier)
+            others = (*others, *self._masses_of([int(i)], whole))
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
             if not kinds and along and self._all_move(whole, members):
-                name, (change, std), others = together, _common(whole, members), heavier
+                name, (change, std), others = (
+                    together,
+                    _common(whole, members),
+                    self._masses_of(members.tolist(), whole),
+                )
             alarm = Alarm("change", name, int(since[i]), now, "warning", 0.0, 0.0, 0.0, alternatives=others)
             alarmed.add(name)
             out.append(self._followed(alarm, change, std))
@@ -239,12 +249,12 @@ class Attribution:
         """Change that all elements of a kind must show for an alarm of theirs: a middle is surer than one element."""
         return self.settings.change / 4
 
-    def _masses_of(self, i: int, drift: Drift) -> tuple[str, ...]:
-        """Masses that would explain the change of parameter `i` as well: of bodies at which all have changed alike."""
+    def _masses_of(self, changed: Sequence[int], drift: Drift) -> tuple[str, ...]:
+        """Masses that would explain what `changed` as well: of bodies at which all springs and dampers did alike."""
         found = []
         for body, elements in self.masses.items():
             at = np.flatnonzero([n.rpartition(".")[0] in elements for n in self.names])
-            if i in at and len({self.kinds[k] for k in at}) > 1 and self._all_move(drift, at):
+            if np.isin(changed, at).any() and len({self.kinds[k] for k in at}) > 1 and self._all_move(drift, at):
                 found.append(f"{body}.mass")
         return tuple(found)
 
