@@ -270,6 +270,7 @@ class VerdictRules:
     clear: float = rule(1.5, "error over the floor, pooled, up to which nothing is left; chosen", 1.25, 2.0)
     clear_sensor: float = rule(2.0, "the same of a single sensor; chosen", 1.6, 3.0)
     carried: float = rule(0.5, "of the excess error; derived: findings explain more than they leave", 0.3, 0.7)
+    gross: float = rule(0.1, "of a sensor's power, left by what is no more a name; chosen: 30 % of it", 0.05, 0.2)
     rejected: float = rule(0.6, "error over the signal, of another vehicle than the file's; chosen", 0.45, 0.8)
     least: float = rule(2e-3, "error over the signal that sampling leaves of a perfect model; derived", 1e-3, 4e-3)
     spread: float = rule(4.0, "standard deviations of a level; derived: one in 16 000 leaves them", 3.0, 6.0)

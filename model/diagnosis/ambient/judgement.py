@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
@@ -94,7 +94,7 @@ def judged(
     rules = options.rules
     kinds = [kind_of(SENSOR_STUCK)] * len(prepared.stuck)
     kinds += [kind_of(VARYING[system.parameters[int(p)].quantity]) for p in np.flatnonzero(pooled.varying)]
-    verdict = verdict_of(kinds, errors, rules.verdict)
+    verdict = verdict_of(kinds, errors, replace(rules.verdict, gross=1.0))  # of power elsewhere, no run's error
     return AmbientJudgement(
         errors=errors,
         verdict=verdict,

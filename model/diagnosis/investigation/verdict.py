@@ -94,7 +94,8 @@ def verdict_of(
     if not named:
         return "unknown_physics" if left or ended else "consistent"
     share = errors.explained(rules)
-    if left and share is not None and share < rules.carried:
+    gross = float(np.max(errors.unexplained(rules), initial=0.0)) > rules.gross
+    if gross or (left and share is not None and share < rules.carried):
         return "unknown_physics"
     physics = [kind for kind in named if kind is not EffectKind.FAULT]
     if not physics:

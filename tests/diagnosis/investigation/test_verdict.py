@@ -36,6 +36,7 @@ EFFECTS = {law.name: kind_of(law) for law in CATALOGUE} | {UNKNOWN: EffectKind.U
         ([], 0.587, 0.587, 0.018, "unknown_physics"),
         (["bouc_wen"], 0.33, 0.08, 0.03, "missing_physics"),
         (["bouc_wen"], 0.339, 0.301, 0.055, "unknown_physics"),
+        (["time_varying_stiffness"], 1.4, 0.51, 0.03, "unknown_physics"),  # most of what was there, and half is left
         (["unknown"], 0.6, 0.1, 0.05, "unknown_physics"),
         (["sensor_gain"], 0.3, 0.03, 0.03, "sensor_fault"),
         (["sensor_bias"], 1.45, 1.01, 0.1, "unknown_physics"),
