@@ -22,7 +22,7 @@ from torch import Tensor, nn
 
 from sprung.model.chunks import chunks, share
 from sprung.model.identification.features import ForceBalance
-from sprung.model.signals import FloatArray, IntArray
+from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.simulate.loading import load_terms
 from sprung.model.system import System
 
@@ -175,7 +175,8 @@ class Estimator:
         There its normal equations hold nothing of some parameter, as of a bogie without any sensor.
         """
         found = self.estimate(windows, workers, loads=loads).log_ratio
-        lost = (np.abs(found[:, : len(self.system.parameters)]) > _LOST).any(axis=1)
+        P = len(self.system.parameters)
+        lost: BoolArray = np.asarray((np.abs(found[:, :P]) > _LOST).any(axis=1))
         return np.where(lost[:, None], 0.0, found)
 
 

@@ -188,5 +188,5 @@ def test_a_body_without_any_sensor_does_not_lead_the_refinement_astray(body: str
     truth = np.log(rng.uniform(0.9, 1.1, (4, 24)))
     windows = simulate_runs(system, truth, system.window, rng).values
     windows[:, :, [c.name.startswith(body) for c in system.channels]] = np.nan
-    found = load_identifier(system).examine(windows, np.ones(4, dtype=bool))
+    found = Identifier(system, bundled_estimator(system)).examine(windows, np.ones(4, dtype=bool))
     assert all(e.adequate and e.iterations < 5 for e in found)
