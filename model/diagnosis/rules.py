@@ -225,6 +225,9 @@ class NoiseRules:
     blocks: int = rule(24, "of the band, whose median is a sensor's level; chosen: physics fills few", 12, 48)
     own: float = rule(0.01, "of a bin's variance, from which it tells a sensor's own noise; chosen", 0.003, 0.03)
     fall: float = rule(0.01, "of a force's noise power, that one round may leave; chosen: steps of ten", 0.003, 0.1)
+    misdeclared: float = rule(
+        10.0, "times a declared noise, that a displacement may show; chosen: a slip of ten", 5.0, 20.0
+    )
     displacement: float = rule(0.5, "of the bins that tell a support's displacement; derived: the fast half", 0.3, 0.7)
     velocity: float = rule(0.15, "of them its velocity; derived: the slow ones alone", 0.08, 0.3)
 

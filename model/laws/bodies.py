@@ -116,7 +116,9 @@ FLEXIBLE_MODE = BodyLaw(
     title="elastic mode of the body",
     parameters=(
         ParameterSpec("frequency", "Hz", 0.2, 500.0, "natural frequency of the free body", lambda s: 10.0, log=True),
-        ParameterSpec("damping_ratio", "1", 1e-4, 0.5, "share of critical damping", lambda s: 0.02, log=True),
+        ParameterSpec(  # car bodies, fitted out, have 0.01 to 0.05
+            "damping_ratio", "1", 1e-4, 0.5, "share of critical damping", lambda s: 0.02, log=True, plausible=(0.0, 0.2)
+        ),
         ParameterSpec(
             "participation", "1", 0.0, 10.0, "mass of the body over modal mass, times shape^2 there", lambda s: 0.3
         ),

@@ -17,12 +17,12 @@ from sprung.model.diagnosis.component.motion import (
     element_motion,
     noise_at_rest,
     still_stretches,
-    white_noise,
     without_gaps,
 )
 from sprung.model.diagnosis.component.own import observed, own_pieces
 from sprung.model.diagnosis.component.piece import Piece
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError
+from sprung.model.diagnosis.record.signals import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
 from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate

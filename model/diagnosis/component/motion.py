@@ -9,21 +9,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from scipy.ndimage import median_filter, uniform_filter1d
 
+from sprung.model.diagnosis.record.signals import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.signals import FloatArray
 
 ComplexArray = NDArray[np.complexfloating]
 
 _FINER, _MOST = 4, 100_000  # steps per sample along which memories are followed, and all of them at most
-_ORDER = 6  # of the differences that tell white noise
-_BLOCKS = 40  # of them, the median counts: bursts are no noise
 
 
 @dataclass(frozen=True)
@@ -164,16 +162,6 @@ def without_gaps(series: FloatArray) -> FloatArray:
         return series
     at = np.arange(len(series))
     return np.interp(at, at[good], series[good])
-
-
-def white_noise(series: FloatArray) -> float:
-    """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
-
-    Smooth motion leaves them by its power above about a third of the sample rate only.
-    """
-    differences = np.diff(series, _ORDER) ** 2 / comb(2 * _ORDER, _ORDER)
-    blocks = np.array_split(differences, min(_BLOCKS, max(1, len(differences) // 10)))
-    return float(np.sqrt(np.median([block.mean() for block in blocks])))
 
 
 def still_stretches(series: FloatArray, sample_rate: float, rules: ComponentRules = RULES.component) -> list[slice]:

@@ -15,7 +15,7 @@ from sprung.model.diagnosis.fit.smoothing import Working
 from sprung.model.diagnosis.fit.whitening import Whitener
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.record.channels import DiagnosisError
-from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, transform
+from sprung.model.diagnosis.record.signals import Noise, Signals, drifting, seen_noise, transform
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import given_terms
 from sprung.model.diagnosis.rules import RULES, Rules
@@ -68,6 +68,7 @@ def _begun(
     work: WorkBudget | None,
 ) -> tuple[Problem, Fit]:
     first = signals.part(0, split)
+    declared = seen_noise(first, declared, rules.noise.misdeclared)
     noise = input_noise(transform(first, declared), declared)
     part = transform(first, noise, differentiated=drifting(system, signals.sensor_index))
     problem = Problem(system, part, signals.sensor_index, noise, rules, memory, work)

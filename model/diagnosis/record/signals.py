@@ -26,6 +26,8 @@ from sprung.model.system import System
 
 _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _ORDER = 8  # of the differences that tell those
+_WHITE_ORDER = 6  # of the differences that tell white noise
+_WHITE_BLOCKS = 40  # of them, the median counts: bursts are no noise
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 
@@ -148,6 +150,30 @@ def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.
     levels = np.array(sensors) / np.sqrt(signals.averaged)
     least = rules.least_noise * np.minimum(levels, roughness(signals.sensors))
     return Noise(moved, rates, shaken, pushed, levels, least)
+
+
+def white_noise(series: FloatArray) -> float:
+    """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
+
+    Smooth motion leaves them by its power above about a third of the sample rate only.
+    """
+    differences = np.diff(series, _WHITE_ORDER) ** 2 / comb(2 * _WHITE_ORDER, _WHITE_ORDER)
+    blocks = np.array_split(differences, min(_WHITE_BLOCKS, max(1, len(differences) // 10)))
+    return float(np.sqrt(np.median([block.mean() for block in blocks])))
+
+
+def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:
+    """Noise of supports whose displacement is measured once: no less than their own fastest changes show.
+
+    A wheel or a table does not move near half the sample rate, so that white noise is what is left there.  Up to `most`
+    times what was declared; what a second measurement tells is estimated from both (`fit.noise.input_noise`).
+    """
+    once = ~signals.integrated & ~np.isfinite(declared.velocity) & ~np.isfinite(declared.acceleration)
+    if not once.any():
+        return declared
+    shown = np.array([white_noise(series) for series in signals.displacement.T])
+    level = np.clip(shown, declared.displacement, most * declared.displacement)
+    return replace(declared, displacement=np.where(once, level, declared.displacement))
 
 
 def roughness(series: FloatArray) -> FloatArray:
