@@ -29,9 +29,9 @@ from sprung.benchmarks.setups import Falsified
 from sprung.model.diagnosis.api import DiagnosisError, Options, Report, diagnose
 from sprung.model.diagnosis.component.measured import is_component_test
 from sprung.model.diagnosis.fit.memory import FitMemory
-from sprung.model.diagnosis.investigation.course import Investigation, Outcome
 from sprung.model.diagnosis.investigation.diagnose import begun, concluded, under, with_findings
 from sprung.model.diagnosis.investigation.judgement import judged
+from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason
 from sprung.model.laws import CATALOGUE

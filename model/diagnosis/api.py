@@ -10,8 +10,8 @@ from sprung.model.diagnosis.ambient.decay import decay_stretch
 from sprung.model.diagnosis.ambient.diagnose import diagnose_unforced
 from sprung.model.diagnosis.component.diagnose import diagnose_components
 from sprung.model.diagnosis.component.measured import covariates, is_component_test
-from sprung.model.diagnosis.investigation.course import Options, Outcome, Progress, Recorded
 from sprung.model.diagnosis.investigation.diagnose import investigate
+from sprung.model.diagnosis.investigation.state import Options, Outcome, Progress, Recorded
 from sprung.model.diagnosis.record.channels import DiagnosisError, TooLittleError, prepare
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.report.report import Finding, Report

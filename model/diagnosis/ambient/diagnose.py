@@ -18,7 +18,7 @@ from sprung.model.diagnosis.ambient.windows import (
     with_known,
 )
 from sprung.model.diagnosis.fit.memory import FitMemory
-from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
+from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.record.channels import Prepared, TooLittleError
 from sprung.model.diagnosis.report.report import (
     Report,

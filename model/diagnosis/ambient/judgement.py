@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from sprung.model.diagnosis.ambient.windows import WindowResult, displaced, independent
-from sprung.model.diagnosis.investigation.course import Options
+from sprung.model.diagnosis.investigation.state import Options
 from sprung.model.diagnosis.investigation.verdict import HeldOutErrors, Verdict, kind_of, verdict_of
 from sprung.model.diagnosis.record.channels import Prepared
 from sprung.model.diagnosis.rules import RULES, AmbientRules

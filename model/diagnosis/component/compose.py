@@ -19,7 +19,7 @@ from sprung.model.diagnosis.component.words import (
     reversed_finding,
     unknown_finding,
 )
-from sprung.model.diagnosis.investigation.course import Options, Recorded
+from sprung.model.diagnosis.investigation.state import Options, Recorded
 from sprung.model.diagnosis.investigation.verdict import EffectKind
 from sprung.model.diagnosis.report.report import (
     CandidateRow,

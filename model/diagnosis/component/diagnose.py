@@ -17,7 +17,7 @@ from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.search import Progress as Told
 from sprung.model.diagnosis.component.search import Ranked, Step, search
 from sprung.model.diagnosis.component.smooth import smooth_serves
-from sprung.model.diagnosis.investigation.course import Options, Progress, Recorded
+from sprung.model.diagnosis.investigation.state import Options, Progress, Recorded
 from sprung.model.diagnosis.report.report import Report
 from sprung.model.diagnosis.rules import ComponentRules, VerdictRules
 from sprung.model.diagnosis.selection.evidence import chance, effective_count, level_gain

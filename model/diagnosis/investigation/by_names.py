@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
-from sprung.model.diagnosis.investigation.course import Found, Investigation, Progress
+from sprung.model.diagnosis.investigation.state import Found, Investigation, Progress
 from sprung.model.diagnosis.selection.compete import noise_bound
 from sprung.model.laws import ElementLaw
 

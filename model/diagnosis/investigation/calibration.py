@@ -21,7 +21,7 @@ from scipy.special import stdtr
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import try_optimise
-from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import PlausibleRules

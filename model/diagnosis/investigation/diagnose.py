@@ -12,16 +12,6 @@ from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.by_names import by_names
 from sprung.model.diagnosis.investigation.calibration import calibrated, of_others, within_sheet
-from sprung.model.diagnosis.investigation.course import (
-    Found,
-    InputFault,
-    Investigation,
-    Nominal,
-    Options,
-    Outcome,
-    Progress,
-    Recorded,
-)
 from sprung.model.diagnosis.investigation.doubt import by_what_is_left
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of, left
@@ -36,6 +26,16 @@ from sprung.model.diagnosis.investigation.judgement import (
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
+from sprung.model.diagnosis.investigation.state import (
+    Found,
+    InputFault,
+    Investigation,
+    Nominal,
+    Options,
+    Outcome,
+    Progress,
+    Recorded,
+)
 from sprung.model.diagnosis.investigation.surface import with_surface
 from sprung.model.diagnosis.investigation.widened import (
     act_together,

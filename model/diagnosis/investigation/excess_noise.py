@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from sprung.model.diagnosis.investigation.course import Investigation, NoiseFault
+from sprung.model.diagnosis.investigation.state import Investigation, NoiseFault
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.rules import NoiseRules
 from sprung.model.diagnosis.selection.holdout import FreeRun

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.screen import screen

@@ -9,7 +9,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.course import InputFault, Nominal, Options
+from sprung.model.diagnosis.investigation.state import InputFault, Nominal, Options
 from sprung.model.diagnosis.record.signals import Noise, Signals
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import INPUT

@@ -8,9 +8,9 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.investigation.calibration import faulty, in_order
-from sprung.model.diagnosis.investigation.course import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
+from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
 from sprung.model.diagnosis.investigation.verdict import EffectKind, HeldOutErrors, bounded_noise, kind_of, verdict_of
 from sprung.model.diagnosis.record.signals import Noise, declared_noise
 from sprung.model.diagnosis.response.terms import Term

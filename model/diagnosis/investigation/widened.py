@@ -15,7 +15,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
-from sprung.model.diagnosis.investigation.course import Investigation, TriedWider, Widened
+from sprung.model.diagnosis.investigation.state import Investigation, TriedWider, Widened
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import WIDER, Term

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.course import Investigation, Outcome
+from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.values import deviations
 
 ENDED = (
@@ -30,8 +30,8 @@ def nothing_fits(outcome: Outcome, rejected: float) -> str:
 
 def likely_reasons(outcome: Outcome) -> list[str]:
     """Two or three reasons for which nothing fits, by what the record shows."""
-    course, before = outcome.investigation, outcome.before
-    names, rules = course.signals.sensor_names, course.options.rules.report
+    state, before = outcome.investigation, outcome.before
+    names, rules = state.signals.sensor_names, state.options.rules.report
     turned, scales = [], []
     for i, name in enumerate(names):
         measured, simulated = before.measured[:, i], before.simulated[:, i]
@@ -45,25 +45,25 @@ def likely_reasons(outcome: Outcome) -> list[str]:
                 scales.append(f"{name} is {scale:.3g} times what it should show (a unit or a scale?)")
     reasons = [f"the sign of {', '.join(turned)}"] if turned else []
     reasons += scales[:1]
-    sigma = np.sqrt(np.maximum(np.diag(course.base.covariance), 0))[: len(course.base.point.theta)]
+    sigma = np.sqrt(np.maximum(np.diag(state.base.covariance), 0))[: len(state.base.point.theta)]
     far = [
         i
-        for i in np.argsort(-np.abs(course.base.point.theta))
-        if abs(course.base.point.theta[i]) > rules.far * (1 + sigma[i])
+        for i in np.argsort(-np.abs(state.base.point.theta))
+        if abs(state.base.point.theta[i]) > rules.far * (1 + sigma[i])
     ]
     if far:
-        parameter = course.system.parameters[int(far[0])]
-        factor = float(np.exp(course.base.point.theta[int(far[0])]))
+        parameter = state.system.parameters[int(far[0])]
+        factor = float(np.exp(state.base.point.theta[int(far[0])]))
         reasons.append(f"{parameter.name} came out {factor:.2g} times nominal, which is not plausible: units, masses")
     reasons.append("an excitation that nobody measured")
     reasons.append("channels swapped, sensors elsewhere than stated, or bodies that the file does not have")
     return reasons[:3]
 
 
-def undecided(course: Investigation) -> list[str]:
+def undecided(state: Investigation) -> list[str]:
     """What the recording is too short or too still to tell."""
-    sigma = deviations(course.system, course.base)
-    loose = [p.name for i, p in enumerate(course.system.parameters) if sigma[i] > course.options.rules.report.loose]
+    sigma = deviations(state.system, state.base)
+    loose = [p.name for i, p in enumerate(state.system.parameters) if sigma[i] > state.options.rules.report.loose]
     if not loose:
         return []
     shown = ", ".join(loose[:6]) + (f" and {len(loose) - 6} more" if len(loose) > 6 else "")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sprung.model.diagnosis.investigation.calibration import channels, in_order
-from sprung.model.diagnosis.investigation.course import Outcome
+from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.diagnosis.report.values import law_parameters
 
@@ -14,16 +14,16 @@ _SHOWN = 4  # in the summary
 
 def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     """Those off by more than their deviation, the surest first; a gain that all channels share is told by none."""
-    course, final = outcome.investigation, outcome.final
-    indices = [*channels(course), *range(course.given, course.given + len(course.found))]
+    state, final = outcome.investigation, outcome.final
+    indices = [*channels(state), *range(state.given, state.given + len(state.found))]
     found = []
     for index in indices:
-        term = course.fit.point.terms[index]
-        if in_order(course, term):
-            (parameter,) = law_parameters(final, index, course.options.rules.plausible)
+        term = state.fit.point.terms[index]
+        if in_order(state, term):
+            (parameter,) = law_parameters(final, index, state.options.rules.plausible)
             found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
-    for fault in course.input_faults:
-        if in_order(course, fault.term):
+    for fault in state.input_faults:
+        if in_order(state, fault.term):
             spec, (value,) = fault.term.law.parameters[0], fault.term.parameters
             parameter = LawParameter(spec.name, value, fault.std, spec.unit)
             found.append((abs(value - fault.term.law.absent[0]) / max(fault.std, 1e-300), fault.term, parameter))

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from sprung.model.diagnosis.investigation.calibration import channels
-from sprung.model.diagnosis.investigation.course import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.investigation.setup import SetupFault
+from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
 from sprung.model.diagnosis.report.calibration import calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
@@ -28,47 +28,47 @@ from sprung.model.laws import StructureLaw
 
 def compose(outcome: Outcome, record: Recorded) -> Report:
     """The report of an investigation."""
-    course, before, after = outcome.investigation, outcome.before, outcome.after
-    said, names = outcome.judgement, course.signals.sensor_names
+    state, before, after = outcome.investigation, outcome.before, outcome.after
+    said, names = outcome.judgement, state.signals.sensor_names
     findings, calibration = findings_of(outcome), calibration_of(outcome)
-    advice = [*course.prepared.notes, *course.notes, *undecided(course)]
+    advice = [*state.prepared.notes, *state.notes, *undecided(state)]
     if said.rejected is not None:
         advice.insert(0, nothing_fits(outcome, said.rejected))
-    elif said.lost_phase and not course.held.still:
+    elif said.lost_phase and not state.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     if said.ended:
         advice.insert(0, ENDED)
-    rules = course.options.rules.verdict
-    explained = said.errors.explained(rules) if course.found else None
+    rules = state.options.rules.verdict
+    explained = said.errors.explained(rules) if state.found else None
     left = said.errors.unexplained(rules)
     unexplained = Unexplained(float(np.mean(left)), dict(zip(names, left.tolist(), strict=True)), said.where)
     return Report(
-        system=course.system.name,
+        system=state.system.name,
         recording=RecordingFacts(
-            course.options.file,
+            state.options.file,
             len(record.values) / record.sample_rate,
             len(record.values),
             int(record.lost),
-            course.prepared.used,
+            state.prepared.used,
         ),
         verdict=said.verdict,
-        baseline=reported_parameters(course.system, course.base),
+        baseline=reported_parameters(state.system, state.base),
         baseline_validation=figures(names, before.per_sensor),
         findings=tuple(findings),
-        augmented=reported_parameters(course.system, outcome.final),
+        augmented=reported_parameters(state.system, outcome.final),
         augmented_validation=figures(names, after.per_sensor),
         noise_floor=figures(names, said.errors.floor),
-        localization=course.first.localization(),
-        candidates=_candidates(course),
+        localization=state.first.localization(),
+        candidates=_candidates(state),
         changes=_changes(outcome),
         explained=explained,
         unexplained=unexplained,
         laws=_laws(outcome, calibration),
         calibration=calibration,
-        noise=_noise(course),
+        noise=_noise(state),
         summary=_summary(outcome, findings, explained, in_words(calibration)),
         advice=tuple(advice),
-        plot_data=plot_data_of(course, before, after, said.floor, [(f.location, f.effect) for f in findings]),
+        plot_data=plot_data_of(state, before, after, said.floor, [(f.location, f.effect) for f in findings]),
     )
 
 
@@ -78,20 +78,20 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     Among them are places of elements that were put right before anything was fitted.
     """
     told = {(one.location, one.effect) for one in calibration}
-    fit, course = outcome.final, outcome.investigation
-    count = course.given + (len(course.found) if outcome.judgement.carried else 0)
+    fit, state = outcome.final, outcome.investigation
+    count = state.given + (len(state.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        moot = index in channels(course) and (term.location, term.law.name) not in told
+        moot = index in channels(state) and (term.location, term.law.name) not in told
         everywhere = isinstance(term.law, StructureLaw) and term.law.branches is not None  # no file has room for it
         if term.law.named and not moot and not everywhere:
-            values, texts = law_parameters(fit, index, course.options.rules.plausible), formula_of(term)
+            values, texts = law_parameters(fit, index, state.options.rules.plausible), formula_of(term)
             found.append(IdentifiedLaw(term.location, term.law.name, values, term.variant, *texts))
-    for fault in course.input_faults:
+    for fault in state.input_faults:
         spec, value = fault.term.law.parameters[0], fault.term.parameters[0]
         parameter = LawParameter(spec.name, value, fault.std, spec.unit)
         found.append(IdentifiedLaw(fault.term.location, fault.term.law.name, (parameter,)))
-    return (*found, *places_put_right(course.setup_faults))
+    return (*found, *places_put_right(state.setup_faults))
 
 
 def places_put_right(faults: Iterable[SetupFault]) -> Iterator[IdentifiedLaw]:
@@ -103,9 +103,9 @@ def places_put_right(faults: Iterable[SetupFault]) -> Iterator[IdentifiedLaw]:
             yield IdentifiedLaw(at.location, law.name, (offset,), law.variants[at.axis])
 
 
-def _noise(course: Investigation) -> dict[str, float]:
+def _noise(state: Investigation) -> dict[str, float]:
     """Standard deviation of one sample of every channel, as the model found it."""
-    system, noise = course.system, course.problem.noise
+    system, noise = state.system, state.problem.noise
     levels: dict[str, float] = {}
     support = force = 0
     for name, source in system.file.inputs.items():
@@ -116,7 +116,7 @@ def _noise(course: Investigation) -> dict[str, float]:
         levels[f"{name}.displacement"] = float(noise.displacement[support])
         levels[f"{name}.velocity"] = float(noise.velocity[support])
         support += 1
-    present = [system.sensors[i] for i in course.problem.sensors]
+    present = [system.sensors[i] for i in state.problem.sensors]
     levels |= dict(zip(present, noise.sensors.tolist(), strict=True))
     known = {channel.name for channel in system.channels}
     return {name: level for name, level in levels.items() if name in known and np.isfinite(level)}
@@ -124,32 +124,32 @@ def _noise(course: Investigation) -> dict[str, float]:
 
 def _changes(outcome: Outcome) -> tuple[str, ...]:
     """Parameters that the nominal structure explains by another value."""
-    course, final = outcome.investigation, outcome.final
-    rules = course.options.rules.report
-    sigma, theta = deviations(course.system, final), final.point.theta
+    state, final = outcome.investigation, outcome.final
+    rules = state.options.rules.report
+    sigma, theta = deviations(state.system, final), final.point.theta
     words = []
     order = sorted(range(len(theta)), key=lambda i: -abs(theta[i]))
     for i in order:
         if abs(theta[i]) > np.log1p(rules.changed) and abs(theta[i]) > rules.sure * sigma[i]:
             change = 100 * (np.exp(theta[i]) - 1)
-            words.append(f"{course.system.parameters[i].name} is {change:+.0f} % from nominal")
+            words.append(f"{state.system.parameters[i].name} is {change:+.0f} % from nominal")
     return tuple(words)
 
 
-def _candidates(course: Investigation) -> tuple[CandidateRow, ...]:
+def _candidates(state: Investigation) -> tuple[CandidateRow, ...]:
     rows: dict[tuple[str, str], CandidateRow] = {}
-    for found in course.found:
+    for found in state.found:
         for trial in [found.trial, *found.trials, *([found.runner_up] if found.runner_up else [])]:
             key = (trial.term.location, trial.term.law.name)
             if key not in rows:
-                p = course.first.p_value(trial.candidate)
+                p = state.first.p_value(trial.candidate)
                 rows[key] = CandidateRow(*key, trial.candidate.score, p, trial.delta_bic())
-    for candidate in course.first.candidates:
+    for candidate in state.first.candidates:
         if len(rows) >= 20:
             break
         rows.setdefault(
             (candidate.location, candidate.effect),
-            CandidateRow(candidate.location, candidate.effect, candidate.score, course.first.p_value(candidate)),
+            CandidateRow(candidate.location, candidate.effect, candidate.score, state.first.p_value(candidate)),
         )
     fitted = [c for c in rows.values() if c.delta_bic is not None]
     screened = [c for c in rows.values() if c.delta_bic is None]

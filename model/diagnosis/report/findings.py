@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.investigation.calibration import faulty, in_order
-from sprung.model.diagnosis.investigation.course import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.setup import SetupFault
+from sprung.model.diagnosis.investigation.state import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
 from sprung.model.diagnosis.report.report import Finding, LawParameter
 from sprung.model.diagnosis.report.sentences import sentence_of
@@ -22,31 +22,31 @@ from sprung.model.laws.sensor_faults import SENSOR_NOISE, SENSOR_STUCK
 
 def findings_of(outcome: Outcome) -> list[Finding]:
     """Findings, the strongest first: a channel that is dead, then by what each explains of chi-square."""
-    course, said = outcome.investigation, outcome.judgement
+    state, said = outcome.investigation, outcome.judgement
     if said.rejected is not None:
         return []
-    ranked = [(np.inf, _stuck_finding(name, at)) for name, at in course.prepared.stuck]
-    ranked += [(np.inf, _setup_finding(f)) for f in course.setup_faults]
-    ranked += [(f.score, _input_finding(f)) for f in course.input_faults if not in_order(course, f.term)]
-    ranked += [_out_of_order(outcome, index) for index in faulty(course)]
+    ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
+    ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
+    ranked += [(f.score, _input_finding(f)) for f in state.input_faults if not in_order(state, f.term)]
+    ranked += [_out_of_order(outcome, index) for index in faulty(state)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if said.carried:
         ranked += [(-(f.delta_bic or 0.0), f) for f in _physics(outcome)]
     ranked.sort(key=lambda pair: -pair[0])
     findings = [finding for _, finding in ranked]
     if said.verdict == "unknown_physics" and not any(f.kind is EffectKind.UNLISTED for f in findings):
-        findings.insert(len(course.setup_faults), _unknown_finding(outcome))
+        findings.insert(len(state.setup_faults), _unknown_finding(outcome))
     return findings
 
 
 def _unknown_finding(outcome: Outcome) -> Finding:
     """What is left above the noise, at the place where it is seen best, without a name."""
-    course, said = outcome.investigation, outcome.judgement
-    here = [candidate for candidate in course.last.candidates if candidate.location == said.place]
+    state, said = outcome.investigation, outcome.judgement
+    here = [candidate for candidate in state.last.candidates if candidate.location == said.place]
     best = max(here, key=lambda candidate: candidate.score, default=None)
     tried = ""
-    if course.found:
-        names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in course.found)
+    if state.found:
+        names = " and ".join(f.trial.term.law.name.replace("_", " ") for f in state.found)
         tried = f"; {names} would explain too little of it"
     left = f"a misfit that no law explains: {said.where}" if said.where else "candidates that were not fitted"
     return Finding(
@@ -54,7 +54,7 @@ def _unknown_finding(outcome: Outcome) -> Finding:
         effect=UNKNOWN,
         kind=EffectKind.UNLISTED,
         parameters=(),
-        p_value=None if best is None else course.last.p_value(best),
+        p_value=None if best is None else state.last.p_value(best),
         delta_bic=None,
         sentence=f"{left}{tried}",
     )
@@ -62,14 +62,14 @@ def _unknown_finding(outcome: Outcome) -> Finding:
 
 def _physics(outcome: Outcome) -> list[Finding]:
     """Findings of the fitted terms, in the order in which they were found: by evidence."""
-    course, findings = outcome.investigation, []
-    for index, found in enumerate(course.found):
-        term = course.fit.point.terms[course.given + index]
-        if in_order(course, term):
+    state, findings = outcome.investigation, []
+    for index, found in enumerate(state.found):
+        term = state.fit.point.terms[state.given + index]
+        if in_order(state, term):
             continue
-        parameters = _free(term, law_parameters(outcome.final, course.given + index, course.options.rules.plausible))
+        parameters = _free(term, law_parameters(outcome.final, state.given + index, state.options.rules.plausible))
         rival = found.runner_up
-        family, advice = _look_alikes(found, course.options.rules.report)
+        family, advice = _look_alikes(found, state.options.rules.report)
         finding = Finding(
             location=term.location,
             effect=term.law.name,
@@ -80,7 +80,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
             runner_up=None if rival is None else (rival.term.law.name, rival.delta_bic()),
             runner_up_location=None if rival is None else rival.term.location,
             family=family,
-            elsewhere=_elsewhere(found, course.options.rules.report),
+            elsewhere=_elsewhere(found, state.options.rules.report),
             advice=advice,
             look_alikes=_beaten(found),
             formula=formula_of(term)[0],

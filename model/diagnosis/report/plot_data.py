@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sprung.model.diagnosis.fit.optimise import Fit
-from sprung.model.diagnosis.investigation.course import Investigation
+from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.selection.holdout import FreeRun
@@ -24,11 +24,11 @@ _BINS = 41
 
 
 def plot_data_of(
-    course: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
+    state: Investigation, before: FreeRun, after: FreeRun, floor: FloatArray, order: list[tuple[str, str]]
 ) -> dict[str, NDArray[Any]]:
     """Everything that a picture may need; `order`: place and effect of every finding, as reported."""
-    rate = course.signals.sample_rate
-    start = course.held.split + round(course.signals.start * rate)
+    rate = state.signals.sample_rate
+    start = state.held.split + round(state.signals.start * rate)
     arrays: dict[str, NDArray[Any]] = {
         "validation.time": (start + np.arange(len(before.measured))) / rate,
         "validation.measured": before.measured,
@@ -36,20 +36,20 @@ def plot_data_of(
         "validation.augmented": after.simulated,
         "validation.noise": floor,
     }
-    scores = course.first.localization()
+    scores = state.first.localization()
     arrays["localization.names"] = np.array(list(scores), dtype=str)
     arrays["localization.score"] = np.array(list(scores.values()))
-    for term in course.fit.point.terms:
+    for term in state.fit.point.terms:
         place = (term.location, term.law.name)
         if isinstance(term.law, ElementLaw) and place in order:
-            arrays.update(_of_element(course, term, f"finding.{order.index(place)}"))
+            arrays.update(_of_element(state, term, f"finding.{order.index(place)}"))
     return arrays
 
 
-def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArray[Any]]:
+def _of_element(state: Investigation, term: Term, key: str) -> dict[str, NDArray[Any]]:
     """Motion of the element, the force that was missed before and after, and the law through it."""
-    fit, grid = course.fit, course.problem.part.grid
-    port = term.port(course.system)
+    fit, grid = state.fit, state.problem.part.grid
+    port = term.port(state.system)
     d_all, v_all = fit.element_motion
     d, v = (d_all @ port)[::4], (v_all @ port)[::4]
     thin = slice(None, None, max(1, len(d) // _MOST))
@@ -58,8 +58,8 @@ def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArra
         law = force_along(term.element_law, term.parameters, d, v, time, fit.forward.element_of(term))
     else:
         law = np.zeros_like(d)
-    after, deviation = latent_force(course, fit, port)
-    before, _ = latent_force(course, course.base, port)
+    after, deviation = latent_force(state, fit, port)
+    before, _ = latent_force(state, state.base, port)
     by_rate = abs(_share(law, v)) > abs(_share(law, d)) if np.any(law) else False
     x = v if by_rate else d
     grid_x = _axis(x, 0.002)
@@ -76,13 +76,13 @@ def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArra
         f"{key}.curve_std": std,
     }
     if isinstance(term.law, StaticLaw):
-        result.update(_surface(course, term, term.law, key, d, v))
+        result.update(_surface(state, term, term.law, key, d, v))
     elif isinstance(term.law, SurfaceLaw) and term.law.latent is not None:
         drawn_map = term.law.latent.map((_BINS, _BINS))
         result[f"{key}.map_d"], result[f"{key}.map_v"] = drawn_map.deflection, drawn_map.rate
         result[f"{key}.map_force"], result[f"{key}.map_std"] = drawn_map.force, drawn_map.std
     elif _of_both(term):
-        result.update(_formula_map(course, term, key, d, v))
+        result.update(_formula_map(state, term, key, d, v))
     else:
         result[f"{key}.curve_law"] = drawn
     if isinstance(term.law, ElementLaw) and term.law.memory and np.any(law):
@@ -92,15 +92,15 @@ def _of_element(course: Investigation, term: Term, key: str) -> dict[str, NDArra
 
 
 def _surface(
-    course: Investigation, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
+    state: Investigation, term: Term, law: StaticLaw, key: str, d: FloatArray, v: FloatArray
 ) -> dict[str, NDArray[Any]]:
     """The unnamed force over deflection and rate, with the standard deviation that its weights have."""
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
     mesh_d, mesh_v = np.meshgrid(axis_d, axis_v)
     values = np.stack([np.broadcast_to(b, mesh_d.shape) for b in law.values(mesh_d, mesh_v)])
-    keys = [other.key for other in course.fit.point.terms]
-    place = course.fit.place(keys.index(term.key))
-    block = course.fit.covariance[place, place]
+    keys = [other.key for other in state.fit.point.terms]
+    place = state.fit.place(keys.index(term.key))
+    block = state.fit.covariance[place, place]
     variance = np.einsum("ivd,ij,jvd->vd", values, block, values)
     return {
         f"{key}.map_d": axis_d,
@@ -118,16 +118,16 @@ def _of_both(term: Term) -> bool:
     return {"d", "v"} <= parse(law.formula, {*law.names, *MOTION}).names
 
 
-def _formula_map(course: Investigation, term: Term, key: str, d: FloatArray, v: FloatArray) -> dict[str, NDArray[Any]]:
+def _formula_map(state: Investigation, term: Term, key: str, d: FloatArray, v: FloatArray) -> dict[str, NDArray[Any]]:
     """A formula's force over deflection and rate, with the standard deviation that its values have."""
     axis_d, axis_v = _axis(d, 0.005), _axis(v, 0.005)
-    motion, element = Motion(*np.meshgrid(axis_d, axis_v), 0.0, ()), course.fit.forward.element_of(term)
+    motion, element = Motion(*np.meshgrid(axis_d, axis_v), 0.0, ()), state.fit.forward.element_of(term)
 
     def force(values: FloatArray) -> FloatArray:
         return np.asarray(term.element_law.force(motion, tuple(values.tolist()), element), dtype=float)
 
-    place = course.fit.place([other.key for other in course.fit.point.terms].index(term.key))
-    block, values = course.fit.covariance[place, place], np.array(term.parameters)
+    place = state.fit.place([other.key for other in state.fit.point.terms].index(term.key))
+    block, values = state.fit.covariance[place, place], np.array(term.parameters)
     steps = np.maximum(1e-6 * np.abs(values), 1e-12)
     slopes = np.stack([(force(values + step) - force(values - step)) for step in np.diag(steps)])
     slopes = slopes / (2 * steps[:, None, None])
@@ -140,12 +140,12 @@ def _formula_map(course: Investigation, term: Term, key: str, d: FloatArray, v: 
     }
 
 
-def latent_force(course: Investigation, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
+def latent_force(state: Investigation, fit: Fit, port: FloatArray) -> tuple[FloatArray, float]:
     """Force along a port that the residual of a fit asks for, N, (N,), and its standard deviation.
 
     Bin by bin with a flat prior cut where the sensors see nothing: f = (r^H R^-1 y) / (r^H R^-1 r + prior).
     """
-    projector = Projector(course.problem, fit)
+    projector = Projector(state.problem, fit)
     response = projector.of_force[:, :, : len(port)] @ port
     residual = projector.factor @ fit.spectrum[projector.grid.band][:, :, None]
     seen = np.sum(np.abs(response) ** 2, axis=1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.course import Outcome
+from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import Finding
 from sprung.model.diagnosis.report.values import deviations
 from sprung.model.diagnosis.response.terms import Term
@@ -41,17 +41,17 @@ def _told(finding: Finding) -> str:
 
 def _worst_bias(outcome: Outcome, without: str) -> str | None:
     """What the missing physics had done to the parameter that it shifted most."""
-    course, final = outcome.investigation, outcome.final
-    sigma = deviations(course.system, final)
-    shift = course.base.point.theta - final.point.theta
+    state, final = outcome.investigation, outcome.final
+    sigma = deviations(state.system, final)
+    shift = state.base.point.theta - final.point.theta
     if not len(shift):
         return None
-    shift = np.where(np.abs(shift) > course.options.rules.report.sure * sigma, shift, 0.0)
+    shift = np.where(np.abs(shift) > state.options.rules.report.sure * sigma, shift, 0.0)
     worst = int(np.argmax(np.abs(shift)))
     if abs(shift[worst]) < 0.01:
         return None
     change = 100 * (np.exp(shift[worst]) - 1)
     side = "high" if change > 0 else "low"
-    if np.exp(shift[worst]) > course.options.rules.report.no_longer:
-        return f"{course.system.parameters[worst].name} is then no longer needed"
-    return f"{without} {course.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"
+    if np.exp(shift[worst]) > state.options.rules.report.no_longer:
+        return f"{state.system.parameters[worst].name} is then no longer needed"
+    return f"{without} {state.system.parameters[worst].name} was read {abs(change):.0f} % too {side}"

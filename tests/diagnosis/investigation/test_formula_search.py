@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.fit.optimise import try_optimise
-from sprung.model.diagnosis.investigation.course import Investigation, Options
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.formula import formula_of
 from sprung.model.diagnosis.investigation.formula_doubt import doubt_of, missing, own_size, uncertainty, whole_force
 from sprung.model.diagnosis.investigation.formula_search import FormulaSearch, taken_out
+from sprung.model.diagnosis.investigation.state import Investigation, Options
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.screening.families import ELEMENT, UNNAMED

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from sprung.model.diagnosis.investigation.course import Found
+from sprung.model.diagnosis.investigation.state import Found
 from sprung.model.diagnosis.report.findings import _elsewhere, _look_alikes
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws.damping import COULOMB_FRICTION, DAMPER_BLOWOFF
