@@ -30,7 +30,7 @@ def reason(stage: str, number: Field[Any]) -> str:
     low, high = number.metadata["range"]
     if found is None or found["varied"] != [number.default, low, high]:
         return f"{number.metadata['reason']}; not varied as it is now"
-    where = "; ".join(found.get("on", [f"{found['recordings']} recordings"]))
+    where = "; ".join(found.get("on", [f"{found['recordings']} of {_varied()['set']}"]))
     told = f"insensitive from {low:g} to {high:g}"
     if found["changes"]:
         told = f"changes {'; '.join(found['changes'])}"
