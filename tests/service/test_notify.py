@@ -97,7 +97,7 @@ def test_alarms_are_told_as_signed_cloud_events(core: Core, system: System, rece
     assert headers["content-type"] == "application/cloudevents+json"
     assert event["specversion"] == "1.0" and event["type"] == "sprung.alarm.opened" and event["subject"] == "a"
     assert event["data"]["alarm"]["severity"] in ("warning", "alarm")
-    assert event["data"]["advisory"].startswith("All of them at once")  # nobody can inspect `*`
+    assert "All of them at once" in event["data"]["advisory"]  # nobody can inspect `*`
     assert event["data"]["page"] == "https://sprung.example.org/pages/vehicles/a"
     signed = f"{headers['webhook-id']}.{headers['webhook-timestamp']}.".encode() + body
     digest = hmac.new(b"a secret of many letters", signed, hashlib.sha256).digest()

@@ -62,7 +62,7 @@ def test_a_resonance_above_what_is_compared_is_no_resonance(law: str) -> None:
     found = find_law(law)
     highest = GRID.omega[GRID.band][-1] / (2 * np.pi)
     for factor, believed in ((0.9, True), (1.1, False)):
-        values = [1.0] * len(found.parameters)
+        values = [0.1] * len(found.parameters)
         values[found.names.index("frequency")] = factor * highest
         term = Term(found, "floor", tuple(values), "z")
         assert (doubt(fit, term) is None) == believed
@@ -113,3 +113,10 @@ def test_a_knee_within_one_sample_is_not_believed(knee: float, believed: bool) -
     reason = doubt(fit, term)
     assert (reason is None) == believed
     assert believed or "within a sample" in (reason or "")
+
+
+def test_what_is_damped_as_strongly_as_a_damper_is_no_elastic_mode() -> None:
+    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID)))
+    law = find_law("flexible_mode")
+    for ratio, believed in ((0.05, True), (0.46, False)):
+        assert (doubt(fit, Term(law, "floor", (3.0, ratio, 0.3), "z")) is None) == believed
