@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import baseline
+from sprung.model.diagnosis.fit.baseline import baseline, refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.problem import Problem
 from sprung.model.diagnosis.investigation.setup_effects import Hypothesis, SetupEffect, SetupPlace, Weighing
@@ -136,7 +136,16 @@ def _best(
             changed, mended = hypothesis.undo(system, signals)
             try:
                 fitted = fitted_samples(signals, mended, split)
-                other, again = baseline(changed, mended, declared, fitted, problem.rules, problem.memory, problem.work)
+                other, again = baseline(
+                    changed,
+                    mended,
+                    declared,
+                    fitted,
+                    problem.rules,
+                    problem.memory,
+                    problem.work,
+                    roughly=_rough(problem),
+                )
             except DiagnosisError:
                 continue
             left = _left(again)
@@ -238,9 +247,18 @@ def _fault(hypothesis: Hypothesis, before: float, after: float) -> SetupFault:
     return SetupFault(hypothesis.effect, hypothesis.site, value, std, before, after)
 
 
+def _rough(problem: Problem) -> bool:
+    """Whether noise levels may wait until a hypothesis is among the best: beside measured forces the fit hangs on them."""
+    return not problem.process_noise
+
+
 def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:
     """A delay, scale or position estimated again on the structure fitted without it, which had absorbed some of it."""
     fault, system, signals, problem, fit = accepted
+    if _rough(problem):
+        problem, fit = refreshed(problem, fit)
+        fault = replace(fault, after=_left(fit))
+        accepted = fault, system, signals, problem, fit
     effect = fault.effect
     if fault.value is None or effect.left is None:
         return accepted
