@@ -34,7 +34,6 @@ from sprung.model.diagnosis.investigation.judgement import judged
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.compose import compose
 from sprung.model.diagnosis.rules import RULES, Rules, reason
-from sprung.model.laws import CATALOGUE
 from sprung.model.system import System
 
 ALONE = {  # stages of recordings of their own, with what decides there
@@ -272,7 +271,7 @@ def _difference(before: Said, after: Said) -> dict[str, Any]:
 
 def _known(name: str, system: System, record: Falsified) -> Subject:
     """A recording diagnosed under the usual rules, with the steps on the way."""
-    options = Options(file=name, catalogue=CATALOGUE, memory=FitMemory())
+    options = Options(file=name, memory=FitMemory())
     if is_component_test(system, record.values) or not system.file.inputs:
         reads = ALONE["component" if system.file.inputs else "ambient"]
         return Subject(name, system, record, options, Said.of(diagnose(system, record, options)), reads)

@@ -55,7 +55,7 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     threading.Thread(target=live, daemon=True).start()
     try:
         show(0.0, "reading")
-        options = Options(file=request.name, catalogue=request.system.catalogue)
+        options = Options(file=request.name)
         report = diagnose(request.system, _load(request), options, show)
         show(1.0, "writing the report")
         write_report(report, request.system, request.out)

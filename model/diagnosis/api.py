@@ -61,12 +61,12 @@ def diagnose(
     >>> report.verdict, report.findings[0].location, report.findings[0].effect
     ('missing_physics', 'damper', 'coulomb_friction')
     """
-    tell, options = progress or (lambda share, text: None), options or Options(catalogue=system.catalogue)
+    tell, options = progress or (lambda share, text: None), options or Options()
     channels = record.values[:, : len(system.channels)]
     if is_component_test(system, channels, options.rules):
         return diagnose_components(system, record, options, tell)
     if system.signals:
-        options = replace(options, catalogue=(*options.catalogue, *following_laws(system, record)))
+        system = replace(system, catalogue=(*system.catalogue, *following_laws(system, record)))
         record = RecordedPart(record.sample_rate, channels, record.lost)
     if system.on_track or not system.file.inputs:
         whole = replace(options.rules.record, longest=len(record.values), enough=len(record.values))
@@ -91,7 +91,7 @@ def _along_what_was_seen(system: System, record: Recorded, options: Options, tel
     on every body, as strong as they have to be, the fit is one of forces along the measured motion.
     """
     forces = {f"disturbance of {body}": ForceInput(kind="force", body=body) for body in system.bodies}
-    pushed = System(system.file.model_copy(update={"inputs": forces}))
+    pushed = replace(system, file=system.file.model_copy(update={"inputs": forces}))
     none = np.zeros((len(record.values), len(forces)))
     values = np.column_stack([none, record.values])
     outcome = investigate(pushed, RecordedPart(record.sample_rate, values, record.lost), options, tell)

@@ -21,7 +21,7 @@ between samples to some thousandths of its force only, and that is the same in e
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -113,7 +113,7 @@ def _computed(system: System, wrong: list[SystemFile], loads: bool, tracked: boo
         measured = 2 * len(system.channels) if tracked else 0
         one = _UsualRide(model, at, data, measured)
         here = one.outputs(model.simulator)
-        shown = [one.slope(one.outputs(LinearSimulator(System(file))) - here) for file in wrong]
+        shown = [one.slope(one.outputs(LinearSimulator(replace(system, file=file))) - here) for file in wrong]
         information = one.information().sum(axis=0) * (_RIDE / _WINDOWS if tracked else 1.0)
     pull = np.stack(shown, axis=1) / _STEP * (_RIDE / _WINDOWS if tracked else 1.0)
     spread = np.array([PRIOR_STD] * P + [term.std for term in loading.terms][:X] + [d.std for d in stated[:measured]])

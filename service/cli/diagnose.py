@@ -101,7 +101,7 @@ def _diagnose(system: System, record: Record, name: str, quiet: bool) -> Report:
     from sprung.model.diagnosis.api import Options, diagnose
 
     with stages(errors()) as show:
-        return diagnose(system, record, Options(file=name, catalogue=system.catalogue), silent_stage if quiet else show)
+        return diagnose(system, record, Options(file=name), silent_stage if quiet else show)
 
 
 def text(report: Report) -> str:

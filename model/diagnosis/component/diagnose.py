@@ -36,7 +36,7 @@ def diagnose_components(system: System, record: Recorded, options: Options, tell
     Errors: `DiagnosisError` when the recording cannot be used at all.
     """
     tell(0.05, "channels, motion and noise")
-    pieces, own = pieces_of(options.catalogue)
+    pieces, own = pieces_of(system.catalogue)
     records = component_records(system, record.values, record.sample_rate, options.rules, own)
     judged = []
     for number, one in enumerate(records):

@@ -125,7 +125,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         one if term.location in state.signals.sensor_names else term for one, term in zip(terms, held, strict=True)
     )
     base = replace(base, point=replace(base.point, terms=(*base.point.terms[: len(file)], *terms)))
-    screening = screen(problem, base, state.options.catalogue, state.options.project)
+    screening = screen(problem, base, state.problem.system.catalogue, state.options.project)
     begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)
     return replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
 
@@ -157,7 +157,7 @@ def _shows(law: SensorLaw, *, rate: bool, support: bool) -> bool:
 def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
     """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; off as found."""
     signals, part = state.signals, state.problem.part
-    laws = [law for law in state.options.catalogue if isinstance(law, SensorLaw)]
+    laws = [law for law in state.problem.system.catalogue if isinstance(law, SensorLaw)]
     rates = {name for name, rate in zip(signals.sensor_names, part.differentiated, strict=True) if rate}
     given = {term.key[:2] for term in state.fit.point.terms[: state.given]}
     values = {term.key: term.parameters for term in state.fit.point.terms[state.given :]}

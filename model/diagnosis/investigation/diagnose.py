@@ -254,7 +254,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         fit=fit,
         held=replace(state.held, noise=problem.noise),
         found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value, disbelieved)),
-        last=screen(problem, fit, options.catalogue, options.project),
+        last=screen(problem, fit, problem.system.catalogue, options.project),
         notes=(*state.notes, *note),
     )
 

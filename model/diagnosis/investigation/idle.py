@@ -31,7 +31,7 @@ def without_idle(state: Investigation) -> Investigation:
         gain = profile_gain(fit.residual, state.fit.residual, sensors, rules.evidence.quiet, rules.evidence)
         if gain < rules.acceptance.idle * found.trial.gain:
             kept = (*state.found[:index], *state.found[index + 1 :])
-            last = screen(state.problem, fit, state.options.catalogue, state.options.project)
+            last = screen(state.problem, fit, state.problem.system.catalogue, state.options.project)
             return without_idle(replace(state, fit=fit, found=kept, last=last))
     return state
 

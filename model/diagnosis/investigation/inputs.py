@@ -25,7 +25,7 @@ def nominal(
     """The nominal structure on the first `split` samples, and all candidates (or those of `laws`) screened on its
     residual."""
     problem, fit = baseline(system, signals, declared, split, options.rules, options.memory, options.work)
-    return Nominal(signals, problem, fit, screen(problem, fit, laws or options.catalogue, options.project))
+    return Nominal(signals, problem, fit, screen(problem, fit, laws or system.catalogue, options.project))
 
 
 def best_input_fault(screening: Screening, alpha: float) -> Candidate | None:

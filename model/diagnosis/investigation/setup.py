@@ -136,16 +136,7 @@ def _best(
             changed, mended = hypothesis.undo(system, signals)
             try:
                 fitted = fitted_samples(signals, mended, split)
-                other, again = baseline(
-                    changed,
-                    mended,
-                    declared,
-                    fitted,
-                    problem.rules,
-                    problem.memory,
-                    problem.work,
-                    roughly=_rough(problem),
-                )
+                other, again = _fitted(changed, mended, declared, fitted, problem)
             except DiagnosisError:
                 continue
             left = _left(again)
@@ -248,8 +239,13 @@ def _fault(hypothesis: Hypothesis, before: float, after: float) -> SetupFault:
 
 
 def _rough(problem: Problem) -> bool:
-    """Whether noise levels may wait until a hypothesis is among the best: beside measured forces the fit hangs on them."""
+    """Whether noise levels may wait until a hypothesis is among the best; beside measured forces the fit needs them."""
     return not problem.process_noise
+
+
+def _fitted(system: System, signals: Signals, declared: Noise, split: int, like: Problem) -> tuple[Problem, Fit]:
+    """Another system or other signals on the terms of a problem, roughly where that will do."""
+    return baseline(system, signals, declared, split, like.rules, like.memory, like.work, roughly=_rough(like))
 
 
 def _sharpened(accepted: _Accepted, declared: Noise, split: int) -> _Accepted:

@@ -19,7 +19,6 @@ from sprung.model.diagnosis.rules import RULES, Rules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.selection.compete import Trial
 from sprung.model.diagnosis.selection.holdout import FreeRun, HeldOut
-from sprung.model.laws import CATALOGUE, Law
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -46,7 +45,6 @@ class Options:
     held_out: bool = True  # accept a finding only if it improves the part that no fit saw
     unnamed: bool = True  # whether forces without a name, and their formulas, are sought, too
     file: str = ""  # name of the recording, for the report
-    catalogue: tuple[Law, ...] = CATALOGUE
     rules: Rules = RULES  # every number that decides
     memory: FitMemory | None = None  # of the same recording's earlier diagnoses
     work: WorkBudget | None = None  # what its fits may cost; None: as the rules say

@@ -72,7 +72,7 @@ def outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
 def with_wider(state: Investigation, wide: Widened) -> Investigation:
     """The investigation with a law that was found in its wider form."""
     problem, fit = refreshed(state.problem, wide.fit)
-    last = screen(problem, fit, state.options.catalogue, state.options.project)
+    last = screen(problem, fit, state.problem.system.catalogue, state.options.project)
     return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -12,9 +12,10 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import butter, sosfiltfilt
 
-from sprung.model.diagnosis.api import Options, Report, TooLittleError, diagnose
+from sprung.model.diagnosis.api import Report, TooLittleError, diagnose
 from sprung.model.diagnosis.component.motion import element_motion, noise_at_rest, still_stretches
 from sprung.model.diagnosis.record.signals import white_noise
+from sprung.model.laws import CATALOGUE, Law
 from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
 from sprung.model.laws.reversals import bouc_wen_memory
 from sprung.model.signals import FloatArray
@@ -68,12 +69,13 @@ def report(
     noise: float = 1.0,
     declared: float = 1.0,
     seed: int = 0,
-    options: Options | None = None,
+    own: tuple[Law, ...] = (),
 ) -> Report:
     random = np.random.default_rng(seed)
     measured = force + noise * random.standard_normal(len(force))
     shown = d + 1e-6 * random.standard_normal(len(d))
-    return diagnose(system(declared), RigRecording(np.column_stack([shown, measured])), options)
+    known = replace(system(declared), catalogue=(*CATALOGUE, *own))
+    return diagnose(known, RigRecording(np.column_stack([shown, measured])))
 
 
 def laws(found: Report) -> list[str]:

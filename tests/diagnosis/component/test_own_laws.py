@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.api import diagnose
 from sprung.model.diagnosis.component.diagnose import pieces_of
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.laws import CATALOGUE, ElementLaw, ParameterSpec, grid
@@ -49,7 +49,7 @@ MIDDLE = 0.5 * (D.max() + D.min())
 
 def test_a_law_of_a_user_is_found_with_its_values() -> None:
     force = K * D + C * V + 40 * np.sin(2 * np.pi * (D - MIDDLE) / 3.1e-3)
-    found = report(force, D, options=Options(catalogue=(*CATALOGUE, WAVES, TORN)))
+    found = report(force, D, own=(WAVES, TORN))
     first = found.findings[0]
     assert (first.effect, first.family, found.verdict) == ("cogging", None, "missing_physics")
     values = {p.name: p for p in first.parameters}
@@ -62,7 +62,7 @@ def test_a_law_of_a_user_is_found_with_its_values() -> None:
 
 def test_a_law_that_follows_the_spring_and_is_linear_in_nothing_is_found() -> None:
     force = K * D + C * V - K * np.maximum(D - MIDDLE - 6e-3, 0.0)
-    found = report(force, D, options=Options(catalogue=(*CATALOGUE, LOST)))
+    found = report(force, D, own=(LOST,))
     first = found.findings[0]
     assert first.effect == "lost_spring"
     assert first.parameters[0].value == pytest.approx(6e-3, rel=0.02)
@@ -75,7 +75,7 @@ def test_a_law_of_a_user_in_the_system_file_is_fitted_and_nothing_is_missing() -
     columns = [D + 1e-6 * random.standard_normal(len(D)), force + random.standard_normal(len(D))]
     catalogue = (*CATALOGUE, WAVES)
     system = parse_system(text, catalogue=catalogue)
-    found = diagnose(system, RigRecording(np.column_stack(columns)), Options(catalogue=catalogue))
+    found = diagnose(system, RigRecording(np.column_stack(columns)))
     assert found.verdict == "consistent"
     values = {p.name: p.value for p in found.laws[0].parameters}
     assert values == pytest.approx({"size": 40.0, "pitch": 3.1e-3}, rel=0.02)

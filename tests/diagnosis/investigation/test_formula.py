@@ -135,8 +135,7 @@ def test_a_formula_becomes_a_law_of_ones_own(told: Report, tmp_path: Path) -> No
     (law,) = load_laws(path, tuple(one.name for one in CATALOGUE))
     assert isinstance(law, ElementLaw) and law.name == "secondary_law_1" and law.strength == 0 and law.listed
     other = simulate(lambda d, v: 2e6 * d * abs(v), seconds=15.0, seed=6)
-    catalogue = (*CATALOGUE, law)
-    report = diagnose(quarter_car(), other, Options(catalogue=catalogue))
+    report = diagnose(replace(quarter_car(), catalogue=(*CATALOGUE, law)), other)
     assert report.verdict == "missing_physics"
     (finding,) = report.findings
     assert (finding.location, finding.effect) == ("secondary", "secondary_law_1")
