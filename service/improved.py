@@ -10,8 +10,8 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from sprung.model.diagnosis.report.report import IdentifiedLaw, Report
-from sprung.model.laws import ElementLaw, SensorLaw
+from sprung.model.diagnosis.report.report import IdentifiedLaw, Report, ReportedParameter
+from sprung.model.laws import ElementLaw, SensorLaw, StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_NOISE
 from sprung.model.system import System, parse_system
 
@@ -23,12 +23,13 @@ def improved_text(text: str, system: System, report: Report) -> str:
     """The text of a system file (the one that `system` was read from) with the findings of a report.
 
     Parameters get the values that were identified with the findings in place; laws stand with values and deviations;
-    the noise of every channel is the one found.  Unnamed forces have no values to write and are left out.
+    the noise of every channel is the one found.  Unnamed forces have no values to write and are left out, and so is a
+    law of all springs: these then have the values with which the structure without it comes closest.
     """
     yaml = YAML()
     yaml.width = 4096
     file = yaml.load(text)
-    for parameter in report.augmented:
+    for parameter in _parameters(system, report):
         part, _, quantity = parameter.name.rpartition(".")
         if quantity not in QUANTITIES:  # the preload of a component test: written as a law
             continue
@@ -54,6 +55,12 @@ def improved_text(text: str, system: System, report: Report) -> str:
     out = io.StringIO()
     yaml.dump(file, out)
     return out.getvalue()
+
+
+def _parameters(system: System, report: Report) -> tuple[ReportedParameter, ...]:
+    """Values with the findings in place; without them where a law took over springs and no file has a place for it."""
+    names = {law.name for law in system.catalogue if isinstance(law, StructureLaw) and law.branches is not None}
+    return report.baseline if any(one.effect in names for one in report.findings) else report.augmented
 
 
 def left_out(report: Report) -> list[str]:

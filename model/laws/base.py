@@ -111,6 +111,7 @@ class ParameterSpec:
     usual: tuple[float, float] = (0.0, float("inf"))  # range in multiples of `typical`, beyond which it is rare
     plausible: tuple[float, float] = (-float("inf"), float("inf"))  # beyond it the value stands for something else
     minor: bool = False  # shapes a corner and says nothing about how strong the law is: not in its sentence
+    accuracy: float = 0.0  # of the value, no less than of `typical`: to which branches follow what it stands for
 
     def admits(self, value: float) -> bool:
         return bool(self.low <= value <= self.high)

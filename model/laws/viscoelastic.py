@@ -41,6 +41,7 @@ from sprung.model.signals import FloatArray
 _APART = 5.0
 _UNIT = 2 * np.pi  # rad/s, of 1 Hz
 _POLES = _UNIT * 3.5 * _APART ** np.arange(-2.0, 3.0)  # 1/s
+_FOLLOWED = 0.03  # of size and order, that five branches make of the power law over a decade or two, orders above 0.2
 
 
 def _weights(stiffness: FloatArray, order: FloatArray) -> list[FloatArray]:
@@ -93,8 +94,16 @@ FRACTIONAL_STIFFNESS = ElementLaw(
     name="fractional_stiffness",
     title="a stiffness that grows with the frequency (rubber)",
     parameters=(
-        ParameterSpec("stiffness", "N/m", 0.0, 1e12, "size of the growing part at 1 Hz", lambda s: 0.1 * s.stiffness),
-        ParameterSpec("order", "1", 0.02, 0.95, "power of the frequency", lambda seen: 0.3),
+        ParameterSpec(
+            "stiffness",
+            "N/m",
+            0.0,
+            1e12,
+            "size of the growing part at 1 Hz",
+            lambda s: 0.1 * s.stiffness,
+            accuracy=_FOLLOWED,
+        ),
+        ParameterSpec("order", "1", 0.02, 0.95, "power of the frequency", lambda seen: 0.3, accuracy=_FOLLOWED),
     ),
     force=_force,
     shapes=_shapes,
@@ -112,6 +121,8 @@ FRACTIONAL_STIFFNESS = ElementLaw(
 
 
 _LOSSY_APART = 4.0
+_LOSSY_FOLLOWED = 0.01  # of a loss factor that seven branches read from dense ones, over half a decade or two
+_POWER_FOLLOWED = 0.2  # of 0.1, the same of the power
 _LOSSY = _UNIT * 1.75 * _LOSSY_APART ** np.arange(-3.0, 4.0)  # 1/s, poles
 _AT_1_HZ = _UNIT**2 + _LOSSY**2  # what the branches' answers there are divided by
 
@@ -140,8 +151,18 @@ STRUCTURAL_DAMPING = StructureLaw(
             0.25,
             "energy lost per radian over the energy stored, at 1 Hz",
             lambda seen: 0.02,
+            accuracy=_LOSSY_FOLLOWED,
         ),
-        ParameterSpec("power", "1", -0.1, 0.5, "of the frequency, with which it grows", lambda seen: 0.1, minor=True),
+        ParameterSpec(
+            "power",
+            "1",
+            -0.1,
+            0.5,
+            "of the frequency, with which it grows",
+            lambda seen: 0.1,
+            minor=True,
+            accuracy=_POWER_FOLLOWED,
+        ),
     ),
     where="elements",
     modify=_unchanged,

@@ -57,7 +57,9 @@ def reported_parameters(system: System, fit: Fit) -> tuple[ReportedParameter, ..
 def law_parameters(fit: Fit, index: int, rules: PlausibleRules = RULES.plausible) -> tuple[LawParameter, ...]:
     term, place = fit.point.terms[index], fit.place(index)
     block = _with_corner(fit, term, fit.covariance[place, place])
-    sigma = np.hypot(np.sqrt(np.maximum(np.diag(block), 0)), rules.simulated * np.abs(term.parameters))
+    size = np.abs(term.parameters)
+    followed = [spec.accuracy for spec in term.law.parameters] * np.maximum(size, term.scales or size)
+    sigma = np.sqrt(np.maximum(np.diag(block), 0) + (rules.simulated * size) ** 2 + followed**2)
     hidden = not term.law.named
     units = {channel.name: channel.unit for channel in fit.forward.system.channels}
     return tuple(

@@ -7,10 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
-from sprung.service.improved import left_out
+from sprung.model.system import parse_system
+from sprung.service.improved import improved_text, left_out
 from tests.diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
 from tests.named_laws import element_law
 
@@ -90,4 +92,7 @@ def test_springs_that_lose_the_same_at_every_frequency_are_named_together() -> N
     assert (finding.location, finding.effect) == ("primary|secondary", "structural_damping")
     loss = finding.parameters[0]
     assert loss.value == pytest.approx(np.tan(np.pi * power / 2), rel=0.05)
+    assert abs(loss.value - np.tan(np.pi * power / 2)) < 3 * loss.std
     assert left_out(report) == ["structural damping at primary and secondary"]
+    written = parse_system(improved_text(QUARTER_CAR, quarter_car(), report)).parameters
+    assert [one.nominal for one in written] == pytest.approx([one.value for one in report.baseline], rel=1e-4)

@@ -25,3 +25,16 @@ def test_an_offset_is_told_in_the_unit_of_its_channel(law: str, unit: str) -> No
     )
     parameters = law_parameters(fit, 0)
     assert [one.unit for one in parameters] == [unit]
+
+
+def test_what_branches_stand_for_is_told_as_accurately_as_they_follow_it() -> None:
+    term = Term(find_law("structural_damping"), "primary|secondary", (0.04, 0.0), scales=(0.02, 0.1))
+    fit: Any = SimpleNamespace(
+        point=SimpleNamespace(terms=(term,)),
+        place=lambda index: slice(0, 2),
+        covariance=np.diag([1e-10, 1e-10]),
+        forward=SimpleNamespace(system=quarter_car()),
+    )
+    loss, power = law_parameters(fit, 0)
+    assert loss.std == pytest.approx(4e-4, rel=0.02)  # dense branches lose 0.7 to 1.3 % more than seven
+    assert power.std == pytest.approx(0.02, rel=0.01)
