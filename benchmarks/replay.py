@@ -100,7 +100,7 @@ def one_run(recording: Path, store_file: str, times: int, begun: float) -> dict[
     return {
         "seconds": ended - started,
         "process_seconds": ended - begun,
-        "recorded_seconds": fed.recorded_seconds(engine.system.sample_rate),
+        "recorded_seconds": fed.recorded_seconds,
         "windows": sum(fed.windows.values()),
         "stages": {stage: round(seconds, 2) for stage, seconds in stages.items()},
         "peak_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,

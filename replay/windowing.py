@@ -66,13 +66,14 @@ class Windower:
         self.jumps: list[ClockJump] = []  # of the clock, and pauses; the first ones
         self.samples = 0  # that belonged to the stream
         self.longest = 0.0  # s, the longest stretch of samples without a jump
+        self.recorded = 0.0  # s, of all stretches, from the first sample of each to the end of its last one
         self.expected = 0  # samples that the emitted windows should hold, each counted once
         self.lost = 0  # of these, samples that did not come or were invalid
         self._period = 1e9 / self.sample_rate  # ns
         self._pending: list[SampleBlock] = []
         self._base = 0  # ns since epoch: the grid's first sample.  Floats hold differences to it only, because a
         self._origin: float | None = None  # float of an absolute time is 256 ns coarse.  ns of the next window's row 0
-        self._begun = 0  # ns, first time of the stretch without a jump
+        self._stretch: tuple[int, int] | None = None  # ns, first and newest time of the stretch without a jump
         self._overlap = (0, 0)  # samples and lost samples of the last window that the next one shares
         self._first_row = True  # the next window is the first of its grid: nothing lies before it
         self._new_segment = False  # the next window is the first after a jump
@@ -86,6 +87,7 @@ class Windower:
         for piece in self.order.push(block):
             if isinstance(piece, ClockJump):
                 out += self._finish()
+                self._end_stretch()
                 self.reasons["clock jump" if piece.seconds < 0 else "pause or clock jump"] += 1
                 self._new_segment = True
                 if len(self.jumps) < KEPT_JUMPS:
@@ -96,12 +98,12 @@ class Windower:
             self.samples += len(piece.time)
             if self._origin is None:
                 self._base, self._origin = int(piece.time[0]), 0.0
-                self._begun = self._base
+            begun, newest = self._stretch or (int(piece.time[0]),) * 2
+            self._stretch = begun, max(newest, int(piece.time.max()))
             if self._waiting > self._most:  # time stands still, or nearly
                 self.reasons["too many samples for their time"] += self._waiting
                 self._forget_all()
         if self._origin is not None and self.order.newest is not None:
-            self.longest = max(self.longest, (self.order.newest - self._begun) / 1e9)
             horizon = self.order.newest - self._base - self.delay * 1e9
             rows = int(np.floor((horizon - self._origin) / self._period)) - REACH
             out += self._emit(rows, ended=False)
@@ -112,7 +114,15 @@ class Windower:
         self.order.flush()
         self.reasons.update(self.order.counts)
         self.order.counts.clear()
+        self._end_stretch()
         return self._finish()
+
+    def _end_stretch(self) -> None:
+        if self._stretch is not None:
+            begun, newest = self._stretch
+            self.longest = max(self.longest, (newest - begun) / 1e9)
+            self.recorded += (newest - begun + self._period) / 1e9
+        self._stretch = None
 
     def _finish(self) -> list[Window]:
         """Emit what the current grid still holds and forget it."""

@@ -18,7 +18,7 @@ from sprung.service.compute import Priority
 from sprung.service.pipeline import Pipeline
 from sprung.service.processed import Batch, Identified
 from sprung.service.reading import Ending, ReadRequest, prefetched, reading_of
-from sprung.service.times import AHEAD, NANOSECONDS, now_ns, to_iso
+from sprung.service.times import AHEAD, now_ns, to_iso
 from sprung.service.worker import ProcessLimits
 
 MOST_MINUTES = 1440  # of comfort that a summary keeps
@@ -41,20 +41,14 @@ class Fed:
     stored_before: int = 0  # windows that the store had already
     expected: int = 0  # samples that the windows should hold
     lost: int = 0  # of these, samples that did not come or were invalid
-    first_ns: int | None = None  # of the samples
-    last_ns: int | None = None
+    recorded_seconds: float = 0.0  # without pauses, jumps of the clock and stray time stamps
+    last_ns: int | None = None  # of the samples
     state: TrackerState | None = None
     tally: Tally = field(default_factory=Tally)
     problems: list[str] = field(default_factory=list)  # one line each
     incomplete: bool = False
     wall_seconds: float = 0.0
     ride: comfort.RideQuality | None = None  # minutes of the body's accelerometers
-
-    def recorded_seconds(self, sample_rate: float) -> float:
-        """From the first sample to the end of the last one."""
-        if self.first_ns is None or self.last_ns is None:
-            return 0.0
-        return round((self.last_ns - self.first_ns) / NANOSECONDS + 1 / sample_rate, 3)
 
     @property
     def fitting(self) -> dict[str, int]:
@@ -158,7 +152,7 @@ def _ended(fed: Fed, ending: Ending) -> None:
     """Take over what is known of a recording once it has been read."""
     fed.tally, fed.problems, fed.incomplete = ending.tally, ending.problems, ending.incomplete
     fed.expected, fed.lost = ending.expected, ending.lost
-    fed.first_ns, fed.last_ns = ending.first_ns, ending.last_ns
+    fed.recorded_seconds, fed.last_ns = ending.recorded_seconds, ending.last_ns
     if fed.last_ns is not None and fed.last_ns > now_ns() + AHEAD:
         line = f"the recording ends on {to_iso(fed.last_ns)}, which is in the future by this host's clock"
         fed.problems = [*fed.problems, line]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -57,8 +57,8 @@ class Ending:
     incomplete: bool
     expected: int  # samples that the windows should hold
     lost: int  # of these, samples that did not come or were invalid
-    first_ns: int | None  # of the samples
-    last_ns: int | None
+    recorded_seconds: float  # without pauses, jumps of the clock and stray time stamps
+    last_ns: int | None  # of the samples
 
 
 class Reading(Protocol):
@@ -73,23 +73,6 @@ class Reading(Protocol):
 
     def close(self) -> None:
         """Stop reading; may be called from any thread."""
-
-
-class Spans:
-    """Passes blocks on and notes the times of their samples."""
-
-    def __init__(self) -> None:
-        self.first_ns: int | None = None
-        self.last_ns: int | None = None
-
-    def watch(self, blocks: Iterable[SampleBlock]) -> Iterator[SampleBlock]:
-        """The same blocks."""
-        for block in blocks:
-            if len(block.time):
-                first, last = int(block.time.min()), int(block.time.max())
-                self.first_ns = first if self.first_ns is None else min(self.first_ns, first)
-                self.last_ns = last if self.last_ns is None else max(self.last_ns, last)
-            yield block
 
 
 def windower_of(system: System, stamped: bool = False) -> Windower:
@@ -112,7 +95,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     """
     system = request.system
     recording = open_stream(request.path, system, request.dbc, request.start)
-    windower, spans = windower_of(system, recording.stamped), Spans()
+    windower = windower_of(system, recording.stamped)
     beside = Beside(len(system.channels), len(system.auxiliary))
     held: list[Window] = []
     whole = 0
@@ -123,7 +106,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
         emit(ReadWindows(held, _copy(recording.tally), recording.vehicle))
         held, told = [], time.monotonic()
 
-    for block in paced(spans.watch(recording.at_rate(system.sample_rate, beside.keep)), request.speed):
+    for block in paced(recording.at_rate(system.sample_rate, beside.keep), request.speed):
         for window in windower.push(block):
             held.append(beside.to(window))
             whole += 1
@@ -144,8 +127,8 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
         recording.incomplete or bool(said),
         windower.expected,
         windower.lost,
-        spans.first_ns,
-        spans.last_ns,
+        round(windower.recorded, 3),
+        windower.order.newest,
     )
 
 

@@ -79,7 +79,7 @@ def run(
                 settings.store is not None,
             )
             status = max(status, _report(pipeline, called, fed, json_lines))
-            told = slower_line(fed, speed, engine.system.sample_rate)
+            told = slower_line(fed, speed)
             if told:
                 print(f"sprung: {called}: {told}", file=sys.stderr)
     return status
@@ -181,7 +181,7 @@ def summary(pipeline: Pipeline, view: VehicleView, fed: Fed) -> dict[str, Any]:
         "alarms": [alarm_dict(alarm) for alarm in view.alarms],
         "comfort": comfort_dict(pipeline, fed),
         **view.measurements(),
-        "recorded_seconds": fed.recorded_seconds(pipeline.engine.system.sample_rate),
+        "recorded_seconds": fed.recorded_seconds,
         "wall_seconds": round(fed.wall_seconds, 3),
     }
 
@@ -191,9 +191,9 @@ def health(view: VehicleView, fed: Fed) -> str:
     return view.health if fed.monitored or view.health == "failure" else "check_function"
 
 
-def slower_line(fed: Fed, speed: float, sample_rate: float) -> str | None:
+def slower_line(fed: Fed, speed: float) -> str | None:
     """What to say of a replay that did not keep up with the speed that was asked for; None where it did."""
-    recorded = fed.recorded_seconds(sample_rate)
+    recorded = fed.recorded_seconds
     pace = recorded / max(fed.wall_seconds, 1e-9)
     if speed <= 0 or fed.wall_seconds < recorded / speed + SLACK_SECONDS or pace > KEPT_UP * speed:
         return None
@@ -202,7 +202,7 @@ def slower_line(fed: Fed, speed: float, sample_rate: float) -> str | None:
 
 def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
     """What was read, how fast, and what is alarmed."""
-    recorded = fed.recorded_seconds(pipeline.engine.system.sample_rate)
+    recorded = fed.recorded_seconds
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())
     pace = recorded / max(fed.wall_seconds, 1e-9)
     lines = [f"{recorded:.1f} s recorded in {fed.wall_seconds:.1f} s ({pace:.0f} x real time); windows: {counts}"]

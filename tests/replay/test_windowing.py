@@ -263,6 +263,7 @@ def test_a_clock_jump_restarts_the_grid(jump: float) -> None:
     assert len(windows) == 10
     assert windows[5].start == START + int((3.0 + jump) * 1e9)
     assert sum(count for reason, count in windower.reasons.items() if "clock jump" in reason) == 1
+    assert windower.recorded == pytest.approx(6.0)
 
 
 def test_a_small_step_back_of_the_clock_is_not_taken_for_duplicates() -> None:
@@ -283,6 +284,7 @@ def test_a_stray_time_stamp_does_not_stop_the_stream() -> None:
     assert windower.reasons["stray time stamp"] == 1
     assert windower.reasons["late"] == 1
     assert len(windows) == 7
+    assert windower.recorded == pytest.approx(4.0)  # and not the years to the stray one
 
 
 def test_the_grid_follows_a_clock_that_drifts() -> None:

@@ -93,7 +93,7 @@ def test_a_file_is_fed_whole_and_counted(csv_engine: Engine, recording: Path, tm
     assert fed.vehicle == "car_7"
     assert fed.windows == {"used": 9, "repaired": 0, "dropped": 0}
     assert fed.tally.used == 100 * SECONDS
-    assert fed.recorded_seconds(100.0) == pytest.approx(SECONDS)
+    assert fed.recorded_seconds == pytest.approx(SECONDS)
     assert (fed.lost, fed.expected) == (0, 28 * 100 * SECONDS)
 
 
