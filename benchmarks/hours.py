@@ -60,14 +60,15 @@ def _hour(number: int, seed: int, seconds: float, cruise: tuple[float, float]) -
     begin = time.process_time()
     engine, vehicle = _product()
     timetable = draw_timetable(vehicle, Service(cruise=cruise), seconds, 10_000 * seed + number, start=6 * HOUR)
-    ran, fast, scores, loads, state = 0, 0, [], [], None
-    unused = {RUNNING: 0, EXCITED: 0}  # windows at these speeds or more
+    ran, fast, idle, scores, loads, state = 0, 0, 0, [], [], None
+    unused = {RUNNING: 0, EXCITED: 0}  # windows of no use at these speeds or more
     for moment in through(engine, vehicle, timetable):
         state = moment.state
         speed = float(timetable.at(timetable.speed, moment.time))
         if speed < RUNNING:
             continue
         ran, fast = ran + 1, fast + (speed >= EXCITED)
+        idle += not moment.watched or state.misfit_since is not None
         for least in unused:
             unused[least] += speed >= least and (not moment.used or state.misfit_since is not None)
         if moment.time > SETTLED and ran % 60 == 0:
@@ -81,7 +82,8 @@ def _hour(number: int, seed: int, seconds: float, cruise: tuple[float, float]) -
     alarms = [f"{a.kind} {a.parameter}" for a in state.alarms]
     return {
         "name": "full_hour", "vehicle": number, "windows_running": ran,
-        "unmonitored_%": 100 * unused[RUNNING] / ran, "unmonitored_from_10_m/s_%": 100 * unused[EXCITED] / max(fast, 1),
+        "unmonitored_%": 100 * idle / ran, "of_no_use_%": 100 * unused[RUNNING] / ran,
+        "of_no_use_from_10_m/s_%": 100 * unused[EXCITED] / max(fast, 1),
         "false_alarms": [a for a in alarms if not a.startswith("sensor")],
         "sensor_alarms": [a for a in alarms if a.startswith("sensor")],
         "rms_error_over_std": float(np.sqrt(np.mean(score**2))),

@@ -27,6 +27,7 @@ class Moment:
     estimate: Estimate
     state: TrackerState
     used: bool  # by the tracker
+    watched: bool  # used, or of no use at a time when what was known before holds, or the vehicle stands
 
 
 def through(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[Moment]:
@@ -37,8 +38,10 @@ def through(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[
         starts = [START + round(k / rate * 1e9) for k in begins]
         found, _ = engine.identify(windows, starts=starts)
         for k, start, estimate in zip(begins, starts, found, strict=True):
-            before, state = state.used, tracker.update(state, estimate, start)
-            yield Moment((k + system.window / 2) / rate, estimate, state, state.used > before)
+            before, state = state, tracker.update(state, estimate, start)
+            share = state.coverage.share
+            watched = 0 < share >= before.coverage.share
+            yield Moment((k + system.window / 2) / rate, estimate, state, state.used > before.used, watched)
 
 
 def _windows(engine: Engine, vehicle: Vehicle, timetable: Timetable) -> Iterator[tuple[FloatArray, list[int]]]:

@@ -154,6 +154,7 @@ class Estimate:
     deviating: Deviating | None = None  # where it was asked for, or refined elsewhere than at the system file
     faults: tuple[MeasurementFault, ...] = ()  # that had to be taken back before the window fitted
     informative: bool = True  # False: too little excitation to tell anything, neither that it fits nor that it does not
+    running: bool = False  # though it is not informative, the vehicle was moved: its windows are too noisy, or alike
     noise: float = 0.0  # share of noise in what looks like information on the parameters; 0: negligible
 
 

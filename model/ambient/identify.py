@@ -162,6 +162,7 @@ def _of_transient(told: TransientFit, P: int, present: BoolArray) -> Estimate:
         converged=told.fitted.converged,
         iterations=told.fitted.iterations,
         informative=bool(identifiable.any()),
+        running=not identifiable.any(),
     )
 
 
@@ -185,6 +186,7 @@ def as_estimate(told: Told, P: int, present: BoolArray) -> Estimate:
         converged=fitted.converged,
         iterations=fitted.iterations,
         informative=bool(identifiable.any() or not fits),
+        running=bool(fits and not identifiable.any()),
     )
 
 

@@ -18,7 +18,8 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
     fits = refined.chi_square < fit_limit(refined.freedom)
     # A window that fits and yet pins nothing down tells nothing; nor does one whose inputs stand still, whatever moves.
     told = np.where(fits, refined.identifiable[:, :P].any(axis=1) & refined.converged, True)
-    informative = (refined.excitation > EXCITED) & told
+    moved = refined.excitation > EXCITED
+    informative = moved & told
     return [
         Estimate(
             log_ratio=refined.log_ratio[b, :P],
@@ -33,6 +34,7 @@ def estimates(refined: Refined, P: int, states: bool, deviating: list[Deviating 
             states=refined.states[b] if states else None,
             outputs=refined.outputs[b] if states and refined.outputs.shape[1] else None,
             informative=bool(informative[b]),
+            running=bool(moved[b] and not informative[b]),
             deviating=deviating[b],
             noise=float(refined.noise[b]),
         )

@@ -64,6 +64,11 @@ class TrackerSettings:
                 f"{self.change}, {self.alarm_change}, {self.failure_change}"
             )
 
+    @property
+    def holding(self) -> float:
+        """s for which what the last window told holds: no failure of the usual pace makes a change meanwhile."""
+        return self.change / self.process.drift_rate
+
     def evidence(self, parameters: int) -> float:
         """Log-likelihood ratio that one side of one parameter must reach, baseline known exactly.
 

@@ -38,6 +38,7 @@ __all__ = [
 ]
 
 MOVING = 10.0  # m/s, from which on wheels move on any track: inputs that are still are not measured
+CRAWLING = 5.0  # m/s, below which a vehicle need not be watched either: nothing shakes it
 
 
 class Tracker:
@@ -155,10 +156,12 @@ class Tracker:
 
         Nobody can watch a vehicle that stands.  One that runs is not watched meanwhile: where inputs are still though
         it is fast, or frozen, and where a window does not fit in a curve; a yaw rate whose zero is off makes every
-        window one.
+        window one.  Where it runs too slowly to tell anything, what was told last holds for a while.
         """
-        runs = estimate.informative or (conditions is not None and conditions.speed > MOVING) or bool(estimate.faults)
-        seen = coverage.update(state.coverage, usable=not runs)
+        speed = np.nan if conditions is None else conditions.speed
+        runs = estimate.informative or speed > MOVING or bool(estimate.faults)
+        known = state.last is not None and (time_ns - state.last) * 1e-9 < self.settings.holding
+        seen = coverage.update(state.coverage, usable=not runs and (known or not estimate.running or speed < CRAWLING))
         new = replace(state, time=time_ns, idle=state.idle + 1, coverage=seen)
         if estimate.informative or not estimate.faults:
             return new

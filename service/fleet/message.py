@@ -38,6 +38,7 @@ MOST_BYTES = 50_000_000  # of a message when it is unpacked: a small one may not
 MOST_WINDOWS = 2000  # of one message
 LEVEL_STEP = 1 / 16  # of a log-ratio, in its standard deviations
 SHIFT_STEP = 1 / 64  # of what deviations do, in standard deviations
+RUNNING = 1 << 16  # the flag of an estimate above its iterations; older receivers take it for some more of these
 Coding = Literal["exact", "small"]
 
 
@@ -164,7 +165,7 @@ def _estimates(found: Sequence[Estimate], coding: Coding) -> dict[str, Any]:
     known = np.stack([e.identifiable for e in found])
     scalars = np.array([[e.nrmse, e.chi_square, e.noise] for e in found])
     sensors = np.stack([e.per_sensor for e in found])
-    flags = [e.adequate + 2 * e.converged + 4 * e.informative + 8 * e.iterations for e in found]
+    flags = [e.adequate + 2 * e.converged + 4 * e.informative + 8 * e.iterations + RUNNING * e.running for e in found]
     deviating = [(i, e.deviating) for i, e in enumerate(found) if e.deviating is not None]
     return {
         "level": _levels(level, np.diagonal(covariance, axis1=1, axis2=2), coding),
@@ -210,10 +211,11 @@ def _read_estimates(data: dict[str, Any], coding: Coding) -> list[Estimate]:
             float(scalars[i, 1]),
             adequate=bool(flag & 1),
             converged=bool(flag & 2),
-            iterations=flag >> 3,
+            iterations=flag % RUNNING >> 3,
             deviating=deviating.get(i),
             faults=faults.get(i, ()),
             informative=bool(flag & 4),
+            running=bool(flag & RUNNING),
             noise=noise[i],
         )
         for i, flag in enumerate(flags)

@@ -60,6 +60,21 @@ def test_a_standing_vehicle_need_not_be_watched(conditions: Conditions | None) -
     assert tracker.health(state) == "ok"
 
 
+def test_a_vehicle_that_runs_too_slowly_to_tell_anything_is_watched_for_a_while_only() -> None:
+    tracker, state, covariance = learned()
+    noisy = estimate(np.zeros(24), covariance, informative=False, running=True)
+    held = round(tracker.settings.holding)
+    for _ in range(1, held):
+        state = tracker.update(state, noisy, (state.time or 0) + SECOND)
+    assert tracker.health(state) == "ok"  # nothing fails within less than two minutes
+    crawled = state
+    for _ in range(40):
+        state = tracker.update(state, noisy, (state.time or 0) + SECOND)
+        crawled = tracker.update(crawled, noisy, state.time or 0, Conditions(speed=2.0))
+    assert tracker.health(state) == "check_function"
+    assert tracker.health(crawled) == "ok"
+
+
 def test_inputs_that_all_repeat_their_last_values_are_no_standstill(system: System, running: FloatArray) -> None:
     inputs, frozen = len(system.inputs), running.copy()
     frozen[:, :, :inputs] = running[:, :1, :inputs]
