@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from sprung.model.signals import SampleBlock, Tally, Window
+from sprung.model.signals import Tally, Window
 from sprung.model.system import System
 from sprung.replay.beside import Beside
 from sprung.replay.pacing import paced
