@@ -2,7 +2,8 @@
 
 `--kills N` sends SIGKILL to real processes: to a service that takes windows, recordings and diagnoses, and to commands
 that replay, migrate, forget, back up and restore.  `--cuts N` replays the system calls of a traced service onto a disk
-that loses what was not synced, and looks at what is left at N moments.  `--load-minutes N` sends the windows of 100
+that loses what was not synced, and looks at what is left at N moments; `--step-cuts N` does so with replay, migration,
+first start, retention, back-up and restoration, N moments each.  `--load-minutes N` sends the windows of 100
 vehicles (`--vehicles`), one a second each; `--soak-minutes N` sends few, uploads and looks at pages meanwhile.
 `--scarce-seconds N` takes disk, files, memory and the store's lock from a running service, for N seconds each; as 20
 kills are, it is done unless told otherwise (`sprung bench trust 0 --scarce-seconds 0`).
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 import tempfile
 import time
 from collections import Counter
@@ -25,7 +27,8 @@ from sprung.benchmarks.trust_power import power_cuts
 from sprung.benchmarks.trust_ride import RestlessRide
 from sprung.benchmarks.trust_scarcity import scarcity
 from sprung.benchmarks.trust_soak import soak
-from sprung.benchmarks.trust_steps import KILLS
+from sprung.benchmarks.trust_step_cuts import cut_step, replay_cuts
+from sprung.benchmarks.trust_steps import KILLS, STEPS
 from sprung.benchmarks.trust_zygote import Zygote
 
 
@@ -33,6 +36,7 @@ def run(
     kills: int = 20,
     *,
     cuts: int = 0,
+    step_cuts: int = 0,
     load_minutes: float = 0.0,
     vehicles: int = VEHICLES,
     soak_minutes: float = 0.0,
@@ -52,12 +56,28 @@ def run(
             yield from _kills(place, kills, seed, minutes * 60)
         if cuts:
             yield from power_cuts(place / "power", cuts, seed)
+        if step_cuts:
+            yield from _step_cuts(place / "power", step_cuts, seed)
         if load_minutes:
             yield from load(Path(temporary), load_minutes, vehicles)
         if soak_minutes:
             yield from soak(Path(temporary), soak_minutes)
         if scarce_seconds:
             yield from scarcity(Path(temporary), scarce_seconds)
+
+
+def _step_cuts(place: Path, cuts: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Each kind of step, and replay."""
+    if shutil.which("strace") is None:
+        yield {"figure": "power cuts of steps", "value": None, "skipped": "strace is not installed"}
+        return
+    zygote = Zygote()
+    for name, make in STEPS.items():
+        folder = place / name.replace(" ", "-")
+        folder.mkdir(parents=True, exist_ok=True)
+        yield cut_step(folder, name, make(folder), cuts, zygote, seed)
+    yield replay_cuts(place / "replay", RestlessRide(), cuts, zygote, seed)
+    zygote.close()
 
 
 def _kills(place: Path, kills: int, seed: int, seconds: float) -> Iterator[dict[str, Any]]:

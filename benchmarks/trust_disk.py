@@ -143,6 +143,13 @@ class ForgetfulDisk:
         self._names: list[SystemCall] = []  # creations, renames and removals that do not last yet
         self._new: dict[int, _File] = {}  # the file of a creation that does not last yet, by the identity of the call
 
+    def hold(self, folder: Path) -> None:
+        """Begin with the files of a folder, which last; it stands for the root."""
+        for path in folder.rglob("*"):
+            if path.is_file():
+                name = f"{self._root}/{path.relative_to(folder).as_posix()}"
+                self._now[name] = self._kept[name] = _File(bytearray(path.read_bytes()), named=True)
+
     def take(self, call: SystemCall) -> None:
         """One further call."""
         match call.name:

@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -111,7 +112,7 @@ class ReplayKills:
     def _close(self, store: Path, printed: Path) -> None:
         self._start(store, printed).wait()
         told = {line["window"] for line in map(_object, printed.read_text().splitlines()) if "window" in line}
-        alone, mine = _content(self._folder / "alone.db"), _content(store)
+        alone, mine = content(self._folder / "alone.db"), content(store)
         self._counts.add(
             chains=1,
             windows_printed=len(told),
@@ -135,32 +136,38 @@ class ReplayKills:
         return self._zygote.command("replay", str(self._ride), "--system", str(SYSTEM_FILE), *more, out=out)
 
 
-class StepKills:
-    """A short step of a command, in a process that says when it begins: migration, retention, back-up, restoration."""
+@dataclass(frozen=True, slots=True)
+class KilledStep:
+    """A short step of a command: migration, retention, back-up, restoration."""
 
-    def __init__(self, folder: Path, zygote: Zygote, code: str, prepare: Callable[[Path], None], judge: Judge) -> None:
-        """code: Python that works in its current folder, after `go()`; prepare: makes that folder; judge: see there."""
+    code: str  # Python that works in its current folder, after `go()`
+    prepare: Callable[[Path], None]  # makes that folder
+    judge: Callable[[Path, bool], dict[str, int]]  # the folder, and whether the step was done again: what is wrong
+
+
+class StepKills:
+    """A step in a process that says when it begins."""
+
+    def __init__(self, folder: Path, zygote: Zygote, step: KilledStep) -> None:
         self._folder = folder
         folder.mkdir(parents=True, exist_ok=True)
         self._counts = LastingCounts(folder / "counts.json")
         self._zygote = zygote
-        self._code = code
-        self._prepare = prepare
-        self._judge = judge
+        self._step = step
 
     def kill(self, rng: random.Random) -> dict[str, Any]:
         """After up to 1.2 times what the step takes alone; what ended before is killed in vain, and counted so."""
         alone = self._alone()
-        place = self._fresh()
-        process, delay = self._start(place), rng.uniform(0.0, 1.2) * alone
+        place = fresh(self._folder / "place", self._step.prepare)
+        process, delay = started(self._step, place, self._zygote), rng.uniform(0.0, 1.2) * alone
         time.sleep(delay)
         missed = not process.alive
         process.kill()
-        first = self._judge(place, False)
-        again = self._start(place)
+        first = self._step.judge(place, False)
+        again = started(self._step, place, self._zygote)
         again.wait()
         self._counts.add(too_late=missed, **first, failed_afterwards=not (place / DONE).exists())
-        self._counts.add(**{f"{name}_afterwards": value for name, value in self._judge(place, True).items()})
+        self._counts.add(**{f"{name}_afterwards": value for name, value in self._step.judge(place, True).items()})
         shutil.rmtree(place)
         return {"seconds": round(delay, 4), "too_late": missed}
 
@@ -168,38 +175,35 @@ class StepKills:
         """Over all kills."""
         return self._counts.counts
 
-    def _fresh(self) -> Path:
-        place = self._folder / "place"
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir(parents=True)
-        self._prepare(place)
-        return place
-
     def _alone(self) -> float:
         note = self._folder / "alone.json"
         if not note.exists():
-            place = self._fresh()
-            process = self._start(place)
+            place = fresh(self._folder / "place", self._step.prepare)
+            process = started(self._step, place, self._zygote)
             begun = time.monotonic()
             process.wait()
             if not (place / DONE).exists():
-                raise ValueError(f"the step fails when nobody kills it: {self._code[-200:]}")
+                raise ValueError(f"the step fails when nobody kills it: {self._step.code[-200:]}")
             note.write_text(json.dumps({"seconds": time.monotonic() - begun}))
         return float(json.loads(note.read_text())["seconds"])
 
-    def _start(self, place: Path) -> Forked:
-        """The process, once it has begun with its step."""
-        for name in (GO, DONE):
-            (place / name).unlink(missing_ok=True)
-        process = self._zygote.step(self._code, place)
-        while process.alive and not (place / GO).exists():
-            time.sleep(0.0005)
-        return process
+
+def fresh(place: Path, prepare: Callable[[Path], None]) -> Path:
+    """A folder that holds what was prepared, and nothing else."""
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    prepare(place)
+    return place
 
 
-Judge = Callable[
-    [Path, bool], dict[str, int]
-]  # the folder, and whether the step was done again: what is wrong, counted
+def started(step: KilledStep, place: Path, zygote: Zygote) -> Forked:
+    """The process of a step, once it has begun."""
+    for name in (GO, DONE):
+        (place / name).unlink(missing_ok=True)
+    process = zygote.step(step.code, place)
+    while process.alive and not (place / GO).exists():
+        time.sleep(0.0005)
+    return process
 
 
 class LastingCounts:
@@ -240,7 +244,8 @@ def count(path: Path, table: str) -> int:
         return -1  # no such table
 
 
-def _content(path: Path) -> dict[str, Any]:
+def content(path: Path) -> dict[str, Any]:
+    """What a replay leaves in a store, for comparison."""
     return {
         "windows": rows(path, "SELECT start_ns, outcome, log_ratio, std FROM windows"),
         "tracker": rows(path, "SELECT vehicle_id, state FROM tracker_states"),

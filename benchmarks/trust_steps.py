@@ -12,7 +12,16 @@ from alembic import command
 from alembic.config import Config
 from sqlalchemy import create_engine, insert, text
 
-from sprung.benchmarks.trust_kills import Kills, ReplayKills, ServiceKills, StepKills, count, integrity, rows
+from sprung.benchmarks.trust_kills import (
+    KilledStep,
+    Kills,
+    ReplayKills,
+    ServiceKills,
+    StepKills,
+    count,
+    integrity,
+    rows,
+)
 from sprung.benchmarks.trust_ride import RestlessRide
 from sprung.benchmarks.trust_zygote import Zygote
 from sprung.service.backup import back_up, restore
@@ -32,7 +41,7 @@ from pathlib import Path
 from sprung.service.housekeeping import Housekeeping
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
-settings = Settings(data_dir=Path("."))
+settings = Settings(data_dir=Path.cwd())
 store = open_store(settings.store_url)
 go()
 housekeeping = Housekeeping(settings, store)
@@ -45,20 +54,20 @@ from pathlib import Path
 from sprung.service.backup import back_up
 from sprung.service.settings import Settings
 go()
-back_up(Settings(data_dir=Path("data")), Path("b.tar"))
+back_up(Settings(data_dir=Path.cwd() / "data"), Path.cwd() / "b.tar")
 """
 RESTORE = """
 from pathlib import Path
 from sprung.service.backup import restore
 from sprung.service.settings import Settings
-settings = Settings(data_dir=Path("new"))
+settings = Settings(data_dir=Path.cwd() / "new")
 go()
 if not (settings.data_dir / "sprung.db").exists():
-    restore(settings, Path("b.tar"))
+    restore(settings, Path.cwd() / "b.tar")
 """
 
 
-def _migration(folder: Path, _ride: RestlessRide, zygote: Zygote) -> Kills:
+def _migration(folder: Path) -> KilledStep:
     def prepare(place: Path) -> None:
         """A store of the first version, with vehicles."""
         engine = create_engine(f"sqlite:///{place}/sprung.db")
@@ -76,19 +85,19 @@ def _migration(folder: Path, _ride: RestlessRide, zygote: Zygote) -> Kills:
         store = place / "sprung.db"
         return {"damaged": integrity(store) != "ok", "vehicles_lost": 500 - count(store, "vehicles")}
 
-    return StepKills(folder, zygote, OPEN, prepare, judge)
+    return KilledStep(OPEN, prepare, judge)
 
 
-def _first_start(folder: Path, _ride: RestlessRide, zygote: Zygote) -> Kills:
+def _first_start(folder: Path) -> KilledStep:
     def judge(place: Path, done: bool) -> dict[str, int]:
         store = place / "sprung.db"
         return {"damaged": integrity(store) != "ok", "no_tables": done and count(store, "vehicles") != 0}
 
-    return StepKills(folder, zygote, OPEN, lambda _place: None, judge)
+    return KilledStep(OPEN, lambda _place: None, judge)
 
 
-def _retention(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
-    lived_in = _lived_in(folder, ride)
+def _retention(folder: Path) -> KilledStep:
+    lived_in = _lived_in(folder)
 
     def judge(place: Path, done: bool) -> dict[str, int]:
         left = count(place / "sprung.db", "windows")
@@ -102,11 +111,11 @@ def _retention(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
             "files_missing": len(kept - present),
         }
 
-    return StepKills(folder, zygote, FORGET, lambda place: _copy(lived_in, place), judge)
+    return KilledStep(FORGET, lambda place: _copy(lived_in, place), judge)
 
 
-def _back_up(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
-    lived_in = _lived_in(folder, ride)
+def _back_up(folder: Path) -> KilledStep:
+    lived_in = _lived_in(folder)
 
     def judge(place: Path, done: bool) -> dict[str, int]:
         whole = (place / "b.tar").exists()
@@ -117,11 +126,11 @@ def _back_up(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
             "leftovers": done and len(list(place.glob("b.tar.*"))),
         }
 
-    return StepKills(folder, zygote, BACK_UP, lambda place: _copy(lived_in, place / "data"), judge)
+    return KilledStep(BACK_UP, lambda place: _copy(lived_in, place / "data"), judge)
 
 
-def _restore(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
-    lived_in = _lived_in(folder, ride)
+def _restore(folder: Path) -> KilledStep:
+    lived_in = _lived_in(folder)
     source = folder / "b.tar"
     if not source.exists():
         back_up(Settings(data_dir=lived_in), source)
@@ -135,10 +144,10 @@ def _restore(folder: Path, ride: RestlessRide, zygote: Zygote) -> Kills:
     def prepare(place: Path) -> None:
         shutil.copy(source, place / "b.tar")
 
-    return StepKills(folder, zygote, RESTORE, prepare, judge)
+    return KilledStep(RESTORE, prepare, judge)
 
 
-def _lived_in(folder: Path, _ride: RestlessRide) -> Path:
+def _lived_in(folder: Path) -> Path:
     """A data folder with a few thousand windows and an upload."""
     place = folder / "lived-in"
     if (place / "done").exists():
@@ -174,12 +183,24 @@ def _restores(place: Path) -> bool:
     return False
 
 
+STEPS: dict[str, Callable[[Path], KilledStep]] = {  # by name: made in a folder for what they need
+    "migration": _migration,
+    "first start": _first_start,
+    "retention": _retention,
+    "back-up": _back_up,
+    "restoration": _restore,
+}
+
+
+def _kills(name: str) -> Callable[[Path, RestlessRide, Zygote], Kills]:
+    def make(folder: Path, _ride: RestlessRide, zygote: Zygote) -> Kills:
+        return StepKills(folder, zygote, STEPS[name](folder))
+
+    return make
+
+
 KILLS: tuple[tuple[str, Callable[[Path, RestlessRide, Zygote], Kills], int], ...] = (  # name, maker, share of all kills
     ("service", ServiceKills, 6),
     ("replay", ReplayKills, 4),
-    ("migration", _migration, 2),
-    ("first start", _first_start, 2),
-    ("retention", _retention, 2),
-    ("back-up", _back_up, 2),
-    ("restoration", _restore, 2),
+    *((name, _kills(name), 2) for name in STEPS),
 )

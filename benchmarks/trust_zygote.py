@@ -99,12 +99,16 @@ def alive(pid: int) -> bool:
         return False
 
 
+def warm_up() -> None:
+    """Import what commands need."""
+    for name in WARM:
+        import_module(name)
+
+
 def main(warm: bool) -> None:
     """The zygote: a line of JSON in, a process number out."""
     if warm:
-        for name in WARM:
-            import_module(name)
-
+        warm_up()
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # children that have ended are gone at once
     for line in sys.stdin:
         wanted = json.loads(line)

@@ -24,6 +24,7 @@ LISTEN_ONLY: dict[str, dict[str, Any]] = {
 }
 FILTERS_IN_KERNEL = ("socketcan", "kvaser", "neovi", "vector", "nixnet")  # others filter in Python, after the cost
 RECEIVE_BUFFER = 8 << 20  # bytes; the default of 200 kB is a tenth of a second of a busy bus
+SO_RCVBUFFORCE = getattr(socket, "SO_RCVBUFFORCE", 33)
 SO_MEMINFO = getattr(socket, "SO_MEMINFO", 55)
 MEMINFO_WORDS, MEMINFO_DROPS = 9, 8
 STATISTICS = ("rx_dropped", "rx_over_errors", "rx_fifo_errors", "rx_missed_errors")
@@ -80,7 +81,10 @@ def widen(bus: can.BusABC) -> None:
     """Let the kernel hold a few seconds of frames where it is asked through a socket."""
     sock = getattr(bus, "socket", None)
     if isinstance(sock, socket.socket):
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
+        try:  # more than the system's limit for everybody, where the process may
+            sock.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BUFFER)
+        except OSError:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
 
 
 def lost_by_kernel(bus: can.BusABC, address: BusAddress) -> int:

@@ -29,6 +29,8 @@ BEHIND_SECONDS = 5.0  # frames that wait longer are not worth reading: they are 
 CAUGHT_UP_SECONDS = 0.5  # ... the reader is this close again
 CLOCK_STEP_SECONDS = 120.0  # a longer delay than this is a clock that was set, not a queue
 ASK_SECONDS = 5.0  # between two looks at the kernel's counters
+ERROR_BUS_OFF, ERROR_RESTARTED = 0x40, 0x100  # classes of error frames, as linux/can/error.h names them
+BUS_OFF = "the controller is bus-off; give `ip link set` a `restart-ms` for it to come back by itself"
 OFFSET_DRIFT = 1e-3  # by which the clock of an interface may drift against the host's
 
 
@@ -99,6 +101,7 @@ class LiveBus:
                     self._opened(bus)
                     for messages in self._receive(bus):
                         retry = FIRST_RETRY
+                        self._note_errors(messages)
                         self._ask(bus)
                         wanted = self._current(self._wanted(messages))
                         if not wanted:
@@ -152,6 +155,19 @@ class LiveBus:
             self.account.incomplete = True
         self._lost_before = lost
 
+    def _note_errors(self, messages: list[can.Message]) -> None:
+        """A controller that took itself off the bus hears nothing until it is restarted: it says so once."""
+        if self.address.interface != "socketcan":  # others tell in ways of their own
+            return
+        for message in messages:
+            off = message.is_error_frame and bool(message.arbitration_id & ERROR_BUS_OFF)
+            if off and self.connected:
+                self.connected, self.trouble = False, BUS_OFF
+                self.account.problem(f"bus {self.name} lost: {BUS_OFF}")
+            on = not message.is_error_frame or bool(message.arbitration_id & ERROR_RESTARTED)
+            if on and not off and not self.connected:
+                self.connected, self.trouble = True, ""
+
     def _wanted(self, messages: list[can.Message]) -> list[can.Message]:
         """Without frames of other ids: on a busy bus most are, and looking closer costs more than they are worth."""
         ids = self._ids
@@ -177,6 +193,7 @@ class LiveBus:
         return messages
 
     def _note_loss(self, error: Exception, retry: float) -> None:
+        self.connected = False
         self.reconnects += 1
         self.trouble = str(error).splitlines()[0] if str(error) else type(error).__name__
         self.account.problem(f"bus {self.name} lost: {self.trouble}; trying again in {retry:.1f} s")

@@ -18,6 +18,10 @@ class Busy(RuntimeError):
         self.retry_after = retry_after
 
 
+class TooManyOfOne(Busy):
+    """One client has what it may have of something that others need, too."""
+
+
 class NoSpace(RuntimeError):
     """What was sent cannot be kept: the quota or the disk is full."""
 

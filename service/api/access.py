@@ -11,6 +11,7 @@ from fastapi.responses import Response
 from pydantic import TypeAdapter
 from sqlalchemy import Connection
 
+from sprung.service.api.clients import client_of
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
 from sprung.service.store import audit
@@ -36,6 +37,16 @@ async def get_actor(request: Request) -> Actor:
 
 
 ActorOf = Annotated[Actor, Depends(get_actor)]
+
+
+async def get_client(request: Request, actor: ActorOf) -> str:
+    """Who counts as one client: whose token it is, or the address where nobody needs to sign in."""
+    if actor == Actor():
+        return f"address {client_of(request.client.host if request.client else '')}"
+    return f"token {actor.name}"
+
+
+ClientOf = Annotated[str, Depends(get_client)]
 
 
 async def read(core: Core, query: Callable[[Connection], T]) -> T:

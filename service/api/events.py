@@ -10,7 +10,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response, StreamingResponse
 
-from sprung.service.api.access import CoreOf
+from sprung.service.api.access import ClientOf, CoreOf
 from sprung.service.core import Core
 from sprung.service.hub import Listener
 from sprung.service.times import optional_iso
@@ -27,15 +27,18 @@ BEAT_SECONDS = 15.0  # a comment, so that proxies keep the connection
     responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}}},
 )
 async def events(
-    request: Request, core: CoreOf, vehicle: Annotated[str | None, Query(max_length=128)] = None
+    request: Request, core: CoreOf, client: ClientOf, vehicle: Annotated[str | None, Query(max_length=128)] = None
 ) -> Response:
-    """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle."""
+    """Server-sent events `vehicle` with `{"vehicle", "window", "alarms"}`, at most one a second and vehicle.
+
+    A client may follow 40 times at once (429). Of 200 in all, whoever has most gives its oldest up for others.
+    """
     loop, ready = asyncio.get_running_loop(), asyncio.Event()
 
     def wake() -> None:
         loop.call_soon_threadsafe(ready.set)
 
-    listener = core.hub.listen(vehicle, wake)
+    listener = core.hub.listen(vehicle, wake, client)
     stream = _stream(request, core, listener, ready)
     return StreamingResponse(stream, media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
@@ -44,7 +47,7 @@ async def _stream(request: Request, core: Core, listener: Listener, ready: async
     quiet = 0.0
     try:
         yield "retry: 3000\n\n"
-        while not core.stopping.is_set() and not await request.is_disconnected():
+        while not (core.stopping.is_set() or listener.ended) and not await request.is_disconnected():
             try:
                 await asyncio.wait_for(ready.wait(), LEAST_SECONDS)
             except TimeoutError:

@@ -20,6 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from sprung.service.api.clients import client_of
 from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, content_kind, need_of, place_of
 from sprung.service.logs import request_id
@@ -335,7 +336,7 @@ def _known(method: str) -> str:
 
 
 def _address(scope: Scope) -> str:
-    return scope["client"][0] if scope.get("client") else ""
+    return client_of(scope["client"][0]) if scope.get("client") else ""
 
 
 def _unauthorized(detail: str) -> ApiProblem:

@@ -19,7 +19,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
 
-from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, UserError
+from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, TooManyOfOne, UserError
 from sprung.service.pages.render import render
 
 MEDIA_TYPE = "application/problem+json"
@@ -149,6 +149,8 @@ def _as_problem(error: Exception) -> ApiProblem:
         case RequestValidationError():
             errors = [_fault(e) for e in error.errors()[:SHOWN_ERRORS]]
             return ApiProblem(422, "; ".join(f"{e['field']}: {e['detail']}" for e in errors[:3]), errors)
+        case TooManyOfOne():
+            return ApiProblem(429, str(error), headers={"Retry-After": str(error.retry_after)})
         case Busy():
             return ApiProblem(503, str(error), headers={"Retry-After": str(error.retry_after)})
         case NotFound():

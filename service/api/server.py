@@ -1,17 +1,15 @@
-"""The server before the application: how many connections there may be, and how long a client may take.
-
-uvicorn bounds neither the number of connections nor the time that a request may take to arrive: a thousand clients
-that send half of one would hold the service for ever.
-"""
+"""The server before the application: uvicorn, whose connections are admitted and watched by a doorkeeper."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
+import socket
 import ssl
+import struct
 import time
-from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
 from typing import Any
 
@@ -20,15 +18,17 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from sprung.service.api.clients import client_of
+from sprung.service.api.doorkeeper import MOST_LINGERING, Doorkeeper
 from sprung.service.settings import Settings
 
 log = logging.getLogger("sprung.server")
-LOOK_SECONDS = 1.0
 RATE_AFTER_SECONDS = 10.0  # from then on a body must have come at the lowest rate, on the average
 LOWEST_RATE = 1000.0  # bytes a second
 UNREAD_SECONDS = 60.0  # an answer may wait for the client to take what asyncio holds of it, some 64 kB
 STALLED_SECONDS = 2.0  # from then on a client that does not take its answer is one that only waits
-RESERVED_DESCRIPTORS = 128  # for the store, uploads and workers
+LINGER_SECONDS = 1.0  # that a refused client has to read why: closed at once, it would hear of a reset instead
+KERNEL_BYTES = 1 << 17  # of an answer that the kernel may hold for a client that takes nothing; else it is megabytes
 
 REFUSED = (
     b"HTTP/1.1 503 Service Unavailable\r\nconnection: close\r\nretry-after: 2\r\n"
@@ -39,80 +39,32 @@ REFUSED_BODY = (
 )
 
 
-class Doorkeeper:
-    """Connections of one server: how many there are, whose, and which of them only wait.
-
-    When there are too many, the one that has waited longest without a whole request is closed for the new one: who
-    holds connections open loses them, and nobody else notices.
-    """
-
-    def __init__(self, settings: Settings) -> None:
-        self.header_seconds = settings.header_seconds
-        self.body_idle_seconds = settings.body_idle_seconds
-        self._most = min(settings.connections, max(16, _descriptors() - RESERVED_DESCRIPTORS))
-        self._most_each = settings.client_connections
-        self._open: dict[GuardedProtocol, None] = {}
-        self._clients: Counter[str] = Counter()
-        self.evicted = 0
-        self.refused = 0
-
-    def __len__(self) -> int:
-        return len(self._open)
-
-    def admit(self, new: GuardedProtocol) -> bool:
-        """Whether there is room for a connection; closes another one for it where it can."""
-        mine = self._clients[new.host] >= self._most_each
-        if mine or len(self._open) >= self._most:
-            others = (p for p in self._open if p.waiting and (p.host == new.host or not mine))
-            idle = min(others, key=lambda p: p.active, default=None)
-            if idle is None:
-                self.refused += 1
-                return False
-            self.evicted += 1
-            idle.end()
-            self.leave(idle)
-        self._open[new] = None
-        self._clients[new.host] += 1
-        return True
-
-    def leave(self, gone: GuardedProtocol) -> None:
-        """Forget a connection."""
-        if self._open.pop(gone, self) is None:
-            self._clients[gone.host] -= 1
-            if not self._clients[gone.host]:
-                del self._clients[gone.host]
-
-    async def watch(self) -> None:
-        """Close connections whose requests do not arrive; runs as long as the server."""
-        while True:
-            await asyncio.sleep(LOOK_SECONDS)
-            now = time.monotonic()
-            for protocol in list(self._open):
-                if protocol.too_slow(now):
-                    protocol.end()
-
-
 class GuardedProtocol(H11Protocol):
     """uvicorn's HTTP/1.1, admitted by a doorkeeper."""
 
     doorkeeper: Doorkeeper
+    _lingers: asyncio.TimerHandle | None = None  # of one that was refused: when it is closed all the same
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """A client connects."""
         super().connection_made(transport)
-        self.host = self.client[0] if self.client else ""
+        self.host = client_of(self.client[0] if self.client else "")
         self.active = self._begun = time.monotonic()  # when something came; when the request that is awaited began
         self._received = 0
         self._full: float | None = None  # since when the client has not taken what was written for it
         self._unsent, self._moved = 0, self.active  # bytes that waited when it was last looked at, and since when
+        _hold_little(transport)
         self._admitted = self.doorkeeper.admit(self)
         if not self._admitted:
-            transport.write(REFUSED % len(REFUSED_BODY) + REFUSED_BODY)
-            transport.close()
+            self._refuse()
 
     def connection_lost(self, exc: Exception | None) -> None:
         """A client has gone."""
         self.doorkeeper.leave(self)
+        if self._lingers is not None:
+            self._lingers.cancel()
+            self._lingers = None
+            self.doorkeeper.lingering -= 1
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -126,14 +78,26 @@ class GuardedProtocol(H11Protocol):
         self._received += len(data)
         super().data_received(data)
 
+    def _refuse(self) -> None:
+        """Say that there is no room, and why; what else comes is passed over until the client has read that."""
+        self.transport.write(REFUSED % len(REFUSED_BODY) + REFUSED_BODY)
+        if self.doorkeeper.lingering >= MOST_LINGERING:
+            self.transport.close()
+            return
+        self.doorkeeper.lingering += 1
+        self._lingers = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
+        if self.transport.can_write_eof():
+            self.transport.write_eof()
+
     def pause_writing(self) -> None:
         """More waits to be sent than is sensible."""
         self._full = self._moved = time.monotonic()
         super().pause_writing()
+        self.doorkeeper.lighten()
 
     def resume_writing(self) -> None:
         """The client has taken most of it."""
-        self._full = None
+        self._full, self._moved = None, time.monotonic()
         super().resume_writing()
 
     @property
@@ -145,13 +109,18 @@ class GuardedProtocol(H11Protocol):
         return self.cycle is None or self.cycle.response_complete or self.cycle.more_body
 
     @property
+    def unsent(self) -> int:
+        """Bytes of answers that the client has not taken, beside what the kernel holds."""
+        return self.transport.get_write_buffer_size()
+
+    @property
     def _at_rest(self) -> bool:
         """Between two requests."""
         return self.conn.their_state is h11.IDLE and not self.conn.trailing_data[0]
 
     def too_slow(self, now: float) -> bool:
         """Whether a request that has begun does not arrive, or an answer is not taken."""
-        if self._full is not None and self._untaken(now, self._full):
+        if self._untaken(now):
             return True
         if not self.waiting:
             return False
@@ -165,12 +134,14 @@ class GuardedProtocol(H11Protocol):
         took = now - self._begun
         return took > RATE_AFTER_SECONDS and self._received < LOWEST_RATE * took
 
-    def _untaken(self, now: float, since: float) -> bool:
-        """Whether the client takes nothing of its answer, or too little; to be asked now and then."""
-        unsent = self.transport.get_write_buffer_size()
-        if unsent != self._unsent:
-            self._unsent, self._moved = unsent, now
-        return now - self._moved > self.doorkeeper.body_idle_seconds or now - since > UNREAD_SECONDS
+    def _untaken(self, now: float) -> bool:
+        """Whether the client takes nothing of its answer, or too little."""
+        unsent = self.unsent
+        if unsent == 0 or unsent < self._unsent:
+            self._moved = now
+        self._unsent = unsent
+        full = self._full is not None and now - self._full > UNREAD_SECONDS
+        return full or now - self._moved > self.doorkeeper.body_idle_seconds
 
     def on_response_complete(self) -> None:
         """uvicorn goes on to the next request."""
@@ -179,6 +150,10 @@ class GuardedProtocol(H11Protocol):
 
     def end(self) -> None:
         """Close now, also where it is closing and would wait for the client to take the rest."""
+        connection = self.transport.get_extra_info("socket")
+        if connection is not None and self.unsent:  # else the kernel would keep what the client does not take
+            with suppress(OSError):
+                connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         self.transport.abort()
 
 
@@ -226,6 +201,14 @@ def make_server(app: FastAPI, settings: Settings, on_exit: Callable[[], None]) -
     return Server(config, doorkeeper, on_exit)
 
 
+def _hold_little(transport: asyncio.BaseTransport) -> None:
+    """Let the kernel hold little of an answer beyond what is on its way, where it can be told so."""
+    connection, option = transport.get_extra_info("socket"), getattr(socket, "TCP_NOTSENT_LOWAT", None)
+    if connection is not None and option is not None:
+        with suppress(OSError):  # no TCP, or gone already
+            connection.setsockopt(socket.IPPROTO_TCP, option, KERNEL_BYTES)
+
+
 def _tls(settings: Settings) -> dict[str, Any]:
     if settings.tls_certificate is None:
         return {}
@@ -236,20 +219,3 @@ def _tls(settings: Settings) -> dict[str, Any]:
     if settings.tls_client_ca is not None:
         options |= {"ssl_ca_certs": str(settings.tls_client_ca), "ssl_cert_reqs": ssl.CERT_REQUIRED}
     return options
-
-
-def _descriptors() -> int:
-    """How many files may be open; as many as the system lets this process have."""
-    try:
-        import resource
-    except ImportError:
-        return 1 << 16
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = hard if hard != resource.RLIM_INFINITY else 1 << 16
-    if soft < wanted:
-        try:
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-            return wanted
-        except (ValueError, OSError):
-            return soft
-    return soft

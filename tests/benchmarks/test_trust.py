@@ -15,7 +15,7 @@ import pytest
 
 from sprung.benchmarks import trust
 from sprung.benchmarks.trust_disk import TRACED, ForgetfulDisk, SystemCall, system_calls
-from sprung.benchmarks.trust_kills import LastingCounts, StepKills
+from sprung.benchmarks.trust_kills import KilledStep, LastingCounts, StepKills
 from sprung.benchmarks.trust_ride import RestlessRide
 from sprung.benchmarks.trust_steps import KILLS
 from sprung.benchmarks.trust_zygote import Zygote
@@ -117,7 +117,7 @@ def test_a_step_that_a_kill_leaves_half_done_is_counted(tmp_path: Path) -> None:
 
     zygote = Zygote(warm=False)
     try:
-        step = StepKills(tmp_path, zygote, HALF, lambda _place: None, judge)
+        step = StepKills(tmp_path, zygote, KilledStep(HALF, lambda _place: None, judge))
         for number in range(4):
             step.kill(random.Random(number))
     finally:

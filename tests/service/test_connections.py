@@ -57,3 +57,38 @@ def test_an_answer_that_nobody_takes_is_given_up(engine: Engine, tmp_path: Path)
                     taken += len(piece)
             assert taken < 6_000_000
         assert len(ask(port, "/static/vendor/swagger-ui-bundle.js")) > 1_400_000
+
+
+def test_others_are_served_while_slow_clients_are_answered(engine: Engine, tmp_path: Path) -> None:
+    """They take a little all the time, so that none of them only waits."""
+    core = build_core(settings(tmp_path, connections=24, client_connections=12), engine)
+    with served(core) as port, ExitStack() as stack:
+        slow = [client(stack, port, f"127.0.0.{2 + k % 2}", LARGE) for k in range(24)]
+        for _ in range(5):
+            for one in slow:
+                with suppress(OSError):
+                    one.recv(512)
+            assert b"200 OK" in ask(port)
+            time.sleep(0.1)
+
+
+def test_who_is_refused_hears_why(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, client_connections=2), engine)
+    with served(core) as port, ExitStack() as stack:
+        following = b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        for one in [client(stack, port, "127.0.0.1", following) for _ in range(2)]:
+            assert one.recv(100).startswith(b"HTTP/1.1 200")
+        answer = ask(port, headers="X-Long: " + 5000 * "x" + "\r\n")
+        assert answer.startswith(b"HTTP/1.1 503")
+        assert b"retry-after" in answer
+
+
+def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, body_idle_seconds=1), engine)
+    with served(core) as port, ExitStack() as stack:
+        silent, taken = client(stack, port, "127.0.0.2", ONE), 0
+        time.sleep(3.0)
+        with pytest.raises(ConnectionResetError):
+            while taken < 1_500_000:
+                taken += len(silent.recv(65536)) or 1_500_000
+        assert taken < 400_000

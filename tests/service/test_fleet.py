@@ -15,6 +15,8 @@ from sprung.service.api.app import create_app
 from sprung.service.board import Board
 from sprung.service.core import Core, build_core
 from sprung.service.engine import Engine
+from sprung.service.errors import Busy, TooManyOfOne
+from sprung.service.hub import Hub
 from sprung.service.metrics import Metrics
 from sprung.service.pipeline import Pipeline
 from sprung.service.settings import Settings
@@ -281,3 +283,24 @@ def test_a_listener_hears_of_its_vehicle(core: Core, client: TestClient, system:
     assert [news.vehicle for news in listener.take()] == ["a"]
     assert woken == [1]
     core.hub.leave(listener)
+
+
+def test_nobody_listens_in_all_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sprung.service.hub.MOST_LISTENERS", 6)
+    monkeypatch.setattr("sprung.service.hub.MOST_OF_ONE", 4)
+    hub = Hub()
+    greedy = [hub.listen(None, lambda: None, "a") for _ in range(4)]
+    with pytest.raises(TooManyOfOne):
+        hub.listen(None, lambda: None, "a")
+    others = [hub.listen(None, lambda: None, "b") for _ in range(3)]
+    assert [one.ended for one in greedy + others] == [True] + 6 * [False]
+    with pytest.raises(Busy):
+        hub.listen(None, lambda: None, "a")
+
+
+def test_a_client_that_follows_too_often_is_told_when_to_come_again(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sprung.service.hub.MOST_OF_ONE", 0)
+    answer = client.get("/events")
+    assert answer.status_code == 429 and answer.headers["retry-after"] == "30"

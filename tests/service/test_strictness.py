@@ -62,6 +62,15 @@ def test_browsers_find_an_icon(client: TestClient) -> None:
     assert client.get("/static/icon.svg?v=1").status_code == 200  # files keep a version in their address
 
 
+def test_files_of_the_pages_are_sent_again_only_where_they_changed(client: TestClient) -> None:
+    first = client.get("/static/vendor/swagger-ui-bundle.js")
+    assert first.status_code == 200 and int(first.headers["content-length"]) == len(first.content) > 1_000_000
+    assert first.headers["content-type"].startswith("text/javascript")
+    again = client.get("/static/vendor/swagger-ui-bundle.js", headers={"If-None-Match": f"W/{first.headers['etag']}"})
+    assert (again.status_code, again.content, again.headers["etag"]) == (304, b"", first.headers["etag"])
+    assert client.get("/static/vendor").status_code == client.get("/static/%2e%2e/render.py").status_code == 404
+
+
 def test_files_of_the_history_are_described(client: TestClient) -> None:
     found = client.get("/openapi.json").json()["paths"]["/vehicles/{id}/history"]["get"]["responses"]["200"]["content"]
     assert all(content["schema"] for content in found.values()) and len(found) >= 4

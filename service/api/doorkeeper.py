@@ -1,0 +1,142 @@
+"""How many connections there may be, whose, and which of them are given up for others.
+
+uvicorn bounds neither the number of connections nor the time that a request may take to arrive: a thousand clients
+that send half of one, or that ask for much and take nothing of it, would hold the service for ever.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter
+from collections.abc import Iterable
+from typing import Protocol
+
+from sprung.service.settings import Settings
+
+LOOK_SECONDS = 1.0
+RESERVED_DESCRIPTORS = 128  # for the store, uploads and workers
+MOST_LINGERING = 64  # refused connections that are still told so; they count in none of the limits
+MOST_UNSENT_BYTES = 200_000_000  # of answers that clients have not taken, of all together
+
+
+class Connection(Protocol):
+    """What is known of a connection."""
+
+    host: str
+    active: float  # when something came, by time.monotonic
+
+    @property
+    def waiting(self) -> bool:
+        """Whether nothing is being done for it."""
+
+    @property
+    def unsent(self) -> int:
+        """Bytes of answers that its client has not taken."""
+
+    def too_slow(self, now: float) -> bool:
+        """Whether it has been waited for for long enough; to be asked now and then."""
+
+    def end(self) -> None:
+        """Close it now."""
+
+
+class Doorkeeper:
+    """Connections of one server.
+
+    When there are too many, the client that holds most of them gives one up for one that holds fewer: first what only
+    waits, and longest.  Who holds connections open loses them, and nobody else notices.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.header_seconds = settings.header_seconds
+        self.body_idle_seconds = settings.body_idle_seconds
+        self._most = min(settings.connections, max(16, _descriptors() - RESERVED_DESCRIPTORS))
+        self._most_each = settings.client_connections
+        self._open: dict[Connection, None] = {}
+        self._clients: Counter[str] = Counter()
+        self.lingering = 0
+        self.evicted = 0
+        self.refused = 0
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def admit(self, new: Connection) -> bool:
+        """Whether there is room for a connection; closes another one for it where it can."""
+        if self._clients[new.host] >= self._most_each or len(self._open) >= self._most:
+            yielding = self._yielding(new.host)
+            if yielding is None:
+                self.refused += 1
+                return False
+            self._evict(yielding)
+        self._open[new] = None
+        self._clients[new.host] += 1
+        return True
+
+    def leave(self, gone: Connection) -> None:
+        """Forget a connection."""
+        if gone in self._open:
+            del self._open[gone]
+            self._clients[gone.host] -= 1
+            if not self._clients[gone.host]:
+                del self._clients[gone.host]
+
+    def lighten(self) -> None:
+        """Close connections with the most that waits to be taken until all of it together is bearable."""
+        waiting = {connection: size for connection in self._open if (size := connection.unsent)}
+        total = sum(waiting.values())
+        while total > MOST_UNSENT_BYTES:
+            heaviest = max(waiting, key=waiting.__getitem__)
+            total -= waiting.pop(heaviest)
+            self._evict(heaviest)
+
+    async def watch(self) -> None:
+        """Close connections whose requests do not arrive, or whose answers are not taken; runs as long as the
+        server."""
+        while True:
+            await asyncio.sleep(LOOK_SECONDS)
+            now = time.monotonic()
+            for connection in list(self._open):
+                if connection.too_slow(now):
+                    connection.end()
+
+    def _yielding(self, host: str) -> Connection | None:
+        """The connection that is closed for a new one of a client; None where all are as worthy."""
+        mine = self._clients[host]
+        if mine >= self._most_each:
+            return _longest_waiting(self._of(host))
+        greedy, most = self._clients.most_common(1)[0]
+        if most <= mine + 1:
+            return _longest_waiting(self._open)
+        theirs = self._of(greedy)
+        return _longest_waiting(theirs) or theirs[0]
+
+    def _of(self, host: str) -> list[Connection]:
+        return [connection for connection in self._open if connection.host == host]
+
+    def _evict(self, connection: Connection) -> None:
+        self.evicted += 1
+        connection.end()
+        self.leave(connection)
+
+
+def _longest_waiting(connections: Iterable[Connection]) -> Connection | None:
+    return min((c for c in connections if c.waiting), key=lambda c: c.active, default=None)
+
+
+def _descriptors() -> int:
+    """How many files may be open; as many as the system lets this process have."""
+    try:
+        import resource
+    except ImportError:
+        return 1 << 16
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = hard if hard != resource.RLIM_INFINITY else 1 << 16
+    if soft < wanted:
+        try:
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+            return wanted
+        except (ValueError, OSError):
+            return soft
+    return soft
