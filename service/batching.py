@@ -61,6 +61,7 @@ class _Request:
     loop: asyncio.AbstractEventLoop
     future: asyncio.Future[AnsweredWindow]
     since: float = field(default_factory=time.perf_counter)
+    handed: float = 0.0  # perf_counter s, to the tracking thread
     asked: AskedWindow | None = None
     answer: AnsweredWindow | BaseException | None = None
 
@@ -92,7 +93,7 @@ class Batcher:
     def __init__(
         self, pipeline: Pipeline, compute: Compute, limit: int, observe: Callable[[dict[str, float]], None]
     ) -> None:
-        """limit: windows that may wait; observe: told the seconds of each stage, `queue` among them."""
+        """limit: windows that may wait; observe: told the seconds of each stage, both queues among them."""
         self._pipeline = pipeline
         self._compute = compute
         self._limit = limit
@@ -213,6 +214,9 @@ class Batcher:
         """Hand over to the tracking thread."""
         if not requests:
             return
+        now = time.perf_counter()
+        for request in requests:
+            request.handed = now
         with self._lock:
             self._to_track.extend(requests)
             if not self._tracking:
@@ -227,6 +231,9 @@ class Batcher:
             self._to_track.clear()
             refused = self._call_in_time()
         _deliver(refused)
+        now = time.perf_counter()
+        for request in batch:
+            self._observe({"track queue": now - request.handed})
         self._keep_together(batch)
         _deliver(batch)
 

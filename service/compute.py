@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import queue
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from enum import IntEnum
@@ -30,10 +31,12 @@ class Compute:
     A single thread is deliberate: torch uses all cores within one call, and two calls at once only get slower.
     """
 
-    def __init__(self, queue_size: int) -> None:
-        self._queue: queue.PriorityQueue[tuple[int, int, Callable[[], Any], Future[Any]]] = queue.PriorityQueue(
+    def __init__(self, queue_size: int, on_wait: Callable[[float], None] = lambda seconds: None) -> None:
+        """on_wait: told how long each function waited for its turn, s."""
+        self._queue: queue.PriorityQueue[tuple[int, int, float, Callable[[], Any], Future[Any]]] = queue.PriorityQueue(
             queue_size
         )
+        self._on_wait = on_wait
         self._number = itertools.count()
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sprung-compute", daemon=True)
@@ -44,7 +47,7 @@ class Compute:
         future: Future[T] = Future()
         self._refuse_when_closed()
         try:
-            self._queue.put_nowait((priority, next(self._number), work, future))
+            self._queue.put_nowait((priority, next(self._number), time.perf_counter(), work, future))
         except queue.Full:
             raise Busy("the numerics are busy; try again in a second") from None
         return future
@@ -55,7 +58,7 @@ class Compute:
             return work()
         future: Future[T] = Future()
         self._refuse_when_closed()
-        self._queue.put((priority, next(self._number), work, future))
+        self._queue.put((priority, next(self._number), time.perf_counter(), work, future))
         return future.result()
 
     @property
@@ -67,7 +70,7 @@ class Compute:
         """Finish what was queued, then stop."""
         if not self._closed.is_set():
             self._closed.set()
-            self._queue.put((Priority.STOP, next(self._number), lambda: None, Future()))
+            self._queue.put((Priority.STOP, next(self._number), 0.0, lambda: None, Future()))
             self._thread.join()
 
     def _refuse_when_closed(self) -> None:
@@ -76,9 +79,10 @@ class Compute:
 
     def _run(self) -> None:
         while True:
-            priority, _, work, future = self._queue.get()
+            priority, _, since, work, future = self._queue.get()
             if priority == Priority.STOP:
                 return
+            self._on_wait(time.perf_counter() - since)
             if not future.set_running_or_notify_cancel():
                 continue
             try:

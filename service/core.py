@@ -46,6 +46,7 @@ from sprung.service.tokens import Tokens
 from sprung.service.upload_room import UploadRoom
 from sprung.service.views import VehicleView, vehicle_view
 from sprung.service.vitals import Vitals, request_histogram
+from sprung.service.waits import Waits
 
 log = logging.getLogger("sprung")
 
@@ -77,6 +78,7 @@ class Core:
     ingest: Ingest
     telling: FleetTelling
     upload_room: UploadRoom
+    waits: Waits
     archive: Archive | None = None
     oidc: Provider | None = None  # where people sign in beside their tokens
     feeds: list[LiveFeed] = field(default_factory=list)  # of live buses
@@ -119,9 +121,11 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     """
     store = open_store(settings.store_url)
     archive = open_archive(settings.archive)
-    compute = Compute(settings.compute_queue)
     board = Board(engine, settings.vehicles_in_memory)
     metrics = Metrics(board, settings.parameter_series_vehicles, partial(fleet_counts, store))
+    waits = Waits(metrics.registry)
+    store.on_wait = waits.of("store")
+    compute = Compute(settings.compute_queue, waits.of("numerics"))
     rides = Rides(settings.parameter_series_vehicles)
     metrics.registry.register(RideCollector(rides))
 
@@ -138,7 +142,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms, follow=following
     )
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
-    jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs)
+    jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs, waits)
     diagnoses = Diagnoses(settings, store, rings, jobs)
     alarm_signals = AlarmSignals(settings, store, rings)
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
@@ -167,6 +171,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
         Ingest(pipeline, settings.late_seconds),
         FleetTelling(engine, store, pipeline.model_id),
         UploadRoom(settings, store),
+        waits,
         archive,
         provider_of(settings),
         feeds,
@@ -184,14 +189,14 @@ def _observed(core: Core) -> Core:
     return core
 
 
-def _jobs(settings: Settings, pipeline: Pipeline, metrics: Metrics, diagnosis: DiagnosisJobs) -> Jobs:
+def _jobs(settings: Settings, pipeline: Pipeline, metrics: Metrics, diagnosis: DiagnosisJobs, waits: Waits) -> Jobs:
     """The queue of jobs, with what runs each kind and how long it may take."""
     recordings = RecordingJobs(settings, pipeline, lambda: tally_counter(metrics, "upload"))
     kinds = {
         "recording": Kind(recordings.run, settings.recording_seconds),
         "diagnosis": Kind(diagnosis.run, settings.diagnosis_seconds),
     }
-    return Jobs(pipeline.store, kinds, settings.job_queue)
+    return Jobs(pipeline.store, kinds, settings.job_queue, waits)
 
 
 def tally_counter(metrics: Metrics, source: str) -> OnTally:

@@ -20,7 +20,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.service.errors import Busy, NotFound, UserError
 from sprung.service.store import Store, work
-from sprung.service.times import now_ns
+from sprung.service.times import NANOSECONDS, now_ns
+from sprung.service.waits import Waits
 
 log = logging.getLogger("sprung.jobs")
 WORST_MESSAGE = "an unexpected error; the service's log has the details"
@@ -88,7 +89,8 @@ class Kind:
 class Jobs:
     """Accepts jobs and works through those of a kind in order; a recording does not wait for a diagnosis of minutes."""
 
-    def __init__(self, store: Store, kinds: Mapping[str, Kind], queue_size: int) -> None:
+    def __init__(self, store: Store, kinds: Mapping[str, Kind], queue_size: int, waits: Waits | None = None) -> None:
+        self._waits = waits
         self._store = store
         self._kinds = kinds
         self._limit = queue_size
@@ -202,6 +204,8 @@ class Jobs:
             if job is None or job.state not in work.UNFINISHED:  # cancelled while it waited
                 return
             work.update_job(connection, job_id, now_ns(), state="running", attempts=job.attempts + 1)
+        if self._waits is not None and not job.attempts:
+            self._waits.of(f"{job.kind} jobs")(max(0.0, (now_ns() - job.created_ns) / NANOSECONDS))
         kind = self._kinds.get(job.kind)
         progress = Progress(lambda share: self._note(job_id, share), self._stopping, kind.seconds if kind else 0.0)
         self._current[job_id] = progress
@@ -211,6 +215,8 @@ class Jobs:
         finally:
             del self._current[job_id]
         self._finish(job_id, values)
+        if self._waits is not None:
+            self._waits.job(job.kind, values["state"], time.monotonic() - started)
         log.info(
             "job ended",
             extra={"job": job_id, "kind": job.kind, "state": values["state"], "seconds": time.monotonic() - started},

@@ -127,4 +127,11 @@ def _guard(app: FastAPI, core: Core) -> None:
         | dict.fromkeys(("/identify", "/ingest/estimates", "/ingest/windows"), windows),
     )
     app.add_middleware(HeadAsGet)
-    app.add_middleware(Guard, settings=core.settings, tokens=core.tokens, requests=core.requests, oidc=core.oidc)
+    app.add_middleware(
+        Guard,
+        settings=core.settings,
+        tokens=core.tokens,
+        requests=core.requests,
+        oidc=core.oidc,
+        on_wait=core.waits.of("threads"),
+    )

@@ -10,7 +10,7 @@ import random
 import re
 import time
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from http.cookies import CookieError, SimpleCookie
 from urllib.parse import quote, urlsplit
@@ -72,8 +72,11 @@ class Guard:
         tokens: Tokens,
         requests: Histogram | None = None,
         oidc: Provider | None = None,
+        on_wait: Callable[[float], None] = lambda seconds: None,
     ) -> None:
-        """requests: takes the durations of requests; oidc: whose tokens are taken, too."""
+        """requests: takes the durations of requests; oidc: whose tokens are taken, too; on_wait: told how long requests
+        wait for one of the threads that they are worked on in."""
+        self._on_wait = on_wait
         self.app = app
         self._oidc = oidc
         self._requests = requests
@@ -161,11 +164,13 @@ class Guard:
             self._limiter.take(address)
         try:
             found = await self._foreign(headers)
-            actor, by_cookie = found if found is not None else await run_in_threadpool(self._actor, headers)
+            if found is None:
+                found = await run_in_threadpool(self._actor, headers, time.perf_counter())
         except ApiProblem:
             if self._good.pop(credential, False):
                 self._limiter.take(address)
             raise
+        actor, by_cookie = found
         if actor is LOCAL:
             return actor, by_cookie
         if not self._good.pop(credential, False):
@@ -192,8 +197,9 @@ class Guard:
             detail = "the provider that the token is of cannot be asked now"
             raise ApiProblem(503, detail, headers={"Retry-After": f"{AGAIN_SECONDS:.0f}"}) from None
 
-    def _actor(self, headers: Headers) -> tuple[Actor, bool]:
+    def _actor(self, headers: Headers, asked: float) -> tuple[Actor, bool]:
         """Whose token of this service or session it is; may read the store."""
+        self._on_wait(time.perf_counter() - asked)
         given = headers.get("authorization", "")
         kind, _, text = given.partition(" ")
         try:

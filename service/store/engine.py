@@ -7,7 +7,8 @@ reads a vehicle's tracker to write it holds the vehicle's row (`fleet.hold_vehic
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
@@ -41,6 +42,7 @@ class Store:
         self.many_writers = engine.dialect.name == "postgresql"
         # one writer a process where the database has one anyway: waiting is fair here
         self._writing = threading.BoundedSemaphore(MOST_WRITERS if self.many_writers else 1)
+        self.on_wait: Callable[[float], None] = lambda seconds: None  # told how long each transaction waited to write
         self.months: set[str] = set()  # partitions that are known to be there (`partitions.prepare`)
 
     @contextmanager
@@ -55,9 +57,11 @@ class Store:
     @contextmanager
     def write(self) -> Iterator[Connection]:
         """One transaction, committed at the end, rolled back when anything raises."""
+        asked = time.perf_counter()
         with self._writing, self.engine.connect() as connection:
             connection.execution_options(sprung_write=True)
             with connection.begin():
+                self.on_wait(time.perf_counter() - asked)
                 yield connection
 
     def probe(self) -> None:
