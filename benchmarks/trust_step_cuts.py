@@ -28,12 +28,15 @@ RIDE_SECONDS = 20.0
 TOLD = "told.jsonl"  # what a replay has printed
 
 
-def cut_step(folder: Path, name: str, step: KilledStep, cuts: int, zygote: Zygote, seed: int) -> dict[str, Any]:
-    """Figures of one kind of step."""
+def cut_step(
+    folder: Path, name: str, step: KilledStep, cuts: int, zygote: Zygote, seed: int, warm: bool = True
+) -> dict[str, Any]:
+    """Figures of one kind of step; warm: with everything imported that commands need."""
     place, log = fresh(folder / "traced", step.prepare), folder / "trace.log"
     disk = ForgetfulDisk(str(place))
     disk.hold(place)
-    code = f"from sprung.benchmarks.trust_zygote import warm_up; warm_up()\ngo = lambda: None\n{step.code}"
+    imports = "from sprung.benchmarks.trust_zygote import warm_up; warm_up()\n" if warm else ""
+    code = f"{imports}go = lambda: None\n{step.code}"
     _traced(log, [sys.executable, "-c", code], place)
     wrong: Counter[str] = Counter()
 

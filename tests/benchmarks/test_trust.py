@@ -17,6 +17,7 @@ from sprung.benchmarks import trust
 from sprung.benchmarks.trust_disk import TRACED, ForgetfulDisk, SystemCall, system_calls
 from sprung.benchmarks.trust_kills import KilledStep, LastingCounts, StepKills
 from sprung.benchmarks.trust_ride import RestlessRide
+from sprung.benchmarks.trust_step_cuts import cut_step
 from sprung.benchmarks.trust_steps import KILLS
 from sprung.benchmarks.trust_zygote import Zygote
 
@@ -124,6 +125,39 @@ def test_a_step_that_a_kill_leaves_half_done_is_counted(tmp_path: Path) -> None:
         zygote.close()
     counts = step.outcome()
     assert counts["half"] > 0 and counts["failed_afterwards"] > 0, counts  # it cannot be done again: "x"
+
+
+RENAMED = """
+import os
+from pathlib import Path
+go()
+for number in range(8):
+    with open(f"{{number}}.part", "w") as file:
+        file.write(3000 * "x")
+        file.flush()
+        if {synced}:
+            os.fsync(file.fileno())
+    os.replace(Path.cwd() / f"{{number}}.part", Path.cwd() / f"{{number}}")
+"""
+
+
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+@pytest.mark.parametrize("synced", [True, False])
+def test_a_power_cut_under_a_step_shows_what_was_not_synced(tmp_path: Path, synced: bool) -> None:
+    def judge(place: Path, _done: bool) -> dict[str, int]:
+        whole = [place / str(number) for number in range(8)]
+        return {"short": sum(path.exists() and path.stat().st_size != 3000 for path in whole)}
+
+    step = KilledStep(RENAMED.format(synced=synced), lambda place: (place / "old").touch(), judge)
+    zygote = Zygote(warm=False)
+    try:
+        told = cut_step(tmp_path, "renamed", step, 12, zygote, 1, warm=False)
+    except ValueError as error:
+        pytest.skip(f"strace may not trace here: {error}")
+    finally:
+        zygote.close()
+    assert told["cuts"] == 12 and not told["failed_afterwards"] and not told["short_afterwards"]
+    assert (told["short"] > 0) is not synced
 
 
 def test_a_kill_that_came_too_late_is_none_and_a_run_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
