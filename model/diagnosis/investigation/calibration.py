@@ -27,6 +27,7 @@ from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
+from sprung.model.diagnosis.selection.plausible import hardly_there
 from sprung.model.laws import Law, SensorLaw
 from sprung.model.laws.base import DataSheet
 from sprung.model.schema import SupportInput
@@ -95,6 +96,33 @@ def _off(term: Term) -> float:
     return (term.parameters[0] - term.law.absent[0]) / term.known[0]
 
 
+def is_gain(term: Term) -> bool:
+    """Whether a term is a gain that an instrument in order may have."""
+    return isinstance(term.law, SensorLaw) and term.law.of_instrument is not None and term.law.slope().gain != 0
+
+
+def shared_gain(terms: Sequence[Term]) -> tuple[float, float]:
+    """Gain that terms with expected deviations share, least far off together, and its deviation; 1 and 0 of none."""
+    gains = [(term.parameters[0], term.known[0]) for term in terms if term.known and is_gain(term)]
+    if not gains:
+        return 1.0, 0.0
+    weights = np.array([1 / spread**2 for _, spread in gains])
+    logs = np.log(np.maximum([gain for gain, _ in gains], 1e-3))
+    return float(np.exp(weights @ logs / np.sum(weights))), float(np.sum(weights) ** -0.5)
+
+
+def centred(terms: Sequence[Term]) -> tuple[Term, ...]:
+    """Terms with gains around one: what all channels show too large is the same rig at another size.
+
+    Other values of its laws explain it as well, so that no fit knows it better than data sheets do.
+    """
+    shared, _ = shared_gain(terms)
+    return tuple(
+        replace(term, parameters=(term.parameters[0] / shared,)) if term.known and is_gain(term) else term
+        for term in terms
+    )
+
+
 def calibrated(state: Investigation, shown: Term) -> Investigation:
     """The investigation with the gains and zeros of all channels in its model, at the beginning of its search.
 
@@ -109,7 +137,7 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         fit = try_optimise(state.problem, replace(state.fit.point, terms=(*file, *terms, *found)), _STEPS[1])
         if fit is None:
             return replace(state, calibrations=0)
-        fitted = fit.point.terms[len(file) : len(file) + len(terms)]
+        fitted = centred(fit.point.terms[len(file) : len(file) + len(terms)])
         if stands_alone(fitted, shown.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
         terms = tuple(term for term in fitted if within_sheet(state, term))
@@ -143,8 +171,10 @@ def of_others(state: Investigation) -> Screening:
 
 
 def faulty(state: Investigation) -> list[int]:
-    """Those of them that are beyond the tolerance beside everything that was found."""
-    return [index for index in channels(state) if not in_order(state, state.fit.point.terms[index])]
+    """Those of them that are beyond the tolerance beside everything that was found, by more than they are uncertain."""
+    fit, rules = state.fit, state.options.rules.plausible
+    beyond = (index for index in channels(state) if not in_order(state, fit.point.terms[index]))
+    return [index for index in beyond if not hardly_there(fit, rules, index)]
 
 
 def _shows(law: SensorLaw, *, rate: bool, support: bool) -> bool:

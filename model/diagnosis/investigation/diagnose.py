@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.fit.baseline import refreshed
+from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.by_names import by_names
@@ -26,6 +26,7 @@ from sprung.model.diagnosis.investigation.judgement import (
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults
+from sprung.model.diagnosis.investigation.standing import by_shared_gain, standing
 from sprung.model.diagnosis.investigation.state import (
     Found,
     InputFault,
@@ -104,9 +105,10 @@ def _still_rejected(state: Investigation, before: Fit) -> bool:
 
 def concluded(state: Investigation, tell: Progress) -> Outcome:
     """The model on the whole recording, its errors on the held-out part, and the verdict."""
+    state = standing(state)
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
-    final = replace(final, covariance=final.covariance + left_open(state))
+    final = replace(final, covariance=final.covariance + left_open(state) + by_shared_gain(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
     said = judged(state, before, after, noisy)
@@ -220,7 +222,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     tried = compete(state.problem, state.fit, candidates, lambda text: tell(share, text))
     tried = with_wider_rivals(state, tried)
     believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
-    there = [t for t in tried if not hardly_there(t.fit, t.term, plausible)]
+    there = [t for t in tried if not hardly_there(t.fit, plausible)]
     worthy = [t for t in there if t.finished and t.evidence > 0 and not _minor(state, t)]
     plain = [t for t in worthy if any(t is one for one in believed)]
     trials = preferred(plain, options.rules.selection)
@@ -248,9 +250,12 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
+    if not fit.converged and not problem.process_noise:
+        problem, fit = refreshed(problem, settled(problem, fit))
     tell(share + 0.12, "screening what is left")
     return replace(
         state,
+        problem=problem,
         fit=fit,
         held=replace(state.held, noise=problem.noise),
         found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value, disbelieved)),

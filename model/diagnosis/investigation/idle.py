@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from sprung.model.diagnosis.fit.baseline import refreshed
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term, is_waveform
 from sprung.model.diagnosis.screening.screen import screen
-from sprung.model.diagnosis.selection.evidence import profile_gain
+from sprung.model.diagnosis.selection.compete import cost
+from sprung.model.diagnosis.selection.evidence import process_gain, profile_gain
 from sprung.model.diagnosis.selection.starts import structure_starts
 from sprung.model.laws import StructureLaw
 
@@ -21,19 +23,36 @@ _STEPS = 8  # of a fit without one finding
 def without_idle(state: Investigation) -> Investigation:
     """An investigation without earlier findings that explain next to nothing beside the last one."""
     rules = state.options.rules
-    if state.problem.process_noise:
-        return state
     for index, found in enumerate(state.found[:-1]):
-        fit = _without(state, state.given + index)
-        if fit is None:
+        other = without(state, index)
+        if other is None:
             continue
-        sensors = len(state.problem.sensors)
-        gain = profile_gain(fit.residual, state.fit.residual, sensors, rules.evidence.quiet, rules.evidence)
-        if gain < rules.acceptance.idle * found.trial.gain:
-            kept = (*state.found[:index], *state.found[index + 1 :])
-            last = screen(state.problem, fit, state.problem.system.catalogue, state.options.project)
-            return without_idle(replace(state, fit=fit, found=kept, last=last))
+        dear = cost(state.fit, rules.evidence, state.given + index)
+        if _gain(other, state) < max(dear, rules.acceptance.idle * found.trial.gain):
+            return without_idle(other)
     return state
+
+
+def without(state: Investigation, index: int) -> Investigation | None:
+    """An investigation without one of its findings, everything else fitted again; None where that diverges."""
+    fit, problem = _without(state, state.given + index), state.problem
+    if fit is None:
+        return None
+    if problem.process_noise:  # what stands for it is noise of the forces
+        problem, fit = refreshed(problem, fit)
+    kept = (*state.found[:index], *state.found[index + 1 :])
+    last = screen(problem, fit, problem.system.catalogue, state.options.project)
+    held = replace(state.held, noise=problem.noise)
+    return replace(state, problem=problem, fit=fit, held=held, found=kept, last=last)
+
+
+def _gain(other: Investigation, state: Investigation) -> float:
+    """Twice the log-likelihood ratio of an investigation's model over another's."""
+    before, after, rules = other.fit, state.fit, state.options.rules.evidence
+    sensors = len(state.problem.sensors)
+    if state.problem.process_noise:
+        return process_gain(before.residual, after.residual, sensors, (before.log_det, after.log_det), rules)
+    return profile_gain(before.residual, after.residual, sensors, rules.quiet, rules)
 
 
 def _without(state: Investigation, index: int) -> Fit | None:

@@ -125,7 +125,7 @@ def _moved(
 
 
 SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
-CHANNELS_SWAPPED = SetupEffect("channels_swapped", "{place}: the two channels are exchanged")
+CHANNELS_SWAPPED = SetupEffect("channels_swapped", "{place}: exchanged")
 NODE_DELAY = SetupEffect(
     "node_delay",
     "{place}: all of them are late by {value}, as a whole node is",

@@ -104,6 +104,13 @@ class Wiring:
         if len(supports) > 1:
             yield [], supports
 
+    def between_bodies(self) -> Iterator[list[tuple[int, int]]]:
+        """Pairs of all sensors of two bodies that carry the same kinds of them: their nodes or plugs exchanged."""
+        for first, second in combinations(self.system.bodies, 2):
+            here, there = ([i for i, body in enumerate(self.body) if body == name] for name in (first, second))
+            if len(here) > 1 and [self.kind[i] for i in here] == [self.kind[i] for i in there]:
+                yield list(zip(here, there, strict=True))
+
     def _turns(self, i: int) -> bool:
         return _is_of_a_point(self.sensors[i])
 
@@ -152,6 +159,8 @@ def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiri
     for axis in (1, 0):
         for sensors, supports in wired.mirrored(axis):
             yield hypothesis(sensors, supports)
+    for pairs in wired.between_bodies():
+        yield hypothesis(pairs, [])
 
 
 def _exchanged(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sprung.model.diagnosis.investigation.calibration import channels, in_order
+from sprung.model.diagnosis.investigation.calibration import channels, faulty, in_order
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.diagnosis.report.values import law_parameters
@@ -15,13 +15,15 @@ _SHOWN = 4  # in the summary
 def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     """Those off by more than their deviation, the surest first; a gain that all channels share is told by none."""
     state, final = outcome.investigation, outcome.final
-    indices = [*channels(state), *range(state.given, state.given + len(state.found))]
+    faults = faulty(state)
+    indices = [index for index in channels(state) if index not in faults]
+    terms = state.fit.point.terms
+    indices += [state.given + at for at in range(len(state.found)) if in_order(state, terms[state.given + at])]
     found = []
     for index in indices:
-        term = state.fit.point.terms[index]
-        if in_order(state, term):
-            (parameter,) = law_parameters(final, index, state.options.rules.plausible)
-            found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
+        term = terms[index]
+        (parameter,) = law_parameters(final, index, state.options.rules.plausible)
+        found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
     for fault in state.input_faults:
         if in_order(state, fault.term):
             spec, (value,) = fault.term.law.parameters[0], fault.term.parameters

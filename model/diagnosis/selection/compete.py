@@ -274,7 +274,7 @@ def _judged(problem: Problem, base: Fit, candidate: Candidate, fit: Fit, quiet: 
     else:
         worth = base.chi_square - fit.chi_square
         gain = min(worth, profile_gain(base.residual, fit.residual, sensors, quiet, rules))
-    dear = cost(fit, len(candidate.term.parameters), rules) + rules.rarity * candidate.term.law.prior_cost
+    dear = cost(fit, rules)
     freedom = len(candidate.term.parameters) + len(fit.point.state) - len(base.point.state)
     return Trial(candidate, fit, gain, worth, gain - dear, freedom)
 
@@ -289,14 +289,14 @@ def preferred(trials: list[Trial], rules: SelectionRules = RULES.selection) -> l
     return trials
 
 
-def cost(fit: Fit, count: int, rules: EvidenceRules = RULES.evidence) -> float:
-    """What the last `count` law parameters cost in evidence."""
-    term = fit.point.terms[-1]
-    block = fit.covariance[len(fit.covariance) - count :, len(fit.covariance) - count :]
+def cost(fit: Fit, rules: EvidenceRules = RULES.evidence, index: int = -1) -> float:
+    """What a law, the last by default, costs in evidence: by its parameters and its rarity."""
+    term, place = fit.point.terms[index], fit.place(index)
+    block = fit.covariance[place, place]
     if not term.law.named:  # amplitudes of one curve, which differ from each other's by convention: each by itself
         block = np.diag(np.diag(block))
     logs = [spec.log for spec in term.law.parameters]
     total = occam_cost(logs, term.scales, block / np.outer(term.slopes, term.slopes), rules)
     for spec, scale, value in zip(term.law.parameters, term.scales, term.parameters, strict=False):
         total += unusual_cost(value / scale, spec.usual, rules)
-    return total
+    return total + rules.rarity * term.law.prior_cost

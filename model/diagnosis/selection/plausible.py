@@ -53,12 +53,16 @@ def out_of_range(term: Term) -> str | None:
     return None
 
 
-def hardly_there(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> bool:
-    """Whether the last term of a fit, with one parameter, does not differ from its absence by its stated deviation."""
+def hardly_there(fit: Fit, rules: PlausibleRules = RULES.plausible, index: int = -1) -> bool:
+    """Whether a term of a fit, the last by default, does not differ from its absence by its stated deviation.
+
+    Of terms with one parameter.
+    """
+    term = fit.point.terms[index]
     if len(term.parameters) != 1 or not np.isfinite(term.law.absent[0]):
         return False
-    value = term.parameters[0]
-    stated = np.hypot(np.sqrt(max(fit.covariance[-1, -1], 0.0)), rules.simulated * abs(value))
+    value, at = term.parameters[0], fit.place(index).start
+    stated = np.hypot(np.sqrt(max(fit.covariance[at, at], 0.0)), rules.simulated * abs(value))
     return bool(abs(value - term.law.absent[0]) < rules.apart * stated)
 
 

@@ -6,13 +6,15 @@ import numpy as np
 import pytest
 
 from sprung.benchmarks.generator import draw_cases, make_recordings, read_vehicle
+from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.benchmarks.setups import KINDS, falsified, in_order
 from sprung.model.diagnosis.fit.baseline import baseline
 from sprung.model.diagnosis.investigation.setup import SetupFault, without_setup_faults
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import declared_noise
 from sprung.model.diagnosis.record.split import cut
-from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
+from tests.diagnosis_cases import simulate
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +51,14 @@ def test_a_wrong_set_up_is_named_at_its_channels(kind: str, vehicle: tuple[Syste
     fault = found(wrong.file or system, wrong.values)[0]
     assert fault.effect.name == KINDS[kind]
     assert frozenset(fault.site.location.split("|")) == wrong.channels
+
+
+def test_all_sensors_of_two_bodies_exchanged_are_no_other_structure() -> None:
+    """Under a road whose displacement alone is measured; each pair by itself would explain too little."""
+    once = parse_system(QUARTER_CAR.replace("    velocity: {csv: v, noise: 5.0e-4}\n", ""))
+    values = np.delete(simulate(seed=45).values, 1, axis=1)
+    (fault,) = found(once, values[:, [0, 3, 4, 1, 2]])
+    assert (fault.effect.name, fault.site.location) == ("channels_swapped", "car_a|bogie_a|car_b|bogie_b")
 
 
 def test_a_delay_is_estimated_with_its_deviation(vehicle: tuple[System, np.ndarray]) -> None:

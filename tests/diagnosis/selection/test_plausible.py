@@ -97,8 +97,11 @@ def test_gains_and_masses_that_stand_for_something_else_are_not_believed(
 def test_what_is_as_if_it_were_not_there_is_no_finding(
     law: str, values: tuple[float, ...], deviation: float, hardly: bool
 ) -> None:
-    fit: Any = SimpleNamespace(covariance=np.diag([1.0, deviation**2]))
-    assert hardly_there(fit, Term(find_law(law), "x", values)) == hardly
+    count = len(values)
+    point = SimpleNamespace(theta=np.zeros(1), terms=(Term(find_law(law), "x", values),))
+    fit: Any = SimpleNamespace(covariance=np.diag([1.0, *[deviation**2] * count]), point=point)
+    fit.place = lambda index: slice(1, 1 + count)
+    assert hardly_there(fit) == hardly
 
 
 @pytest.mark.parametrize(("knee", "believed"), [(0.2, True), (0.004, False)])

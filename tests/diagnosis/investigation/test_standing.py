@@ -1,0 +1,61 @@
+"""What was found is looked at once more: fits that still fall, findings that have come to nothing, a shared gain."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sprung.model.diagnosis.api import Options
+from sprung.model.diagnosis.fit import baseline
+from sprung.model.diagnosis.investigation.calibration import centred, shared_gain
+from sprung.model.diagnosis.investigation.diagnose import begun
+from sprung.model.diagnosis.investigation.standing import standing
+from sprung.model.diagnosis.investigation.state import Found, Investigation
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.diagnosis.selection.compete import compete
+from sprung.model.laws import find_law
+from sprung.model.system import parse_system
+from tests.diagnosis_cases import SYSTEM, simulate
+
+
+def _heavier(ratio: float) -> Investigation:
+    """A quarter car whose body is `ratio` times as heavy as its file says, with that as its finding."""
+    system = parse_system(SYSTEM.replace("mass: 8000", f"mass: {8000 / ratio:g}"))
+    state = begun(system, simulate(seconds=10.0, seed=46), Options(), lambda share, text: None)
+    candidate = next(one for one in state.first.candidates if one.term.key[:2] == ("car", "mass_change"))
+    (trial,) = compete(state.problem, state.fit, [candidate])
+    return replace(state, fit=trial.fit, found=(Found(trial, (), None, 1e-9),))
+
+
+@pytest.mark.parametrize(("ratio", "kept"), [(1.0, 0), (1.2, 1)])
+def test_a_finding_no_further_from_nothing_than_its_deviation_is_taken_out(ratio: float, kept: int) -> None:
+    after = standing(_heavier(ratio))
+    assert len(after.found) == len(after.fit.point.terms) == kept
+
+
+def test_a_fit_that_still_falls_is_fitted_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A law accepted on a fit that is ten steps from its end leaves what passes for another finding."""
+    falls = [50.0, 12.0, 10.0, 10.0]
+    fits: list[Any] = [SimpleNamespace(deviance=fall, converged=fall == 10.0, point=None) for fall in falls]
+    left = iter(fits)
+    monkeypatch.setattr(baseline, "try_optimise", lambda problem, point, steps: next(left))
+    begin: Any = SimpleNamespace(deviance=90.0, converged=False, point=None)
+    problem: Any = None
+    assert baseline.settled(problem, begin) is fits[2]
+    monkeypatch.setattr(baseline, "try_optimise", lambda problem, point, steps: None)
+    assert baseline.settled(problem, begin) is begin
+
+
+def test_a_gain_that_all_channels_share_is_taken_out_of_them() -> None:
+    gain, lag = find_law("sensor_gain"), find_law("sensor_lag")
+    shown = [
+        Term(gain, name, (1.02 * own,), known=(0.015,)) for name, own in (("a", 1.01), ("b", 1.0), ("c", 1 / 1.01))
+    ]
+    shown.append(Term(lag, "a", (1e-4,), known=(2e-3,)))
+    assert shared_gain(shown) == (pytest.approx(1.02), pytest.approx(0.015 / 3**0.5))
+    values = [term.parameters[0] for term in centred(shown)]
+    assert values == pytest.approx([1.01, 1.0, 1 / 1.01, 1e-4])
+    assert shared_gain(shown[3:]) == (1.0, 0.0)
