@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import sys
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
 
 request_id: ContextVar[str] = ContextVar("request_id", default="")
+CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 PLAIN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime"}
 
 
@@ -37,7 +39,8 @@ class PlainLines(logging.Formatter):
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         """Level and message."""
-        return " ".join(f"sprung: {record.levelname}: {record.message}".splitlines())
+        line = " ".join(f"sprung: {record.levelname}: {record.message}".splitlines())
+        return CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)  # a terminal would obey them
 
 
 def set_up(form: str, level: str) -> None:

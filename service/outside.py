@@ -10,8 +10,9 @@ import http.client
 import ipaddress
 import socket
 import ssl
-from collections.abc import Sequence
-from contextlib import closing
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
@@ -107,36 +108,47 @@ def resolved(receiver: Receiver, allowed: Sequence[Network]) -> list[str]:
 def post(url: str, body: bytes, headers: dict[str, str], allowed: Sequence[Network], seconds: float) -> int:
     """Send to an address that was judged; the status of the answer.  Redirections are not followed.
 
-    Raises ForbiddenAddress, UserError, OSError, or http.client.HTTPException for an answer that is none.
+    seconds: to connect, and for all that follows.  Raises ForbiddenAddress, UserError, OSError, or
+    http.client.HTTPException for an answer that is none.
     """
     receiver = safe_url(url)
     error: OSError | None = None
     for address in resolved(receiver, allowed):
         try:
-            connection = _connected(receiver, address, seconds)
-        except ssl.SSLError:
-            raise
+            line = socket.create_connection((address, receiver.port), seconds)
         except OSError as failed:
             error = failed
             continue
-        with closing(connection):
+        with closing(line), _within(line, seconds), closing(_spoken(receiver, line)) as connection:
             connection.request("POST", receiver.target, body, headers)
             return connection.getresponse().status
     raise error or OSError(f"{receiver.host} has no address")
 
 
-def _connected(receiver: Receiver, address: str, seconds: float) -> http.client.HTTPConnection:
-    """A connection to one address, in the receiver's name: TLS checks the certificate against that."""
-    line = socket.create_connection((address, receiver.port), seconds)
+@contextmanager
+def _within(line: socket.socket, seconds: float) -> Iterator[None]:
+    """Hang up on whoever takes longer in all: the time-out of a socket begins anew with every byte."""
+    with closing(line.dup()) as same:  # TLS takes the other one over
+        ended = threading.Timer(seconds, _hang_up, [same])
+        ended.daemon = True
+        ended.start()
+        try:
+            yield
+        finally:
+            ended.cancel()
+
+
+def _hang_up(line: socket.socket) -> None:
+    with suppress(OSError):
+        line.shutdown(socket.SHUT_RDWR)
+
+
+def _spoken(receiver: Receiver, line: socket.socket) -> http.client.HTTPConnection:
+    """HTTP over a line to one address, in the receiver's name: TLS checks the certificate against that."""
     if receiver.scheme == "http":
         connection = http.client.HTTPConnection(receiver.host, receiver.port)
-        connection.sock = line
-        return connection
-    try:
+    else:
+        connection = http.client.HTTPSConnection(receiver.host, receiver.port)
         line = ssl.create_default_context().wrap_socket(line, server_hostname=receiver.host)
-    except OSError:
-        line.close()
-        raise
-    connection = http.client.HTTPSConnection(receiver.host, receiver.port)
     connection.sock = line
     return connection

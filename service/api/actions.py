@@ -12,7 +12,7 @@ from pydantic import Field
 from sprung.model.tracking.tracker import TrackerStateError
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
-from sprung.service.api.bodies import StrictBody
+from sprung.service.api.bodies import LINE_PATTERN, TEXT_PATTERN, StrictBody
 from sprung.service.api.fleet import vehicle_answer
 from sprung.service.api.idempotency import Once, OnceOf
 from sprung.service.api.problems import ApiProblem
@@ -22,7 +22,9 @@ from sprung.service.store.marks import MarkRow
 from sprung.service.times import from_iso, to_iso
 
 router = APIRouter(tags=["operation"])
-Text = Annotated[str, Field(min_length=1, max_length=2000, examples=["damper 2l replaced, order 4711"])]
+Text = Annotated[
+    str, Field(min_length=1, max_length=2000, pattern=TEXT_PATTERN, examples=["damper 2l replaced, order 4711"])
+]
 
 
 class AcknowledgeBody(StrictBody):
@@ -57,7 +59,9 @@ class MaintenanceBody(NoteBody):
 class VehicleBody(StrictBody):
     """What is to be changed; what is left out stays."""
 
-    label: str | None = Field(default=None, max_length=128, description="what people call it; empty takes it away")
+    label: str | None = Field(
+        default=None, max_length=128, pattern=LINE_PATTERN, description="what people call it; empty takes it away"
+    )
     retired: bool | None = Field(default=None, description="out of service: not listed, data kept")
 
 

@@ -15,7 +15,7 @@ from fastapi.responses import PlainTextResponse, Response
 from pydantic import Field
 
 from sprung.service.api.access import ActorOf, CoreOf, json_response, read
-from sprung.service.api.bodies import StrictBody
+from sprung.service.api.bodies import LINE_PATTERN, StrictBody
 from sprung.service.store import audit
 from sprung.service.store.tokens import TokenRow
 from sprung.service.times import optional_iso, to_iso
@@ -32,7 +32,7 @@ Scope = Literal["read", "ingest", "operate", "admin"]
 class TokenBody(StrictBody):
     """A token to be made."""
 
-    name: Annotated[str, Field(min_length=1, max_length=128)]
+    name: Annotated[str, Field(min_length=1, max_length=128, pattern=LINE_PATTERN)]
     scopes: Annotated[list[Scope], Field(min_length=1, max_length=4)]
     fleet: Annotated[str, Field(max_length=128, description="vehicles whose ids begin so; empty: all")] = ""
     days: Annotated[float | None, Field(gt=0, lt=36_500, description="until it ends; null: never")] = 365.0

@@ -52,6 +52,7 @@ REPORT_POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; form-action 'none'; "
     "frame-ancestors 'none'; sandbox allow-popups allow-top-navigation-by-user-activation"
 )
+CLOSE = {"Connection": "close"}
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -127,6 +128,8 @@ class Guard:
             need = need_of(scope["method"], path)
             if len(scope["headers"]) > MOST_HEADERS or sum(map(_length, scope["headers"])) > MOST_HEADER_BYTES:
                 raise ApiProblem(431, f"more than {MOST_HEADERS} headers, or {MOST_HEADER_BYTES // 1000} kB of them")
+            if "transfer-encoding" in headers and "content-length" in headers:  # a proxy may believe the other one
+                raise ApiProblem(400, "give Content-Length or Transfer-Encoding, not both", headers=CLOSE)
             await self._check_host(headers)
             actor, by_cookie = await self._who(scope, headers, need)
             self._check_browser(scope, headers, need, by_cookie)

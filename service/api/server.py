@@ -10,6 +10,7 @@ import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from types import FrameType
 from typing import Any
 
@@ -172,6 +173,9 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[Any] | None = None) -> None:
         """Begin to watch with the first connection."""
+        if self.config.ssl is not None:
+            loop, seconds = asyncio.get_running_loop(), self.doorkeeper.header_seconds
+            loop.create_server = partial(loop.create_server, ssl_handshake_timeout=seconds)  # type: ignore[method-assign]
         await super().startup(sockets)
         self._watching = asyncio.create_task(self.doorkeeper.watch())
 
@@ -184,7 +188,7 @@ def make_server(app: FastAPI, settings: Settings, on_exit: Callable[[], None]) -
         app,
         http=protocol,
         ws="none",
-        log_level="warning",
+        log_level="error",  # what strangers send wrong would fill the log
         log_config=None,
         access_log=False,
         server_header=False,

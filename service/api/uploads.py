@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field, replace
@@ -18,7 +19,7 @@ from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from sprung.replay.recording import EXTENSIONS
-from sprung.service.api.bodies import VehicleId
+from sprung.service.api.bodies import LINE_PATTERN, VehicleId
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.scopes import FORM
 from sprung.service.core import Core
@@ -30,6 +31,7 @@ from sprung.service.times import now_ns
 from sprung.service.upload_room import Share
 
 CHUNK = 1 << 20
+DECEIVING = re.compile(LINE_PATTERN[1:-2].replace("[^", "["))  # characters that a name should not have
 MOST_PARTS = 8
 MOST_FIELD_BYTES = 4096
 LONGEST_BOUNDARY = 70  # RFC 2046
@@ -219,7 +221,7 @@ class Form:
         if self._part.name != "file" or self._target is not None:
             raise ApiProblem(422, "give one file, in the field `file`", [{"field": "file", "detail": "one is needed"}])
         name = options[b"filename"].decode("utf-8", "replace")
-        self._label = name.replace("\\", "/").rsplit("/", 1)[-1][-255:]
+        self._label = DECEIVING.sub("_", name.replace("\\", "/").rsplit("/", 1)[-1][-255:])
         self._extension = known_extension(self._label)
         if self._share is not None:
             self._part_file = f"{self._id}.part"

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import http.client
 import ipaddress
 import socket
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import suppress
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -121,3 +124,24 @@ def test_receivers_on_this_host_need_a_word_in_the_settings(tmp_path: Path, stor
     Notices(Settings(**settings, webhook_networks="127.0.0.0/8"), store)
     with pytest.raises(UserError, match="SPRUNG_WEBHOOK_NETWORKS"):
         Notices(Settings(**settings, webhook_networks="127.0.0.1/8"), store)
+
+
+def test_a_receiver_that_drips_is_hung_up_on() -> None:
+    """Each byte comes in time; all of them together do not."""
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+
+        def drip() -> None:
+            line, _ = listening.accept()
+            with line, suppress(OSError):
+                line.recv(65536)
+                for _ in range(100):
+                    line.sendall(b"H")
+                    time.sleep(0.1)
+
+        dripping = threading.Thread(target=drip)
+        dripping.start()
+        begun = time.monotonic()
+        with pytest.raises((OSError, http.client.HTTPException)):
+            outside.post(f"http://127.0.0.1:{listening.getsockname()[1]}/", b"{}", {}, LOCAL, 0.5)
+        assert time.monotonic() - begun < 5.0
+        dripping.join()

@@ -138,8 +138,8 @@ def certificate(folder: Path, name: str, by: Path | None = None) -> Path:
 def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engine, tmp_path: Path) -> None:
     authority = certificate(tmp_path, "authority")
     server, client = certificate(tmp_path, "server", authority), certificate(tmp_path, "client", authority)
-    core = build_core(settings(tmp_path, tls_certificate=server, tls_client_ca=authority), engine)
-    with served(core) as port:
+    core = build_core(settings(tmp_path, tls_certificate=server, tls_client_ca=authority, header_seconds=3), engine)
+    with served(core) as port, socket.create_connection(("127.0.0.1", port)) as silent:
         context = ssl.create_default_context(cafile=str(authority))
 
         def status() -> bytes:
@@ -155,6 +155,7 @@ def test_mutual_tls_lets_in_who_shows_a_certificate_and_nobody_else(engine: Engi
         context.load_cert_chain(str(client))
         assert b"200 OK" in status()
         assert b"200 OK" not in ask(port)  # no plain HTTP
+        assert closed_within(silent, 10)  # no handshake begun
 
 
 def test_wrong_bodies_cost_milliseconds(engine: Engine, system: System) -> None:

@@ -1,0 +1,64 @@
+"""Names, texts and requests that would deceive who reads them somewhere else: a terminal, a proxy, another database."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from sprung.model.system import System
+from sprung.service.core import Core, build_core
+from sprung.service.engine import Engine
+from sprung.service.logs import PlainLines
+from tests.served import served
+from tests.service.test_server import settings
+from tests.service_fakes import make_window
+
+DECEIVING = ["a\0b", "\x1b[31mred", "a\rb", "\x85", "\u202egnp.exe", "\u2066x"]
+
+
+@pytest.mark.parametrize("text", [*DECEIVING, "two\nlines"])
+def test_labels_are_one_line_without_hidden_characters(
+    core: Core, client: TestClient, system: System, text: str
+) -> None:
+    core.pipeline.process("a", [make_window(system, 0)])
+    assert client.patch("/vehicles/a", json={"label": text}).status_code == 422
+    assert client.patch("/vehicles/a", json={"label": "Größe 😀 <b>"}).status_code == 200
+
+
+def test_notes_may_have_lines_and_tabs_and_nothing_else_hidden(core: Core, client: TestClient, system: System) -> None:
+    core.pipeline.process("a", [make_window(system, 0)])
+    for text in (text for text in DECEIVING if text != "a\rb"):
+        assert client.post("/vehicles/a/notes", json={"text": text}).status_code == 422, text
+    assert client.post("/vehicles/a/notes", json={"text": "two\r\nlines\tand more"}).status_code == 201
+
+
+def test_an_upload_is_called_without_hidden_characters(core: Core, client: TestClient) -> None:
+    name = "\x1b[31m\u202ea.csv"
+    form = f'--b\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\nx\r\n--b--\r\n'.encode()
+    answer = client.post("/recordings", content=form, headers={"Content-Type": "multipart/form-data; boundary=b"})
+    assert answer.status_code == 202
+    detail = client.get("/audit").json()[0]["detail"]
+    assert detail["name"] == "_[31m_a.csv"
+
+
+def test_a_terminal_is_told_nothing_by_a_log() -> None:
+    told = {"name": "x", "levelno": 40, "levelname": "ERROR", "msg": "%s", "args": ("\x1b[2Jof\x07\nx.csv",)}
+    assert PlainLines().format(logging.makeLogRecord(told)) == r"sprung: ERROR: \x1b[2Jof\x07 x.csv"
+
+
+def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engine, tmp_path: Path) -> None:
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        two = b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5\r\n"
+        line.sendall(two + b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\nGET /health/live HTTP/1.1\r\nHost: x\r\n\r\n")
+        answer = b""
+        while piece := line.recv(65536):  # until it is closed
+            answer += piece
+        assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1") == 1
+        assert b"give Content-Length or Transfer-Encoding" in answer
