@@ -199,15 +199,15 @@ def _figures(data: _Data, model: VisualModel) -> tuple[dict[str, float | None], 
     train, test = splits["train"], splits["test"]
     move, affine = evaluate.symmetry(task, model, train), evaluate.gauge(task, model, train)
     rows, starts = evaluate.every_window(test)
-    figures = evaluate.state_figures(task, evaluate.predict(task, model, test, rows, starts, move))
-    free = evaluate.predict(task, model, test, rows, starts, affine)
+    figures = evaluate.state_figures(task, evaluate.predict(model, test, rows, starts, move))
+    free = evaluate.predict(model, test, rows, starts, affine)
     figures |= _gauge_free(task, free)
     figures["forecast_relative"] = evaluate.forecast_error(task, model, test, affine)
     few = torch.arange(min(evaluate.SHOWN_WINDOWS, len(test.embeddings)))
-    shown = evaluate.predict(task, model, test, few, few % 26, move)
+    shown = evaluate.predict(model, test, few, few % 26, move)
     figures["OE"] = evaluate.observation_error(task, model, shown)
     for name in ("unseen", "below", "noisy"):
-        found = evaluate.predict(task, model, splits[name], *evaluate.every_window(splits[name]), affine)
+        found = evaluate.predict(model, splits[name], *evaluate.every_window(splits[name]), affine)
         outside = evaluate.state_figures(task, found)
         figures[f"SE_{name}_relative"] = outside["SE_relative"]
         if found.parameters is not None:

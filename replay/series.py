@@ -93,17 +93,17 @@ def _flat(content: Any, name: str = "", depth: int = 0) -> Iterator[Column]:
     yield from of_matrix(name, values)
 
 
-def of_matrix(name: str, values: NDArray[Any], unit: str | None = None) -> Iterator[Column]:
+def of_matrix(name: str, values: NDArray[Any]) -> Iterator[Column]:
     """A vector, or the columns of a matrix (its rows where it lies on its side), as columns."""
     if values.dtype.kind not in "fiubUM" or values.ndim not in (1, 2) or max(values.shape, default=0) < 2:
         return
     if values.ndim == 1 or 1 in values.shape:
-        yield whole(name, values.reshape(-1), unit)
+        yield whole(name, values.reshape(-1), None)
         return
     upright = values if values.shape[0] >= values.shape[1] else values.T
     if upright.shape[1] <= WIDEST:
         for i in range(upright.shape[1]):
-            yield whole(f"{name}(:,{i + 1})", upright[:, i], unit)
+            yield whole(f"{name}(:,{i + 1})", upright[:, i], None)
 
 
 @contextmanager

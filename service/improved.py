@@ -103,7 +103,7 @@ def _drop_laws(entry: Any, undone: set[str]) -> None:
 def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> None:
     """Add a law; held: full names of values that the file holds fixed."""
     names = law.location.split("|")
-    entry = _holder(file, system, names[0])
+    entry = _holder(file, names[0])
     if entry is None:
         return
     values = CommentedMap({name: text for name in ("formula", "memory") if (text := getattr(law, name))})
@@ -129,7 +129,7 @@ def _place(file: Any, system: System, law: IdentifiedLaw, held: set[str]) -> Non
     placed.append(made)
 
 
-def _holder(file: Any, system: System, name: str) -> Any:
+def _holder(file: Any, name: str) -> Any:
     """The entry of the file that a law belongs to."""
     for group in ("elements", "bodies", "inputs", "sensors"):
         if name in (file.get(group) or {}):

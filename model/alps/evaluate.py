@@ -34,7 +34,7 @@ class Predicted:
     true_parameters: Tensor
 
 
-def predict(task: Task, model: VisualModel, split: Split, rows: Tensor, starts: Tensor, move: Move) -> Predicted:
+def predict(model: VisualModel, split: Split, rows: Tensor, starts: Tensor, move: Move) -> Predicted:
     """Predict windows (rows, starts); `move` brings the model's states to the true ones."""
     found = _passed(model, split, rows, starts)
     return replace(found, encoded=move(found.encoded), simulated=move(found.simulated))

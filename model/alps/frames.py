@@ -14,6 +14,8 @@ from sprung.model.alps.decoder import DeconvolutionalDecoder
 from sprung.model.alps.embedding import ConvolutionalEmbedding
 from sprung.model.alps.task import Task
 
+_AT_ONCE = 1000  # pictures, which need not all be in memory
+
 
 class FrameAutoencoder(nn.Module):
     """Pictures (M, 3, 64, 64) -> standardised embeddings (M, E) -> pictures.
@@ -57,9 +59,9 @@ class FrameAutoencoder(nn.Module):
         scaling.copy_(torch.stack([found.mean(0), found.std(0).clamp_min(1e-4)]))
 
     @torch.no_grad()
-    def encode_rollouts(self, task: Task, states: Tensor, chunk: int = 1000) -> Tensor:
+    def encode_rollouts(self, task: Task, states: Tensor) -> Tensor:
         """Render true states (R, T, N) and embed every frame once -> (R, T, E)."""
         assert task.render is not None
         flat = states.reshape(-1, states.shape[-1])
-        parts = [self.encode(task.render(part)) for part in flat.split(chunk)]
+        parts = [self.encode(task.render(part)) for part in flat.split(_AT_ONCE)]
         return torch.cat(parts).reshape(*states.shape[:2], -1)

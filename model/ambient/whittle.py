@@ -53,7 +53,8 @@ class Whittle:
         response = self.responses.at(x[: self.P], self.omega)
         sources = self.excitation.sources(x[self.P :])
         S = self.noise + _centre(response.signals @ sources.matrix @ adjoint(response.signals))
-        return self._cost(*self._whiten(S))
+        _, log_det, whitened = self._whiten(S)
+        return self._cost(log_det, whitened)
 
     def evaluate(self, x: FloatArray) -> Evaluation:
         """Everything that a step of Fisher scoring needs."""
@@ -76,7 +77,7 @@ class Whittle:
         slope = local @ np.ascontiguousarray(left.reshape(F, size, 1)).view(np.float64).reshape(F, -1, 1)
         weight = self.spectra.weight[:, None, None]
         gradient, information = self._together(slope * weight, local @ local.swapaxes(1, 2) * weight)
-        return Evaluation(self._cost(inverse, log_det, whitened), gradient, information, whitened, S, self.noise)
+        return Evaluation(self._cost(log_det, whitened), gradient, information, whitened, S, self.noise)
 
     def _together(self, slope: FloatArray, products: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gradient and information of all x from those of the local quantities, (F, P + L, 1) and (F, P + L, P + L)."""
@@ -97,7 +98,7 @@ class Whittle:
         log_det = 2 * np.log(np.diagonal(factor, axis1=1, axis2=2).real).sum(axis=1)
         return inverse, log_det, inverse @ self.seen @ adjoint(inverse)
 
-    def _cost(self, inverse: np.ndarray, log_det: FloatArray, whitened: np.ndarray) -> float:
+    def _cost(self, log_det: FloatArray, whitened: np.ndarray) -> float:
         trace = np.einsum("fii->f", whitened).real
         return float(self.spectra.weight @ (log_det + trace))
 

@@ -31,8 +31,8 @@ _PLATFORMS = {("Linux", "x86_64"): "linux64", ("Linux", "aarch64"): "aarch64-lin
 _LIBRARY = {"Darwin": ".dylib"}  # what FMI calls binaries, elsewhere .so
 
 
-def write_fmu(path: Path, system: System, *, compiler: str | None = "cc") -> None:
-    """Write `path`.fmu; with a compiler, the binary for this machine is in it, else sources only.
+def write_fmu(path: Path, system: System) -> None:
+    """Write `path`.fmu: sources, and the binary for this machine made by its C compiler (`cc`).
 
     Errors: `ExchangeError` for laws without a formula and where the compiler fails.
     """
@@ -47,8 +47,7 @@ def write_fmu(path: Path, system: System, *, compiler: str | None = "cc") -> Non
         (sources / "equations.h").write_text(header, encoding="utf-8")
         shutil.copy(RUNTIME, sources / "fmi2.c")
         (Path(folder) / "modelDescription.xml").write_bytes(_description(system, laws, name, guid))
-        if compiler is not None:
-            _compile(compiler, sources, Path(folder) / "binaries" / _platform(), name)
+        _compile("cc", sources, Path(folder) / "binaries" / _platform(), name)
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for file in sorted(Path(folder).rglob("*")):
                 if file.is_file():
@@ -64,7 +63,7 @@ def _platform() -> str:
 
 def _compile(compiler: str, sources: Path, folder: Path, name: str) -> None:
     if shutil.which(compiler) is None:
-        raise ExchangeError(f"{compiler}: no such C compiler; install one, or export sources only")
+        raise ExchangeError(f"{compiler}: no such C compiler; install one")
     folder.mkdir(parents=True)
     target = folder / f"{name}{_LIBRARY.get(platform.system(), '.so')}"
     command = [compiler, "-O2", "-std=c99", "-fPIC", "-shared", "-o", str(target), str(sources / "fmi2.c"), "-lm"]

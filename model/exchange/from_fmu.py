@@ -127,7 +127,7 @@ def _ordered(
     if sorted(order) != list(range(len(A))):
         odd = next(i for i in range(len(A)) if i not in order)
         raise ExchangeError(f"{path}: state {states[odd]} is neither a displacement nor the velocity of one")
-    supports, columns = _pairs(path, inputs, B)
+    supports, columns = _pairs(path, inputs)
     n = len(velocity)
     A, C = A[np.ix_(order, order)], C[:, order]
     A[:n] = np.eye(n, 2 * n, n)
@@ -136,7 +136,7 @@ def _ordered(
     return LinearFmu(A, paired, C, tuple(states[i] for i in velocity), supports, outputs)
 
 
-def _pairs(path: Path, inputs: Sequence[str], B: FloatArray) -> tuple[tuple[str, ...], list[int]]:
+def _pairs(path: Path, inputs: Sequence[str]) -> tuple[tuple[str, ...], list[int]]:
     """Supports, and for each the columns of its displacement and its velocity (-1: it has none)."""
     stems: dict[str, list[int]] = {}
     for i, name in enumerate(inputs):

@@ -75,15 +75,14 @@ class FrequencyModel:
         found: Tensor = output
         return found
 
-    def drive_noise(self, *, usual: bool = False) -> FloatArray:
+    def drive_noise(self) -> FloatArray:
         """Noise of each drive per sample as its value's standard deviation over frequency, shape (F, W/2).
 
         Slopes follow their values (j w), measured or derived: see `model.simulate.fusion`.  That of an acceleration
         grows with 1 / w^2 towards low frequencies, as its integral's does.
-        usual: that of usual instruments where none is stated.
         """
         drives = drives_of(self.simulator.system)
-        noise = [drive.noise_at(self.omega.numpy(), self.simulator.dt, usual=usual) for drive in drives]
+        noise = [drive.noise_at(self.omega.numpy(), self.simulator.dt) for drive in drives]
         return np.array(noise).reshape(-1, len(self.omega)).T.copy()
 
 

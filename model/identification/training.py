@@ -97,7 +97,7 @@ def train(
     features = ForceBalance(system, system.window)
     data = _simulated_rows(features, settings, report)
     net = new_estimator(system, settings.seed).double()
-    _initialise(net, features, data, settings)
+    _initialise(net, features, settings)
     run = TrainingRun(net, out / "checkpoint", settings, _fingerprint(system, settings))
     run.resume()
     _fit_simulated(run, settings, data, report)
@@ -164,7 +164,7 @@ def _rows(features: ForceBalance, windows: FloatArray) -> Tensor:
     return torch.cat([regressors, target.unsqueeze(2)], dim=2).float()
 
 
-def _initialise(net: EstimatorNet, features: ForceBalance, data: _Rows, settings: TrainingSettings) -> None:
+def _initialise(net: EstimatorNet, features: ForceBalance, settings: TrainingSettings) -> None:
     """Start from weights that are inverse to the noise of a row at nominal values."""
     net.noise.copy_(noise_power(features, np.random.default_rng([settings.seed, 1])))
     direction = torch.cat([torch.ones(net.architecture.parameters), -torch.ones(1)]).double()

@@ -86,12 +86,12 @@ CATALOGUE: tuple[Law, ...] = (
 )
 
 
-def find_law(name: str, catalogue: tuple[Law, ...] = CATALOGUE) -> Law:
+def find_law(name: str) -> Law:
     """The law of that name; a ValueError that lists the names otherwise."""
-    for law in catalogue:
+    for law in CATALOGUE:
         if law.name == name:
             return law
-    known = ", ".join(law.name for law in catalogue)
+    known = ", ".join(law.name for law in CATALOGUE)
     raise ValueError(f"no law is called {name!r}; the catalogue has {known}")
 
 

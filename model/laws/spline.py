@@ -192,14 +192,13 @@ def estimate_force(
     jacobian: FloatArray,
     *,
     current: LatentForce | None = None,
-    noise: float | None = None,
 ) -> LatentForce:
     """Estimate the surface along a motion (d, v), each (T,), at the element.
 
     respond: forces (T, m) on the element along the motion's time axis -> whitened sensor answers (R, m), in the sense
     in which the simulation would change; residual (R,): measured minus simulated, whitened; jacobian (R, P): the
     answers to everything else that is free.  `current` is the surface that the simulation already holds: the answer is
-    the whole new one, so that estimate and refit can take turns.  `noise` is s; estimated if left out.
+    the whole new one, so that estimate and refit can take turns.
     """
     basis, _ = np.linalg.qr(jacobian / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300))
     forces = surface.forces(*motion) @ surface.free
@@ -210,7 +209,7 @@ def estimate_force(
     if current is not None:
         target = target + answers @ (surface.free.T @ current.coefficients)
     problem = _Evidence(answers.T @ answers, answers.T @ target, float(target @ target), len(target), surface, power)
-    s = noise or problem.noise()
+    s = problem.noise()
     weights = problem.best(s)
     mean, covariance = problem.averaged(weights, s)
     return LatentForce(

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sprung.model.schema import ForceInput, SupportInput
-from sprung.model.sensor_kinds import USUAL_NOISE
 from sprung.model.signals import FloatArray
 from sprung.model.simulate.fusion import motion, motion_noise, motion_shares, used
 from sprung.model.system import System
@@ -22,19 +21,17 @@ class Drive:
     support: bool
     columns: dict[int, int]  # window column by the derivative that it shows
     noise: dict[int, float]  # standard deviation of one sample, likewise
-    usual: dict[int, float]  # that of a usual instrument
 
     @property
     def integrated(self) -> int:
         """How often what is measured has to be integrated."""
         return used(self.noise)[0] if self.noise else 0
 
-    def noise_at(self, omega: FloatArray, dt: float, *, usual: bool = False) -> FloatArray:
+    def noise_at(self, omega: FloatArray, dt: float) -> FloatArray:
         """Noise of the value per sample as a standard deviation over frequency, (F,)."""
         if not self.noise:
             return np.zeros(len(omega))
-        stated = motion_noise(omega, dt, self.noise)
-        return motion_noise(omega, dt, self.usual) if usual and not stated.any() else stated
+        return motion_noise(omega, dt, self.noise)
 
     def shares_at(self, omega: FloatArray, dt: float) -> dict[int, FloatArray]:
         """Share of every measured derivative in the value over frequency, each (F,)."""
@@ -59,7 +56,6 @@ def drives_of(system: System) -> tuple[Drive, ...]:
                 support=not isinstance(source, ForceInput),
                 columns=columns,
                 noise={order: channel.noise for order, channel in channels.items()},
-                usual={order: USUAL_NOISE[channel.unit] for order, channel in channels.items()},
             )
         )
     return tuple(drives)

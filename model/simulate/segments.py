@@ -79,7 +79,7 @@ def _sweeps(
     Q = -(-(samples + 1) // segments)  # one sample more than needed: the last one is inside a segment, too
     segments = -(-(samples + 1) // Q)
     stacked = _stack(known, segments, 2 * parts * Q)
-    wide = [_widen(site, segments, V) for site in sites]
+    wide = [_widen(site, segments) for site in sites]
     clocks = np.repeat(start + np.arange(segments) * Q * parts * steps.h, V)
     x, z = _first_guess(wide, stacked[0], clocks, guess, (segments, Q, V, len(transition)))
     over = np.linalg.matrix_power(transition, Q)
@@ -137,7 +137,7 @@ def _stack(known: FloatArray, segments: int, nodes: int) -> FloatArray:
     return out.reshape(nodes + 1, known.shape[1], -1)
 
 
-def _widen(site: Site, segments: int, V: int) -> Site:
+def _widen(site: Site, segments: int) -> Site:
     def tile(value: FloatArray) -> FloatArray:
         return np.tile(value, segments) if np.ndim(value) else value
 

@@ -93,7 +93,7 @@ class Attribution:
             return state.alarms
         alarms = [self._kept_open(alarm, state, drift, now) for alarm in state.alarms]
         if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMPED[jump.kind]:
-            alarms = self._with_sensor(alarms, state, jump, now)
+            alarms = self._with_sensor(alarms, jump, now)
         alarms = self._with_crept(alarms, crept, state, now)
         alarms = self._with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, drift, now)
@@ -293,7 +293,7 @@ class Attribution:
                 found.append((abs(needed) / deviation.std, f"{deviation.name}.{deviation.kind}"))
         return tuple(name for _, name in sorted(found)[:3])
 
-    def _with_sensor(self, alarms: list[Alarm], state: TrackerState, jump: Jump, now: int) -> list[Alarm]:
+    def _with_sensor(self, alarms: list[Alarm], jump: Jump, now: int) -> list[Alarm]:
         """Opens the alarm of a gain or a delay that has jumped."""
         name = self.sensor_name(jump.direction, jump.kind)
         if any(a.closed is None and a.kind == "sensor" and a.parameter == name for a in alarms):

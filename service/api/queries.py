@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 from fastapi import Path, Query, Request
 from fastapi.routing import APIRoute
@@ -86,8 +86,3 @@ def one_of(name: str, value: str | None, known: Sequence[str]) -> str | None:
     if value is not None and value not in known:
         raise wrong_query(name, f"{value[:60]!r} is none of {', '.join(known)}")
     return value
-
-
-def described(**models: Any) -> dict[int | str, dict[str, Any]]:
-    """Answers with a content type of their own, for the description of the API."""
-    return {200: {"content": models}}

@@ -157,7 +157,7 @@ def _report(pipeline: Pipeline, path: Path, fed: Fed, json_lines: bool) -> int:
         print(json.dumps({"summary": summary(pipeline, view, fed)}), flush=True)
     else:
         print_table(parameter_table(view, width_of_output()))
-        print(closing_line(pipeline, view, fed))
+        print(closing_line(view, fed))
     complaint = incomplete_line(path, fed)
     for line in fed.problems:
         if line not in (complaint or ""):
@@ -200,7 +200,7 @@ def slower_line(fed: Fed, speed: float) -> str | None:
     return f"--speed {speed:g} was asked for and {pace:.2g} reached: this machine, busy as it is, is no faster"
 
 
-def closing_line(pipeline: Pipeline, view: VehicleView, fed: Fed) -> str:
+def closing_line(view: VehicleView, fed: Fed) -> str:
     """What was read, how fast, and what is alarmed."""
     recorded = fed.recorded_seconds
     counts = ", ".join(f"{count} {outcome}" for outcome, count in fed.windows.items())

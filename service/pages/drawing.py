@@ -106,7 +106,7 @@ def side_view(system: System, parameters: Mapping[str, Mark], sensors: Mapping[s
         base = max((top for top in ends if top is not None), default=foot) if None not in ends else foot
         across = found.across(*layout.element_position(name))
         parts.append(_element(name, short[name], across, head, base, parameters))
-    parts += _captions(system, found, foot, tops)
+    parts += _captions(system, foot, tops)
     names = short_names(system.sensors)
     for name, sensor in file.sensors.items():
         body = getattr(sensor, "body", None)
@@ -251,7 +251,7 @@ def _ground(found: DrawingColumns, foot: float) -> list[str]:
     return [*parts, f'<line class="rail" x1="8" x2="{found.width - 8:.1f}" y1="{floor:.1f}" y2="{floor:.1f}"/>']
 
 
-def _captions(system: System, found: DrawingColumns, foot: float, tops: Mapping[str, float]) -> list[str]:
+def _captions(system: System, foot: float, tops: Mapping[str, float]) -> list[str]:
     """What the names of a storey have in common, at its left edge."""
     heads: dict[str, float] = {}
     for name in system.elements:

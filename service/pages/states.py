@@ -31,7 +31,7 @@ def hints(
     sensors: Mapping[str, Mark],
 ) -> list[Hint]:
     """The most urgent first; empty for a vehicle that is well."""
-    found = [*_alarms(row, view, active), *_sensors(sensors)]
+    found = [*_alarms(row, active), *_sensors(sensors)]
     whole = row.windows["used"] + row.windows["repaired"]
     every = whole + row.windows["dropped"] + row.windows["uninformative"]
     if silent:
@@ -65,7 +65,7 @@ def _built(view: VehicleView) -> list[Hint]:
     return [Hint("info", "Not quite as the system file says", text)]
 
 
-def _alarms(row: FleetRow, view: VehicleView, active: Sequence[AlarmRow]) -> list[Hint]:
+def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
     found = []
     changed = [a for a in active if a.kind == "change" and a.parameter]
     if changed:

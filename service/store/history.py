@@ -90,22 +90,6 @@ class Series:
     high: FloatArray  # largest, shape (n, P)
 
 
-def history(
-    connection: Connection,
-    vehicle: str,
-    model_id: int,
-    since: int,
-    until: int,
-    resolution: float,
-    limit: int,
-) -> list[HistoryPoint]:
-    """`series` as points."""
-    found = series(connection, vehicle, model_id, since, until, resolution, limit)
-    return [
-        HistoryPoint(*row) for row in zip(found.time.tolist(), found.windows.tolist(), *_arrays(found), strict=True)
-    ]
-
-
 def series(
     connection: Connection,
     vehicle: str,
@@ -172,10 +156,6 @@ def _together(stored: Iterable[Any], older: Iterable[ArchivedPosterior]) -> Iter
         if row[0] != last:
             last = row[0]
             yield row
-
-
-def _arrays(found: Series) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    return found.mean, found.std, found.low, found.high
 
 
 def _of_rows(newest_first: Sequence[Any]) -> Series:

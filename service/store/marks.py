@@ -56,11 +56,11 @@ def add_mark(connection: Connection, row: MarkRow) -> MarkRow:
     return MarkRow(int(key[0]), **values)
 
 
-def list_marks(connection: Connection, vehicle: str, limit: int, since: int = 0) -> list[MarkRow]:
+def list_marks(connection: Connection, vehicle: str, limit: int) -> list[MarkRow]:
     """Marks of a vehicle, newest first."""
     query = (
         select(marks)
-        .where(marks.c.vehicle_id == vehicle, marks.c.time_ns >= since)
+        .where(marks.c.vehicle_id == vehicle)
         .order_by(marks.c.time_ns.desc(), marks.c.id.desc())
         .limit(limit)
     )

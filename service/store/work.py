@@ -182,12 +182,6 @@ def get_report(connection: Connection, report_id: str) -> ReportRow | None:
     return None if row is None else ReportRow(*row)
 
 
-def list_reports(connection: Connection, vehicle: str, limit: int) -> list[ReportRow]:
-    """Reports of a vehicle, newest first."""
-    query = select(reports).where(reports.c.vehicle_id == vehicle).order_by(reports.c.created_ns.desc()).limit(limit)
-    return [ReportRow(*row) for row in connection.execute(query)]
-
-
 def _one(connection: Connection, table: Table, key: str) -> Any:
     return connection.execute(select(table).where(table.c.id == key)).first()
 

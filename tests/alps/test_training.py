@@ -115,7 +115,7 @@ def test_opening_with_components_finds_the_orbits_up_to_their_turn() -> None:
     model = fit.VisualModel(FrameAutoencoder(SIZES), Network(task, "alps", SIZES)).eval()
     rows, starts = every_window(data)
     model.network.encoder.head.open_with_components(data.embeddings.flatten(0, 1))
-    opened = predict(task, model, data, rows[:20], starts[:20], symmetry(task, model, data))
+    opened = predict(model, data, rows[:20], starts[:20], symmetry(task, model, data))
     error = (opened.encoded - opened.true)[..., :4].square().mean().sqrt()
     assert float(error) < 0.6 * float(opened.true[..., :4].square().mean().sqrt())
     figures = state_figures(task, opened)

@@ -133,9 +133,11 @@ def test_a_window_that_does_not_fit_names_the_measurement_and_then_fits(
     found = identifier.examine(values, np.zeros(len(values), dtype=bool))
     named = [{(f.channel, f.kind) for f in e.faults} for e in found]
     assert sum((channel, kind) in faults for faults in named) >= 3
-    for estimate in found:
+    used = [estimate for estimate in found if estimate.adequate]
+    assert len(used) >= 3
+    for estimate in used:
         z = estimate.log_ratio / np.sqrt(np.diag(estimate.covariance))
-        assert not estimate.adequate or np.sqrt(np.mean(z**2)) < 1.6
+        assert np.sqrt(np.mean(z**2)) < 1.6
 
 
 @pytest.mark.parametrize("kind", ["frozen", "saturated"])
@@ -145,10 +147,12 @@ def test_a_stuck_sensor_is_named_and_the_window_used_without_it(
     values = windows(system, record(6, 5), hop=100)[1:5]
     most = 1.1 * values[:, :, 21].std()
     values[:, :, 21] = values[:, :1, 21] if kind == "frozen" else np.clip(values[:, :, 21], -most, most)
-    for estimate in identifier.examine(values, np.zeros(4, dtype=bool)):
-        if kind == "frozen" or not estimate.adequate or estimate.faults:
-            assert [(f.channel, f.kind) for f in estimate.faults] == [("bogie1_1r", kind)]
-            assert estimate.adequate
+    found = identifier.examine(values, np.zeros(4, dtype=bool))
+    named = [estimate for estimate in found if estimate.faults]
+    assert len(named) == 4 if kind == "frozen" else named
+    for estimate in found:
+        assert estimate.adequate
+        assert [(f.channel, f.kind) for f in estimate.faults] == ([("bogie1_1r", kind)] if estimate.faults else [])
 
 
 @pytest.mark.parametrize("gain", [0.02, 0.05, 0.1])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import sqlite3
 from contextlib import closing
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -142,38 +141,38 @@ def test_rollups_equal_the_statistics_of_their_windows_however_they_were_cut(any
     for first in range(0, 1000, 37):
         model = fill(any_store, records[first : first + 37])
     with any_store.read() as connection:
-        points = history.history(connection, "a", model, 0, 2**62, 60, 100)
-    assert sum(p.windows for p in points) == 1000
-    for point in points:
+        points = history.series(connection, "a", model, 0, 2**62, 60, 100)
+    assert points.windows.sum() == 1000
+    for i, time in enumerate(points.time):
         inside = [
             r.posterior.log_ratio[0]
             for r in records
-            if r.posterior is not None and point.time <= r.start < point.time + 60 * NANOSECONDS
+            if r.posterior is not None and time <= r.start < time + 60 * NANOSECONDS
         ]
-        assert point.windows == len(inside)
-        assert point.mean[0] == pytest.approx(np.mean(inside))
-        assert (point.low[0], point.high[0]) == (min(inside), max(inside))
+        assert points.windows[i] == len(inside)
+        assert points.mean[i, 0] == pytest.approx(np.mean(inside))
+        assert (points.low[i, 0], points.high[i, 0]) == (min(inside), max(inside))
 
 
 def test_history_bounds_range_and_number_and_keeps_the_newest(any_store: Store) -> None:
     model = fill(any_store, [record(i) for i in range(100)])
     with any_store.read() as connection:
-        raw = history.history(connection, "a", model, START + 10 * HOP, START + 20 * HOP, 0, 1000)
-        newest = history.history(connection, "a", model, 0, 2**62, 0, 5)
-        coarse = history.history(connection, "a", model, 0, 2**62, 5, 1000)
-    assert [p.time for p in raw] == [START + i * HOP for i in range(10, 20)]
-    assert [p.time for p in newest] == [START + i * HOP for i in range(95, 100)]
-    assert sum(p.windows for p in coarse) == 100
-    assert all(b.time - a.time == 5 * NANOSECONDS for a, b in pairwise(coarse))
+        raw = history.series(connection, "a", model, START + 10 * HOP, START + 20 * HOP, 0, 1000)
+        newest = history.series(connection, "a", model, 0, 2**62, 0, 5)
+        coarse = history.series(connection, "a", model, 0, 2**62, 5, 1000)
+    assert raw.time.tolist() == [START + i * HOP for i in range(10, 20)]
+    assert newest.time.tolist() == [START + i * HOP for i in range(95, 100)]
+    assert coarse.windows.sum() == 100
+    assert (np.diff(coarse.time) == 5 * NANOSECONDS).all()
 
 
 def test_hours_are_told_from_hourly_rollups(any_store: Store) -> None:
     hours = [record(i * 7200) for i in range(48)]  # one window an hour, for two days
     model = fill(any_store, hours)
     with any_store.read() as connection:
-        points = history.history(connection, "a", model, 0, 2**62, 6 * 3600, 1000)
+        points = history.series(connection, "a", model, 0, 2**62, 6 * 3600, 1000)
         chosen = history.fitting_resolution(connection, "a", model, 0, 2**62, 10)
-    assert sum(p.windows for p in points) == 48
+    assert points.windows.sum() == 48
     assert chosen >= 47 * 3600 / 10
 
 

@@ -68,7 +68,7 @@ def compose_components(
         unexplained=unexplained,
         summary=_summary(said, findings, unexplained),
         advice=tuple(advice if said.verdict != "consistent" else []),
-        plot_data=_arrays(judged, record.sample_rate),
+        plot_data=_arrays(judged),
     )
 
 
@@ -156,7 +156,7 @@ def _summary(said: ComponentJudgement, findings: list[Finding], left: Unexplaine
     return f"{text}{'; ' + nuisance if nuisance else ''}."
 
 
-def _arrays(judged: Sequence[Judged], sample_rate: float) -> dict[str, np.ndarray]:
+def _arrays(judged: Sequence[Judged]) -> dict[str, np.ndarray]:
     """Arrays for pictures: validation of every force, and for every law motion and force before and after."""
     first = judged[0]
     arrays: dict[str, np.ndarray] = {}
