@@ -87,7 +87,7 @@ class Subject:
         if stage in LAST:
             done = self.outcome
             state = under(done.investigation, rules)
-            judgement = judged(state, done.before, done.after, done.noise_faults)
+            judgement = judged(state, done.before, done.after, done.noise_faults, done.judgement.ended)
             return Said.of(compose(replace(done, investigation=state, judgement=judgement), self.record))
         if stage in LATE and name not in FIRST:
             state = under(self.state, rules)

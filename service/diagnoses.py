@@ -30,6 +30,7 @@ from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.worker import ProcessLimits, Task, Worker
 
 log = logging.getLogger("sprung.diagnosis")
+SEARCH = 0.6  # of the time of a diagnosis; the rest is for what is being fitted then, the last fit and the pictures
 
 
 class Diagnoses:
@@ -142,9 +143,10 @@ class DiagnosisJobs:
         final = self._settings.reports / report_id
         part = final.with_name(f"{report_id}.{os.getpid()}.part")
         shutil.rmtree(part, ignore_errors=True)
-        engine = served.engine
-        request = DiagnosisRequest(path, row.name, engine.system, engine.dbc, part, text or self._shared_text())
-        seconds = self._settings.diagnosis_seconds
+        engine, seconds = served.engine, self._settings.diagnosis_seconds
+        request = DiagnosisRequest(
+            path, row.name, engine.system, engine.dbc, part, text or self._shared_text(), SEARCH * seconds
+        )
         worker = Worker(
             self.task, request, ProcessLimits(seconds, seconds, self._settings.worker_memory_bytes), "the diagnosis"
         )

@@ -35,6 +35,8 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     one_thread_each()  # candidates are fitted beside each other
     hand_over_often()
     from sprung.model.diagnosis.api import Options, diagnose
+    from sprung.model.diagnosis.fit.work import WorkBudget
+    from sprung.model.diagnosis.rules import RULES
     from sprung.service.improved import write_improved
     from sprung.service.report import write_report
 
@@ -55,7 +57,8 @@ def run(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
     threading.Thread(target=live, daemon=True).start()
     try:
         show(0.0, "reading")
-        options = Options(file=request.name)
+        work = WorkBudget(RULES.fit.work, time.monotonic() + request.search_seconds)
+        options = Options(file=request.name, work=work)
         report = diagnose(request.system, _load(request), options, show)
         show(1.0, "writing the report")
         write_report(report, request.system, request.out)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ class DiagnosisRequest:
     dbc: Path | None
     out: Path  # folder for page, pictures and report; made when absent
     system_text: str | None = None  # the file that the system was read from: what was found is written into a copy
+    search_seconds: float = math.inf  # after which no further candidate is fitted, and what was found is reported
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,7 +77,7 @@ class Settings(BaseSettings):
     max_uploads_bytes: int = Field(default=20_000_000_000, gt=0)  # all uploads and excerpts that are kept
     recording_seconds: float = Field(default=7200.0, gt=0)  # that reading an upload may take in all
     reading_silence_seconds: float = Field(default=60.0, gt=0)  # that it may go on without any sample
-    diagnosis_seconds: float = Field(default=600.0, gt=0)
+    diagnosis_seconds: float = Field(default=1800.0, gt=0)  # its search ends before and reports what it found
     isolate_reading: bool = True  # commands, too, read recordings in a process of their own
     worker_memory_bytes: int = Field(default=4_000_000_000, gt=0)  # of a process that reads an upload or diagnoses
     batch_windows: int = Field(default=128, gt=0)  # windows identified and stored in one transaction

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,14 @@ from sqlalchemy.exc import OperationalError
 from sprung.service.api.app import create_app
 from sprung.service.core import Core, build_core
 from sprung.service.diagnosing import within
-from sprung.service.diagnosis_task import Stage
+from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
 from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.jobs import Jobs, Kind, Progress
 from sprung.service.settings import Settings
 from sprung.service.store import Store, work
 from sprung.service.store.work import JobRow
+from sprung.service.worker import Emit
 from tests.service_fakes import diagnose, eventually
 
 
@@ -177,6 +179,22 @@ def test_a_diagnosis_that_breaks_fails_and_the_next_one_works(core: Core, name: 
         assert eventually(lambda: stored(core.store, good).state == "done")
         assert told in (stored(core.store, bad).error or "")
         assert [path.name for path in core.settings.reports.iterdir()] == [good]
+
+
+def tells_its_time(request: DiagnosisRequest, emit: Emit[Stage]) -> DiagnosisResult:
+    """A diagnosis that tells how long it may search."""
+    return replace(diagnose(request, emit), verdict=f"{request.search_seconds:.1f}")
+
+
+def test_the_search_of_a_diagnosis_ends_before_its_process_is_ended(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(Settings(data_dir=tmp_path / "data", diagnosis_seconds=50.0), engine)
+    core.diagnosis_jobs.task = tells_its_time
+    with TestClient(create_app(core)) as client:
+        job = ask_for(client, "good.mcap")
+        assert eventually(lambda: stored(core.store, job).state == "done")
+        with core.store.read() as connection:
+            report = work.get_report(connection, job)
+    assert report is not None and report.verdict == "30.0"
 
 
 def test_a_running_diagnosis_is_cancelled_over_http_and_does_not_hold_up_a_stop(core: Core) -> None:

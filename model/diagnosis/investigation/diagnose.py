@@ -78,8 +78,8 @@ def with_findings(state: Investigation, tell: Progress) -> Investigation:
     for number in range(len(state.found), 0 if uncertain else state.options.rules.acceptance.findings):
         before = state
         state = _next_finding(state, number, tell)
-        if state.problem.worked_out:
-            tell(0.92, "the budget of work is spent: no further candidate is fitted")
+        if state.problem.work is not None and state.problem.worked_out:
+            tell(0.92, f"the search ends at its {state.problem.work.limit}: no further candidate is fitted")
         if state.calibrations and not before.calibrations:  # everything is sought anew beside them
             return with_findings(replace(state, notes=notes), tell)
         if len(state.found) == len(before.found):
@@ -105,13 +105,15 @@ def _still_rejected(state: Investigation, before: Fit) -> bool:
 
 def concluded(state: Investigation, tell: Progress) -> Outcome:
     """The model on the whole recording, its errors on the held-out part, and the verdict."""
+    work = state.problem.work
+    ended = work.limit if work is not None and work.ended else ""  # from here on time no longer counts
     state = standing(state)
     tell(0.93, "the model on the whole recording")
     final = _on_everything(state)
     final = replace(final, covariance=final.covariance + left_open(state) + by_shared_gain(state))
     before, after = state.held.runs(state.base.point, state.fit.point)
     noisy = noise_faults(state, before, after)
-    said = judged(state, before, after, noisy)
+    said = judged(state, before, after, noisy, ended)
     if np.any(said.errors.unexplained(state.options.rules.verdict) > 0):
         final = replace(final, covariance=final.covariance + by_what_is_left(state.problem, state.fit))
     return Outcome(state, final, before, after, noisy, said)

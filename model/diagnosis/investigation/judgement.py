@@ -24,8 +24,10 @@ from sprung.model.signals import FloatArray
 _BAND = 0.8  # of the power of what is left, for the frequencies where it lies
 
 
-def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...]) -> Judgement:
-    """Errors and verdict of an investigation.
+def judged(
+    state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[NoiseFault, ...], ended: str = ""
+) -> Judgement:
+    """Errors and verdict of an investigation; ended: what its search ended at, empty where it came to its end.
 
     Where laws follow the sensors' motion and the free run loses its phase, errors of the run say little: then the
     forces that nobody measured are judged, over the inertia forces.
@@ -51,8 +53,7 @@ def judged(state: Investigation, before: FreeRun, after: FreeRun, noisy: tuple[N
     kinds += [kind_of(state.fit.point.terms[index].law) for index in faulty(state)]
     kinds += [kind_of(SENSOR_STUCK)] * len(state.prepared.stuck) + [kind_of(SENSOR_NOISE)] * len(noisy)
     other = another_structure(state, deciding)
-    ended = state.problem.worked_out
-    verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=ended)
+    verdict = verdict_of(kinds + physics, deciding, rules, other_structure=other, ended=bool(ended))
     rejected = float(np.sqrt(np.mean(deciding.after**2)))
     physics = [kind for kind in physics if kind is not EffectKind.NUISANCE]
     carried = verdict != "unknown_physics" or not physics or physics[0] is EffectKind.UNLISTED

@@ -156,7 +156,7 @@ class Judgement:
     rejected: float | None  # error over the signal of a model that does not describe the recording
     lost_phase: bool  # the free run's errors say little: judged was how the motion goes on
     parts: int  # changes of the structure that were needed, where they are too many to be believed; else 0
-    ended: bool  # the search ended at its budget of work
+    ended: str  # what the search ended at, its "budget of work" or "limit of time"; empty where it came to its end
     carried: bool  # the findings carry the verdict: what they explain outweighs what they leave
     place: str  # where most of what is left is seen
     where: str  # the same in words, with size and frequencies; empty where nothing is left

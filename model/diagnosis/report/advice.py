@@ -7,10 +7,13 @@ import numpy as np
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome
 from sprung.model.diagnosis.report.values import deviations
 
-ENDED = (
-    "the search ended at its budget of work: more candidates were left to be fitted, and what is still unexplained "
-    "may have a name; a shorter recording, or one with fewer samples a second, is searched to the end"
-)
+
+def search_ended(limit: str) -> str:
+    """That a search ended at its budget of work or limit of time, and what to do about it."""
+    return (
+        f"the search ended at its {limit}: more candidates were left to be fitted, and what is still unexplained "
+        "may have a name; a shorter recording, or one with fewer samples a second, is searched to the end"
+    )
 
 
 def nothing_fits(outcome: Outcome, rejected: float) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from sprung.model.diagnosis.investigation.calibration import channels
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
-from sprung.model.diagnosis.report.advice import ENDED, nothing_fits, undecided
+from sprung.model.diagnosis.report.advice import nothing_fits, search_ended, undecided
 from sprung.model.diagnosis.report.calibration import calibration_of, in_words
 from sprung.model.diagnosis.report.findings import findings_of
 from sprung.model.diagnosis.report.plot_data import plot_data_of
@@ -37,7 +37,7 @@ def compose(outcome: Outcome, record: Recorded) -> Report:
     elif said.lost_phase and not state.held.still:
         advice.insert(0, "the free run loses its phase: its errors say little here, judged was how the motion goes on")
     if said.ended:
-        advice.insert(0, ENDED)
+        advice.insert(0, search_ended(said.ended))
     rules = state.options.rules.verdict
     explained = said.errors.explained(rules) if state.found else None
     left = said.errors.unexplained(rules)
@@ -170,5 +170,5 @@ def _summary(outcome: Outcome, findings: list[Finding], explained: float | None,
         if said.where:
             text += f"; still unexplained: {said.where}"
     if said.ended:
-        text += "; the search ended at its budget of work"
+        text += f"; the search ended at its {said.ended}"
     return f"{text}{beside}."

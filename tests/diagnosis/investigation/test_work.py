@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +23,20 @@ def test_a_search_without_any_work_left_is_not_consistent() -> None:
     assert report.verdict == "unknown_physics"
     assert "ended at its budget" in report.summary and "ended at its budget" in report.advice[0]
     assert any("budget" in text for text in said)
+
+
+def test_a_search_at_its_limit_of_time_reports_what_was_found_until_then() -> None:
+    options = Options(work=WorkBudget(1e9, time.monotonic()))
+    report = diagnose(quarter_car(), simulate(seconds=6, seed=4), options)
+    assert report.verdict == "unknown_physics"
+    assert "ended at its limit of time" in report.summary and "ended at its limit of time" in report.advice[0]
+
+
+def test_the_end_of_a_budget_that_was_not_needed_is_not_told() -> None:
+    work = WorkBudget(1e9, time.monotonic() + 1000)
+    told = diagnose(quarter_car(), simulate(seconds=6, seed=4), Options(work=work))
+    assert told.verdict == "consistent" and "ended" not in told.summary
+    assert not work.ended and work.apart(2)[0].until == work.until
 
 
 def test_work_is_counted_and_nothing_more_is_fitted_once_it_is_done() -> None:
