@@ -42,7 +42,14 @@ from sprung.model.laws.sensor_faults import (
     SENSOR_STUCK,
 )
 from sprung.model.laws.stiffness import BUMP_STOP, CLEARANCE, CUBIC_STIFFNESS, PROGRESSIVE_STOP
-from sprung.model.laws.structure import MISSING_CONNECTION, SUSPENDED_MASS, WRONG_POSITION
+from sprung.model.laws.structure import (
+    DAMPING_CHANGE,
+    INERTER,
+    MISSING_CONNECTION,
+    STIFFNESS_CHANGE,
+    SUSPENDED_MASS,
+    WRONG_POSITION,
+)
 from sprung.model.laws.viscoelastic import FRACTIONAL_STIFFNESS, STRUCTURAL_DAMPING
 
 CATALOGUE: tuple[Law, ...] = (
@@ -77,6 +84,9 @@ CATALOGUE: tuple[Law, ...] = (
     MISSING_CONNECTION,
     SUSPENDED_MASS,
     WRONG_POSITION,
+    INERTER,
+    STIFFNESS_CHANGE,
+    DAMPING_CHANGE,
     SENSOR_GAIN,
     SENSOR_LAG,
     SENSOR_BIAS,

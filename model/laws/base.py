@@ -304,6 +304,9 @@ class StructureLaw(Parametrised):
     powers: Mapping[int, tuple[float, float]] = field(default_factory=dict)  # as of a `BodyLaw`
     adds_motion: bool = False  # whether it brings a degree of freedom of its own
     strengths: tuple[int, ...] = ()  # parameters in which it is linear at first order, together 0 where it is absent
+    # Derivative of its element's deflection that its force goes with, by its only parameter: 0, 1, 2; None: another way
+    along: int | None = None
+    holds: str = ""  # quantity of the element that the system file must hold: no candidate where that is estimated
     # What it puts beside every spring that its location names; the mechanics stay as they are
     branches: Callable[[Values, SpringDamper], tuple[Maxwell, ...]] | None = None
     prior_cost: float = 0.0

@@ -16,8 +16,19 @@ from sprung.model.laws.base import (
 )
 from sprung.model.signals import FloatArray
 
-_CHANGE = ParameterSpec("p", "1", -0.95, 20.0, "relative change that is reached in the end", lambda seen: 0.1)
-_TAU = ParameterSpec("tau", "s", 0.05, 1e6, "time constant of the change", lambda seen: seen.seconds / 3, log=True)
+_CHANGE = ParameterSpec(  # more than twice what it was is rather a value that the file holds wrong
+    "p", "1", -0.95, 20.0, "relative change that is reached in the end", lambda seen: 0.1, usual=(0.0, 10.0)
+)
+_TAU = ParameterSpec(  # what is done before the first sample does not change during the recording
+    "tau",
+    "s",
+    0.05,
+    1e6,
+    "time constant of the change",
+    lambda seen: seen.seconds / 3,
+    log=True,
+    plausible=(CLOCK_LEAD / 5, float("inf")),
+)
 
 
 def _progress(time: FloatArray, tau: FloatArray) -> FloatArray:

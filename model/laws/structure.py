@@ -5,6 +5,7 @@ All are linear.  A point (x, y) of a body moves by z + (y - y0) roll + (x - x0) 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -156,6 +157,84 @@ WRONG_POSITION = StructureLaw(
     strengths=(0,),
     fault=True,
 )
+
+
+_RIGID = 1000.0  # Hz, of an inerter on what holds it, above all that is compared
+
+
+def _geared(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
+    """One more degree of freedom: a mass that moves as an element's deflection does, and pulls the element."""
+    (inertance,) = (float(value) for value in p)
+    ((_, element),) = sites
+    omega = 2 * np.pi * _RIGID
+    extended = replace(
+        mechanics,
+        dofs=(*mechanics.dofs, f"inerter{element}.deflection"),
+        body_of_dof=np.append(mechanics.body_of_dof, -1),
+        mass=np.append(mechanics.mass, inertance),
+        H=np.pad(mechanics.H, ((0, 0), (0, 1))),
+        F=np.pad(mechanics.F, ((0, 1), (0, 0))),
+        S=np.pad(mechanics.S, ((0, 0), (0, 1))),
+    )
+    row = np.append(mechanics.H[element], -1.0)
+    held = with_element(extended, row, inertance * omega**2, 0.1 * omega * inertance, mechanics.G[element])
+    L = held.L.copy()
+    L[:, -1] = L[:, element]  # a force sensor of the element shows it, too
+    return replace(held, L=L)
+
+
+INERTER = StructureLaw(
+    name="inerter",
+    title="inertia beside spring and damper",
+    parameters=(
+        ParameterSpec("inertance", "kg", 1e-9, 1e9, "force per acceleration of the deflection", _any, log=True),
+    ),
+    where="element",
+    modify=_geared,
+    absent=(0.0,),
+    looks_like="the element seems softer the faster it moves; its bodies seem to have other masses",
+    confused_with=("mass_change", "sensor_lag", "suspended_mass"),
+    sentence="has an inertia of {inertance} beside its spring and damper",
+    adds_motion=True,
+    along=2,
+    prior_cost=RARE,
+)
+
+
+def _stiffer(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
+    stiffness = mechanics.stiffness.copy()
+    stiffness[sites[0].number] += float(p[0])
+    return replace(mechanics, stiffness=stiffness)
+
+
+def _more_damped(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, variant: str) -> Mechanics:
+    damping = mechanics.damping.copy()
+    damping[sites[0].number] += float(p[0])
+    return replace(mechanics, damping=damping)
+
+
+def _held(
+    quantity: str, unit: str, along: int, modify: Callable[..., Mechanics], alike: tuple[str, ...]
+) -> StructureLaw:
+    """Another stiffness or damping than the one that the system file holds."""
+    return StructureLaw(
+        name=f"{quantity}_change",
+        title=f"another {quantity} than the file holds",
+        parameters=(ParameterSpec("change", unit, -1e15, 1e15, "above the value of the system file", _any),),
+        where="element",
+        modify=modify,
+        absent=(0.0,),
+        looks_like="its neighbours' values are off together, and differently at every frequency",
+        confused_with=alike,
+        sentence=f"its {quantity} is {{change}} above what the system file holds",
+        strengths=(0,),
+        along=along,
+        holds=quantity,
+    )
+
+
+STIFFNESS_CHANGE = _held("stiffness", "N/m", 0, _stiffer, ("mass_change", "time_varying_stiffness"))
+DAMPING_CHANGE = _held("damping", "N s/m", 1, _more_damped, ("time_varying_damping", "series_stiffness"))
 
 
 def sites_of(file: SystemFile, location: str) -> tuple[Foothold, ...]:

@@ -95,9 +95,13 @@ def changed_parts(state: Investigation) -> int:
 def is_part(law: Law) -> bool:
     """Whether a law is a linear part of the structure: a connection, a hung mass, a spring in series, rubber.
 
+    A value that the file holds wrong is none.
+
     Sums of them come close to any other structure.
     """
-    return isinstance(law, StructureLaw) or (isinstance(law, ElementLaw) and law.memory_decay is not None)
+    if isinstance(law, StructureLaw):
+        return not law.holds
+    return isinstance(law, ElementLaw) and law.memory_decay is not None
 
 
 def another_structure(state: Investigation, errors: HeldOutErrors | None = None) -> bool:

@@ -29,8 +29,9 @@ HARMONIC = Family("harmonics", look_elsewhere=lambda rules: rules.of_lines)
 LINE = Family("line", freedom=2, look_elsewhere=lambda rules: rules.of_lines)
 MODE = Family("mode")
 MASS = Family("mass")
+PART = Family("part")
 STRUCTURE = Family("structure", freedom=None, look_elsewhere=lambda rules: rules.of_places)
 SENSOR = Family("sensor")
 INPUT = Family("input", rank=0)  # channels of supports, compensated before anything else
 FORCE = Family("force", rank=0)  # measured forces, fitted as a law is
-FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, STRUCTURE, SENSOR, INPUT, FORCE)
+FAMILIES = (ELEMENT, UNNAMED, HARMONIC, LINE, MODE, MASS, PART, STRUCTURE, SENSOR, INPUT, FORCE)

@@ -16,7 +16,7 @@ import numpy as np
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term, branches_of, supports
 from sprung.model.diagnosis.rules import ScreeningRules
-from sprung.model.diagnosis.screening.families import STRUCTURE
+from sprung.model.diagnosis.screening.families import PART, STRUCTURE
 from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.laws import Law, StructureLaw
 from sprung.model.laws.structure import AXES, moved_row, point_rows, sites_of
@@ -45,9 +45,18 @@ def structure_candidates(projector: Projector, laws: tuple[Law, ...]) -> Iterato
             yield from _of_all_springs(projector, law)
         else:
             for name in system.elements:
-                for axis in law.variants:
-                    if turns(system, name, axis):
-                        yield from _moved(projector, law, name, axis)
+                yield from _of_element(projector, law, name)
+
+
+def _of_element(projector: Projector, law: StructureLaw, name: str) -> Iterator[tuple[Candidate, int]]:
+    """What an element has beside its spring and damper, or the places at which it may sit."""
+    system = projector.problem.system
+    if law.along is None:
+        for axis in law.variants:
+            if turns(system, name, axis):
+                yield from _moved(projector, law, name, axis)
+    elif not law.holds or f"{name}.{law.holds}" not in {parameter.name for parameter in system.parameters}:
+        yield _beside(projector, law, law.along, name), 1
 
 
 def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[Candidate, int]]:
@@ -64,6 +73,19 @@ def _of_all_springs(projector: Projector, law: StructureLaw) -> Iterator[tuple[C
     if springs and amount > 0:
         amount = min(_FAINT * amount, law.parameters[0].high)
         yield Candidate(replace(term, parameters=(amount, *law.absent[1:]), scales=(amount, 0.1)), score, STRUCTURE), 1
+
+
+def _beside(projector: Projector, law: StructureLaw, along: int, name: str) -> Candidate:
+    """A force that goes with a derivative of an element's deflection."""
+    fit, grid = projector.fit, projector.grid
+    band, element = grid.band, projector.problem.system.elements.index(name)
+    rate = fit.motions.rate[band, element]
+    force = (fit.motions.deflection[band, element], rate, 1j * grid.omega[band] * rate)[along]
+    score, amount = projector.score(projector.pack(projector.of_force[:, :, element] * force[:, None]))
+    (spec,) = law.parameters
+    value = float(np.clip(amount, spec.low, spec.high))
+    term = Term(law, name, (value,), law.variants[0], scales=(max(abs(value), 1e-9),))
+    return Candidate(term, score if value == amount else 0.0, PART)
 
 
 def unconnected(system: System) -> Iterator[tuple[str, str]]:
