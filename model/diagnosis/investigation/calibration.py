@@ -20,7 +20,8 @@ import numpy as np
 from scipy.special import stdtr
 
 from sprung.model.diagnosis.fit.baseline import refreshed
-from sprung.model.diagnosis.fit.optimise import try_optimise
+from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
+from sprung.model.diagnosis.investigation.setup import misfit
 from sprung.model.diagnosis.investigation.state import Investigation
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.response.terms import Term
@@ -149,13 +150,22 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
     if base is None:
         return replace(state, calibrations=0)
     problem, base = refreshed(problem, base)
-    terms = tuple(
-        one if term.location in state.signals.sensor_names else term for one, term in zip(terms, held, strict=True)
-    )
-    base = replace(base, point=replace(base.point, terms=(*base.point.terms[: len(file)], *terms)))
     screening = screen(problem, base, state.problem.system.catalogue, state.options.project)
     begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)
-    return replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
+    begun = replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
+    if float(np.max(misfit(base))) > state.options.rules.setup.misfit:
+        return begun  # kept until the law stands that is left out: beside it they would run away from any start
+    base = freed(begun, base)
+    return replace(begun, base=base, fit=base)
+
+
+def freed(state: Investigation, fit: Fit) -> Fit:
+    """A fit whose next steps move gains, zeros and delays of sensors; those of what drives everything are kept."""
+    sensors, terms = state.signals.sensor_names, list(fit.point.terms)
+    for index in channels(state):
+        if terms[index].location in sensors:
+            terms[index] = replace(terms[index], fixed=())
+    return replace(fit, point=replace(fit.point, terms=tuple(terms)))
 
 
 def channels(state: Investigation) -> range:

@@ -11,7 +11,7 @@ from sprung.model.diagnosis.fit.baseline import refreshed, settled
 from sprung.model.diagnosis.fit.optimise import Fit, try_optimise
 from sprung.model.diagnosis.fit.work import WorkBudget
 from sprung.model.diagnosis.investigation.by_names import by_names
-from sprung.model.diagnosis.investigation.calibration import calibrated, of_others, within_sheet
+from sprung.model.diagnosis.investigation.calibration import calibrated, freed, of_others, within_sheet
 from sprung.model.diagnosis.investigation.doubt import by_what_is_left
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula import formula_of, left
@@ -249,7 +249,7 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         if state.calibrations:
             return state
     second = runner_up(state.problem, state.fit, _new(state, state.last.candidates), chosen, believed)
-    problem, fit = refreshed(state.problem, chosen.fit if chosen.named else _smoother(state, chosen.fit))
+    problem, fit = refreshed(state.problem, freed(state, chosen.fit if chosen.named else _smoother(state, chosen.fit)))
     state = replace(state, problem=problem, fit=fit)
     trial, fit = _variant(state, chosen, trials)
     if not fit.converged and not problem.process_noise:
@@ -295,7 +295,7 @@ def _variant(state: Investigation, chosen: Trial, trials: list[Trial]) -> tuple[
     best = chosen, state.fit
     for rival in trials:
         if rival is not chosen and rival.term.key[:2] == chosen.term.key[:2] and rival.named:
-            fit = try_optimise(state.problem, rival.fit.point, 6, state.fit.whitener)
+            fit = try_optimise(state.problem, freed(state, rival.fit).point, 6, state.fit.whitener)
             dearer = (rival.gain - rival.evidence) - (best[0].gain - best[0].evidence)
             if fit is not None and best[1].deviance - fit.deviance > dearer:
                 best = rival, fit

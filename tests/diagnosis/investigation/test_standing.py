@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import make_dataclass, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,10 +12,11 @@ import pytest
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.fit import baseline
-from sprung.model.diagnosis.investigation.calibration import centred, shared_gain
+from sprung.model.diagnosis.investigation.calibration import centred, freed, shared_gain
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.standing import standing
 from sprung.model.diagnosis.investigation.state import Found, Investigation
+from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.selection.compete import compete
 from sprung.model.laws import find_law
@@ -61,3 +62,12 @@ def test_a_gain_that_all_channels_share_is_taken_out_of_them() -> None:
     values = [term.parameters[0] for term in centred(shown)]
     assert values == pytest.approx([1.01, 1.0, 1 / 1.01, 1e-4])
     assert shared_gain(shown[3:]) == (1.0, 0.0)
+
+
+def test_gains_of_sensors_move_beside_a_law_and_those_of_what_drives_everything_do_not() -> None:
+    gain = find_law("sensor_gain")
+    kept = [Term(gain, name, (1.01,), known=(0.015,), fixed=(True,)) for name in ("car_a", "road.displacement")]
+    law = Term(find_law("coulomb_friction"), "secondary", (300.0, 0.002), fixed=(False, True))
+    fit: Any = make_dataclass("_Fit", ["point"])(Point(np.zeros(0), (*kept, law), np.zeros(0)))
+    state: Any = SimpleNamespace(signals=SimpleNamespace(sensor_names=("car_a",)), given=2, calibrations=2)
+    assert [term.fixed for term in freed(state, fit).point.terms] == [(), (True,), (False, True)]

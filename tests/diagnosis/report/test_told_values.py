@@ -27,6 +27,21 @@ def test_an_offset_is_told_in_the_unit_of_its_channel(law: str, unit: str) -> No
     assert [one.unit for one in parameters] == [unit]
 
 
+def test_a_size_in_the_unit_of_a_power_is_as_uncertain_as_the_power() -> None:
+    """beta in m^-n of a hysteresis that yields over 5 mm: its exponent is simulated to a thousandth."""
+    term = Term(find_law("bouc_wen"), "secondary", (9.2e4, 2.0e4, 2.0))
+    along = np.array([0.0, 2.0e4 * np.log(1 / 0.005), 1.0])  # of one more in the exponent
+    fit: Any = SimpleNamespace(
+        point=SimpleNamespace(terms=(term,)),
+        place=lambda index: slice(0, 3),
+        covariance=np.outer(along, along) * 1e-8 + np.diag([1.0, 1.0, 1e-14]),
+        forward=SimpleNamespace(system=quarter_car()),
+    )
+    values = {one.name: one for one in law_parameters(fit, 0)}
+    assert values["n"].std == pytest.approx(2e-3, rel=0.05)
+    assert values["beta"].std == pytest.approx(2.0e4 * np.log(1 / 0.005) * 2e-3, rel=0.05)
+
+
 def test_what_branches_stand_for_is_told_as_accurately_as_they_follow_it() -> None:
     term = Term(find_law("structural_damping"), "primary|secondary", (0.04, 0.0), scales=(0.02, 0.1))
     fit: Any = SimpleNamespace(
