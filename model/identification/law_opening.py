@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from sprung.model.identification.gauss_newton import WindowBatch
-from sprung.model.identification.law_point import Moved, Steps, WindowPoint
+from sprung.model.identification.law_point import Steps, WindowPoint
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import as_rows
 from sprung.model.signals import FloatArray
@@ -47,7 +47,7 @@ def opened(w: LawWindows, start: WindowPoint, data: WindowBatch) -> WindowPoint:
     steps = steps.take(torch.zeros(B, dtype=torch.long))
     smooth = np.zeros((2, B, T, len(w.system.mechanics.stiffness)))
     point = replace(start, x0=torch.zeros_like(start.x0), force=torch.zeros_like(start.force))
-    residual = w.residual(Moved(*w.simulate(steps, point.force, point.x0, data)), data, whiten)
+    residual = w.residual(w.simulate(steps, point.force, point.x0, data)[1], data, whiten)
     x0, singular = torch.linalg.solve_ex(_ridged(by.shown[:N] @ by.shown[:N].T), by.shown[:N] @ residual)
     sound = (singular == 0) & x0.isfinite()  # values that no vehicle has: their windows begin at rest
     point = replace(point, x0=x0.where(sound, 0.0).squeeze(2))
@@ -59,7 +59,7 @@ def opened(w: LawWindows, start: WindowPoint, data: WindowBatch) -> WindowPoint:
         law = w.forces_along(along, point, steps)
         size = law.square().mean(dim=(0, 1)).sqrt().clamp_min(1e-9) if size is None else size
         squares, pull = _errors(w.slopes_along(along, point, steps), by, point.force - law, (error * size) ** -1)
-        gradient = by.shown @ w.residual(Moved(states, outputs), data, whiten) - pull
+        gradient = by.shown @ w.residual(outputs, data, whiten) - pull
         factor, failed = torch.linalg.cholesky_ex(products + squares)
         step = torch.cholesky_solve(gradient, factor).squeeze(2)
         sound = (failed == 0) & step.isfinite().all(dim=1)  # sensors that show nonsense: such a window stays

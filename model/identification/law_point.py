@@ -75,6 +75,7 @@ class Moved:
 
     states: Tensor  # (B, T, N)
     outputs: Tensor  # (B, T, S')
+    lost: Tensor  # whether Newton's method left all bounds, so that the forces are not those of the laws, (B,)
 
 
 @dataclass(frozen=True, slots=True)

@@ -59,13 +59,14 @@ class Second:
 
     def take(self, at: Tensor) -> Second:
         """Some of the windows."""
-        motion = Moved(self.motion.states[at], self.motion.outputs[at])
+        motion = Moved(self.motion.states[at], self.motion.outputs[at], self.motion.lost[at])
         return Second(self.point.take(at), motion, self.residual[at], self.cost[at], self.step[at], self.alone[at])
 
     def put(self, at: Tensor, some: Second) -> None:
         """Replace some of the windows."""
         self.point.put(at, some.point)
         self.motion.states[at], self.motion.outputs[at] = some.motion.states, some.motion.outputs
+        self.motion.lost[at] = some.motion.lost
         self.residual[at], self.cost[at] = some.residual, some.cost
         self.step[at], self.alone[at] = some.step, some.alone
 
@@ -133,7 +134,7 @@ class LawSearch:
         steps = w.steps(point, data)
         point, motion, near = w.settle(point, steps, data)
         columns, flow = w.columns(point, steps, motion, data, smooth)
-        residual = w.residual(motion, data, columns.whiten)
+        residual = w.residual(motion.outputs, data, columns.whiten)
         cost, step, alone = columns.solve(residual, point.unknowns)
         there = residual.square().sum(dim=(1, 2))
         worse = ~(there <= self.there[rows] * (1 + 1e-6) + _SLACK)
@@ -147,7 +148,7 @@ class LawSearch:
         going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
         if len(going):  # the old products are good enough for one more
             self._third(going, second, columns.take(going), near.take(going), data.take(going))
-        done = ((second.small(std) & held) | still) & ~worse
+        done = ((second.small(std) & held) | still) & ~worse & ~motion.lost & ~second.motion.lost
         _, diverged = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
         sane = (diverged == 0) & second.there.isfinite()
         ripe = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
@@ -176,7 +177,7 @@ class LawSearch:
         """The step from `there` with products from nearby."""
         w = self.windows
         there, motion, _ = w.settle(there, w.steps(there, data), data, flow)
-        residual = w.residual(motion, data, columns.whiten)
+        residual = w.residual(motion.outputs, data, columns.whiten)
         return Second(there, motion, residual, *columns.solve(residual, there.unknowns))
 
     def _third(self, at: Tensor, second: Second, columns: Columns, flow: Flow, data: WindowBatch) -> None:

@@ -152,6 +152,7 @@ class LawWindows:
         these make it larger, and would come back as motion.
         """
         force, moving = point.force.clone(), torch.arange(len(point.force))
+        lost = torch.zeros(len(force), dtype=torch.bool)
         for _ in range(_SWEEPS):
             if not len(moving):
                 break
@@ -161,6 +162,7 @@ class LawWindows:
             states, outputs = self.simulate(their_steps, some.force, some.x0, theirs)
             if bool((wild := self._wild(outputs, theirs)).any()):
                 force[moving[wild]] = point.force[moving[wild]]
+                lost[moving[wild]] = True
                 moving = moving[~wild]
                 continue
             along = self.along(states, theirs, _AS_MEASURED, some, their_steps)
@@ -174,12 +176,12 @@ class LawWindows:
         for usable in (point.force, torch.zeros_like(force)):
             if not bool((wild := self._wild(outputs, data)).any()):
                 break
-            force[wild] = usable[wild]
+            force[wild], lost[wild] = usable[wild], True
             states, outputs = self.simulate(steps, force, point.x0, data)
         point = replace(point, force=force)
         if flow is None:
             flow = self.flow(self.along(states, data, _AS_MEASURED, point, steps), point, steps)
-        return point, Moved(states, outputs), flow
+        return point, Moved(states, outputs, lost), flow
 
     def _wild(self, outputs: Tensor, data: WindowBatch) -> Tensor:
         """Windows whose simulated outputs (B, T, S') have left all bounds, (B,)."""
@@ -230,9 +232,9 @@ class LawWindows:
         slopes = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return Flow(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
 
-    def residual(self, motion: Moved, data: WindowBatch, whiten: Tensor) -> Tensor:
-        """Whitened residual, (B, K, 1)."""
-        compressed = (data.measured - motion.outputs) @ self.model.compression.matrix(data.present).mT
+    def residual(self, outputs: Tensor, data: WindowBatch, whiten: Tensor) -> Tensor:
+        """Whitened residual of simulated outputs (B, T, S'), (B, K, 1)."""
+        compressed = (data.measured - outputs) @ self.model.compression.matrix(data.present).mT
         return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
 
     def columns(
