@@ -12,6 +12,8 @@ import os
 import tempfile
 from pathlib import Path
 
+import typer
+
 from sprung.model.laws import CATALOGUE
 from sprung.model.systemfile import json_schema
 from sprung.service.api.app import create_app
@@ -24,18 +26,31 @@ from sprung.service.settings import Settings
 TARGET = Path(__file__).resolve().parent / "reference"
 
 
+def names() -> list[list[str]]:
+    """Words of every command, groups before their commands."""
+    found = [[name] for name in _names(app)]
+    for group in app.registered_groups:
+        found.append([str(group.name)])
+        found += [[str(group.name), name] for name in _names(group.typer_instance)]
+    return found
+
+
 def commands() -> str:
     """The help of every command."""
     os.environ["COLUMNS"] = "100"
-    names = [[str(one.callback.__name__)] for one in app.registered_commands if one.callback is not None]
-    names += [[str(group.name)] for group in app.registered_groups]
     parts = ["# Commands\n\nAs `sprung COMMAND --help` prints them.\n"]
-    for words in names:
+    for words in names():
         text = io.StringIO()
         with contextlib.redirect_stdout(text):
-            run([*words, "--help"])
+            if run([*words, "--help"]) != 0:
+                raise SystemExit(f"sprung {' '.join(words)} --help failed")
         parts.append(f"## sprung {' '.join(words)}\n\n```\n{text.getvalue().strip()}\n```\n")
     return "\n".join(parts)
+
+
+def _names(of: typer.Typer | None) -> list[str]:
+    registered = [] if of is None else of.registered_commands
+    return [str(one.name or one.callback.__name__) for one in registered if one.callback is not None]
 
 
 def laws() -> str:
