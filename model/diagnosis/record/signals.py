@@ -30,6 +30,7 @@ _WHITE_ORDER = 6  # of the differences that tell white noise
 _WHITE_BLOCKS = 40  # of them, the median counts: bursts are no noise
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
+_END_DEGREE = 4  # of the polynomial through them, of a support's motion
 
 
 @dataclass(frozen=True)
@@ -201,12 +202,17 @@ def drifting(system: System, sensors: np.ndarray) -> np.ndarray:
 
 def rate_of(position: FloatArray, grid: Grid) -> FloatArray:
     """Time derivative of series (N, m), exact within the band: what their ends leave open is a parabola's."""
-    ends = np.vander(np.arange(_END) * grid.step, 3)
-    slopes = [np.linalg.lstsq(ends, stretch, rcond=None)[0][1] for stretch in (position[:_END], position[::-1][:_END])]
-    polynomial = detrend_ends(position, (slopes[0], -slopes[1]), grid)
+    polynomial = detrend_ends(position, _end_slopes(position, grid, 2), grid)
     rest = grid.forward(position - grid.monomials @ polynomial)
     slope = grid.monomials @ derivative(polynomial, grid.length)
     return np.asarray(grid.inverse(1j * grid.omega[:, None] * rest) + slope)
+
+
+def _end_slopes(series: FloatArray, grid: Grid, degree: int) -> tuple[FloatArray, FloatArray]:
+    """Slopes of series (N, m) at the first and the last sample, per second, each (m,), of polynomials through few."""
+    ends = np.vander(np.arange(min(_END, len(series))) * grid.step, degree + 1)
+    first, last = (np.linalg.lstsq(ends, part[: len(ends)], rcond=None)[0][-2] for part in (series, series[::-1]))
+    return first, -last
 
 
 def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None = None) -> Part:
@@ -224,9 +230,9 @@ def transform(signals: Signals, noise: Noise, differentiated: np.ndarray | None 
     d, v = signals.displacement, np.where(has_rate, signals.velocity, 0.0)
     polynomial = np.zeros((grid.monomials.shape[1], d.shape[1]))
     if d.shape[1]:
-        polynomial = detrend_ends(d, None, grid)
-        with_rate = detrend_ends(d, (v[0], v[-1]), grid)
-        polynomial[:, has_rate] = with_rate[:, has_rate]
+        slopes = _end_slopes(d, grid, _END_DEGREE)
+        first, last = (np.where(has_rate, v[at], slope) for at, slope in zip((0, -1), slopes, strict=True))
+        polynomial = detrend_ends(d, (first, last), grid)
     slope = np.zeros_like(polynomial)
     slope[:-1] = polynomial[1:] * np.arange(1, len(polynomial))[:, None] / grid.length
     D = grid.forward(d - grid.monomials @ polynomial)
