@@ -121,10 +121,18 @@ def _hdf5(path: Path) -> Iterator[list[Column]]:
 
         def visit(name: str, item: Any) -> None:
             if isinstance(item, h5py.Dataset) and not name.startswith("#"):
+                _check_own(path, name, item)
                 found.extend(_checked(path, item, column) for column in _datasets(name, item))
 
         file.visititems(visit)
         yield found
+
+
+def _check_own(path: Path, name: str, item: Any) -> None:
+    """Raise UnreadableRecording where the values of a dataset lie elsewhere: an upload could name any file of this
+    machine, and its sender would read it as samples.  Views of the file itself may lead there through its links."""
+    if item.external or item.is_virtual:
+        raise UnreadableRecording(f"{path}: {name} takes its values from elsewhere; a file must hold its own")
 
 
 def _checked(path: Path, item: Any, column: Column) -> Column:

@@ -11,10 +11,11 @@ from sqlalchemy import Connection
 
 from sprung.service.api import job_models, models
 from sprung.service.api.access import CoreOf, json_response, read
-from sprung.service.api.queries import After, Limit, Since, time_of, wrong_query
+from sprung.service.api.queries import After, Limit, Since, time_of, with_cursor
 from sprung.service.api.recordings import job_dict
 from sprung.service.core import Core
 from sprung.service.store import fleet, lists
+from sprung.service.store.cursors import whole_number
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.times import optional_iso, to_iso
 from sprung.service.views import alarm_dict
@@ -39,7 +40,7 @@ async def alarms(
     begin = None if since is None else time_of("since", since, 0)
     wanted = WantedAlarms(vehicle, active, acknowledged, severity, kind, begin)
     last = _cursor(after)
-    place = None if last is None else (last[0], _number(last[1]))
+    place = None if last is None else (last[0], with_cursor(lambda: whole_number(last[1])))
     rows = await read(core, lambda connection: fleet.list_alarms(connection, wanted, limit, place))
     following = f"{rows[-1].opened}:{rows[-1].id}" if len(rows) == limit else None
     return json_response({"alarms": [alarm_dict(row) for row in rows], "next": following})
@@ -187,13 +188,4 @@ async def _answer(
 
 
 def _cursor(text: str | None) -> lists.Cursor | None:
-    try:
-        return lists.parse_cursor(text)
-    except ValueError:
-        raise wrong_query("after", "is no `next` of a page before") from None
-
-
-def _number(text: str) -> int:
-    if not text.isdigit():
-        raise wrong_query("after", "is no `next` of a page before")
-    return int(text)
+    return with_cursor(lambda: lists.parse_cursor(text))

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from sprung.service.pages.drawing import Mark
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.status import FleetRow, Reason
-from sprung.service.views import VehicleView, told, unclear
+from sprung.service.times import to_iso
+from sprung.service.views import VehicleView, suspected, told, unclear
 
 MOSTLY = 0.5  # share of the windows from which something is worth a hint
 
@@ -31,7 +32,7 @@ def hints(
     sensors: Mapping[str, Mark],
 ) -> list[Hint]:
     """The most urgent first; empty for a vehicle that is well."""
-    found = [*_alarms(row, active), *_sensors(sensors)]
+    found = [*_alarms(row, active), *_sensors(sensors, active)]
     whole = row.windows["used"] + row.windows["repaired"]
     every = whole + row.windows["dropped"] + row.windows["uninformative"]
     if silent:
@@ -72,7 +73,7 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
         worst = max(changed, key=lambda a: abs(a.change or 0.0))
         many = f" and {len(changed) - 1} more" if len(changed) > 1 else ""
         level = "alarm" if any(a.severity == "alarm" for a in changed) else "warning"
-        size = "" if worst.change is None else f" by {100 * worst.change:+.1f} %"
+        size = f" by {_size(worst)}" if _size(worst) else ""
         together = "*" in (worst.parameter or "")
         waiting = [a for a in changed if a.acknowledged is None]
         seen = f"Acknowledged by {worst.acknowledged_by or 'somebody'}."
@@ -83,9 +84,11 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
             else "Inspect the element; once it is repaired, mark the maintenance so that its baseline is learned anew."
         )
         unsure = unclear(worst.alternatives)
-        found.append(Hint(level, f"{told(worst)} has changed{size}{many}", f"{unsure}{what} {ask}"))
-    if any(a.kind == "misfit" for a in active):
-        text = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
+        found.append(Hint(level, f"{told(worst)} has changed{size}{many}", f"{_since(worst)}. {unsure}{what} {ask}"))
+    misfit = next((a for a in active if a.kind == "misfit"), None)
+    if misfit is not None:
+        cause = "A sensor, or physics that the model lacks. A diagnosis follows by itself; its report is listed below."
+        text = f"{_since(misfit)}. {cause}"
         found.append(Hint("warning", "Windows no longer fit the model", text))
     if any(a.kind == "load" for a in active):
         found.append(Hint("warning", "Load out of range", "Check the load sensor, or the loading of the vehicle."))
@@ -95,12 +98,33 @@ def _alarms(row: FleetRow, active: Sequence[AlarmRow]) -> list[Hint]:
     return found
 
 
-def _sensors(sensors: Mapping[str, Mark]) -> list[Hint]:
+def _size(alarm: AlarmRow) -> str:
+    """How large a change is, and how sure; empty where that is not known."""
+    if alarm.change is None:
+        return ""
+    std = "" if alarm.std is None else f" ± {100 * alarm.std:.1f}"
+    return f"{100 * alarm.change:+.1f}{std} %"
+
+
+def _since(alarm: AlarmRow) -> str:
+    return f"Since {to_iso(alarm.onset)[:19].replace('T', ' ')} UTC"
+
+
+def _fault(alarm: AlarmRow) -> str:
+    """What is wrong with the channels of an alarm of kind sensor, and since when."""
+    channels, fault = suspected(alarm)
+    size = f" {_size(alarm)}" if fault == "gain" and _size(alarm) else ""
+    return f"{_since(alarm)}: {', '.join(channels)}, {fault}{size}"
+
+
+def _sensors(sensors: Mapping[str, Mark], active: Sequence[AlarmRow]) -> list[Hint]:
     suspect = [name for name, mark in sensors.items() if mark.state == "suspect"]
     absent = [name for name, mark in sensors.items() if mark.state == "absent"]
     found = []
     if suspect:
+        faults = "".join(f"{_fault(a)}. " for a in active if a.kind == "sensor")
         text = "Check mounting, cable and scale; springs and dampers are judged without it where the others suffice."
+        text = f"{faults}{text}"
         found.append(Hint("warning", f"Sensor suspect: {', '.join(suspect)}", text))
     if absent:
         text = "Its channel delivers nothing, or its address in the system file is wrong: `sprung inspect` lists it."

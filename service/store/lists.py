@@ -7,6 +7,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Connection, Table, and_, or_, select
 
+from sprung.service.store.cursors import whole_number
 from sprung.service.store.outbox import DeliveryRow
 from sprung.service.store.schema import deliveries, jobs, recordings, reports
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
@@ -53,7 +54,7 @@ def parse_cursor(text: str | None) -> Cursor | None:
     created, separator, identity = text.partition(":")
     if not separator:
         raise ValueError(text)
-    return int(created), identity
+    return whole_number(created), identity
 
 
 def _page(

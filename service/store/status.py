@@ -10,6 +10,7 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, Select, and_, func, or_, select
 
+from sprung.service.store.cursors import whole_number
 from sprung.service.store.engine import upsert
 from sprung.service.store.fleet import staging_models
 from sprung.service.store.schema import alarms, fleet_status, tracker_states, vehicles, window_reasons, windows
@@ -334,7 +335,7 @@ def _beyond(sort: Sort, after: str) -> ColumnElement[bool]:
         if value:
             raise ValueError(after)
         return own > identity
-    number = float(value) if sort == "drift" else int(value)
+    number = float(value) if sort == "drift" else whole_number(value)
     return or_(column < number, and_(column == number, own > identity))
 
 

@@ -40,6 +40,24 @@ def test_a_table_of_a_billion_rows_that_were_never_written_is_refused(tmp_path: 
     assert "states 2000000000000 values" in refused(tmp_path / "a.h5")
 
 
+@pytest.mark.parametrize("kind", ["external", "virtual", "itself"])
+def test_a_table_whose_values_lie_in_another_file_of_this_machine_is_refused(tmp_path: Path, kind: str) -> None:
+    h5py = pytest.importorskip("h5py")
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["x"] = np.arange(1000.0)
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"], file["right"] = np.arange(1000) / 100, np.arange(1000)
+        if kind == "external":
+            file.create_dataset("left", (1000,), "f8", external=[(secret, 0, 8000)])
+        else:
+            file["link"] = h5py.ExternalLink(secret, "x")  # by which a view of the file itself leads out of it
+            view = h5py.VirtualLayout((1000,), "f8")
+            view[:] = h5py.VirtualSource(*((secret, "x") if kind == "virtual" else (".", "link")), (1000,))
+            file.create_virtual_dataset("left", view)
+    assert "left takes its values from elsewhere" in refused(tmp_path / "a.h5")
+
+
 @pytest.mark.parametrize("rows", [400_000, 1000])
 def test_chunks_too_large_to_be_unpacked_are_refused(
     tmp_path: Path, rows: int, monkeypatch: pytest.MonkeyPatch

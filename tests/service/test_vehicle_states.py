@@ -49,9 +49,17 @@ def test_what_an_alarm_cannot_be_told_from_is_said() -> None:
     rivals = DAMPER.alternatives
     active = [AlarmRow("change", DAMPER.parameter, 0, 1, None, "warning", -0.1, 0.02, None, alternatives=rivals)]
     said = hints(ROW, view, active, [], False, sensor_marks(SYSTEM, view))
-    assert said[0].title == "bogie1_1l.gain or primary_11l.damping has changed by -10.0 %"
+    assert said[0].title == "bogie1_1l.gain or primary_11l.damping has changed by -10.0 ± 2.0 %"
+    assert said[0].text.startswith("Since 1970-01-01 00:00:00 UTC. ")
     assert "do not tell it from bogie1_1l.gain: check the sensor first" in said[0].text
     assert not any("Sensor suspect" in hint.title for hint in said)
+
+
+def test_what_is_wrong_with_a_sensor_is_said_with_its_size_and_since_when() -> None:
+    active = [AlarmRow("sensor", "bogie1_1l.gain", 10**9, 1, None, "warning", 0.059, 0.003, None)]
+    said = hints(ROW, VIEW, active, [], False, {"bogie1_1l": Mark("suspect")})
+    assert said[0].title == "Sensor suspect: bogie1_1l"
+    assert said[0].text.startswith("Since 1970-01-01 00:00:01 UTC: bogie1_1l, gain +5.9 ± 0.3 %. Check mounting")
 
 
 def test_a_body_that_is_not_as_its_file_says_is_told() -> None:

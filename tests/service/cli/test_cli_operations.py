@@ -52,6 +52,15 @@ def test_help_is_in_full_words(command: str, capsys: pytest.CaptureFixture[str])
             assert len(lines[i + 1]) - len(lines[i + 1].lstrip()) == began.end(), lines[i : i + 2]
 
 
+@pytest.mark.parametrize("command", ["", "token"])
+def test_a_command_without_its_command_shows_the_help_as_lines(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(command.split()) == 2
+    told = capsys.readouterr()
+    assert told.err == "" and told.out.startswith("Usage: sprung") and len(told.out.splitlines()) > 10
+
+
 def test_wrong_usage_points_to_the_help_of_its_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay"]) == 2
     line = capsys.readouterr().err.strip()
