@@ -79,7 +79,7 @@ class Engine:
     def load_state(self, data: dict[str, Any]) -> TrackerState:
         """A stored tracker state; one that cannot be read starts anew rather than stopping the service."""
         try:
-            return self.tracker.whole(TrackerState.from_dict(data))
+            return self.tracker.upgraded(TrackerState.from_dict(data))
         except TrackerStateError as error:
             log.warning("a stored tracker state cannot be read (%s); the vehicle's baseline is learned anew", error)
             return self.tracker.initial_state()

@@ -255,7 +255,7 @@ class Pipeline:
         held = self._told
         if held is None or count >= FRESH_GROWTH * held.vehicles or not 0 <= now - held.at < FRESH_NS:
             rows = fleet.latest_trackers(connection, self.model_id, LEARNED_FROM)
-            state = self.engine.tracker.newcomer([self.engine.load_state(row.state) for row in rows])
+            state = self.engine.tracker.initial_state_from([self.engine.load_state(row.state) for row in rows])
             self._told = held = Newcomer(count, now, state)
         return held.state
 

@@ -189,7 +189,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         _of_sensors(engine, last),
         engine.tracker.sensors(state),
         body_loads(engine, state),
-        engine.tracker.built(state),
+        engine.tracker.body_constants(state),
         engine.tracker.loads_as_of(state),
     )
 

@@ -1,12 +1,12 @@
-"""Alarms of one vehicle: opened, followed, closed, and attributed to what the evidence speaks for.
+"""Alarms of one vehicle: opening, update, closing, and fault isolation.
 
-A sequential test that has left the baseline says that something changed, not what.  Before an alarm accuses an element,
+A sequential test detects that something has changed, not what.  Before an alarm names an element,
 
-- a deviation of a measurement must have had its chance: some windows since the onset must have been weighed for it, and
-  while their evidence for one rises, the next are waited for; what explains the change as well is named with the alarm,
-  and when the windows point to it, it is the alarm;
-- all elements of a kind that moved together are one message: oil that warms, rubber that stiffens in the cold;
-- where all springs and dampers at a body moved alike, its mass is named with them: it is the scale of their forces.
+- sensor faults must be excluded: some windows since the onset must have contained information on deviations of the
+  measurements, and while the evidence for one rises, further windows are awaited; deviations that explain the change
+  equally well are listed with the alarm, and if a jump of one is found, that is the alarm;
+- elements of a kind that changed together give one alarm: oil that warms up, rubber that stiffens in the cold;
+- where all springs and dampers at a body changed alike, its mass is listed as an alternative: it scales their forces.
 """
 
 from __future__ import annotations
@@ -22,40 +22,41 @@ from sprung.model.identification.deviations import Deviation, named
 from sprung.model.signals import FaultKind, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import weather as weathers
-from sprung.model.tracking.deviations import DeviationModel, Jump
+from sprung.model.tracking.deviation_model import DeviationModel
+from sprung.model.tracking.deviations import Jump
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Alarm, Severity, Stuck, TrackerState
 from sprung.model.tracking.weather import WeatherModel
 
 CERTAIN = 2.5  # standard deviations within which two explanations are equally good
-LARGEST = {"gain": 0.3, "delay": 0.03}  # a deviation beyond this is none that a sensor has for long
-PATIENCE = 20.0  # s that an alarm waits for windows weighed for deviations
-ALIKE = 0.35  # of the common change: elements within this of it move together
+LARGEST = {"gain": 0.3, "delay": 0.03}  # larger deviations are not considered as explanations
+PATIENCE = 20.0  # s that an alarm waits for windows with information on deviations
+ALIKE = 0.35  # of the common change: elements within this of it change together
 MOST_OF = 0.75  # of the elements of a kind
-FEWEST = 4  # elements that can be said to move together
-RECOVERED = 0.6  # of the change that opens an alarm of a kind: below it is over
-MENDED = 0.2  # of a sensor's largest deviation: surely below it is over
-LOAD_KNOWN = 0.02  # standard deviation of a load that can be said to be beyond a limit
-WINDOWS = 6  # windows that a frozen or reversed channel needs to be told
-HARD = ("frozen", "saturated", "inverted", "swapped")
+FEWEST = 4  # elements whose changes can be compared with a common one
+RECOVERED = 0.6  # of the change that opens an alarm of a kind: below, the alarm is closed
+SENSOR_RECOVERED = 0.2  # of a sensor's largest deviation: below with certainty, its alarm is closed
+LOAD_KNOWN = 0.02  # standard deviation of a load from which on it is compared with its limits
+HARD_FAULT_WINDOWS = 6  # windows after which a frozen or reversed channel is reported
+HARD_FAULTS = ("frozen", "saturated", "inverted", "swapped")
 
 
 @dataclass(frozen=True, slots=True)
 class Drift:
     """Posterior over baseline of every parameter."""
 
-    change: FloatArray  # value / baseline - 1, apart from what all of a kind have in common, shape (P,)
+    change: FloatArray  # value / baseline - 1 without the level common to all of a kind, shape (P,)
     std: FloatArray
-    whole: FloatArray  # with it, but for the slow part that is weather
+    whole: FloatArray  # the same with that level, but for its slow part, which is attributed to weather
 
 
 @dataclass(frozen=True, slots=True)
 class LoadLimit:
-    """What a body may carry, kg beside its empty mass."""
+    """Limits of the load of a body."""
 
     empty: float  # kg
-    least: float | None
-    most: float | None
+    least: float | None  # kg
+    most: float | None  # kg
 
     def beyond(self, ratio: float) -> float:
         """kg above the most, or (negative) below the least, of a mass whose logarithm over the empty one is `ratio`."""
@@ -75,26 +76,26 @@ class Attribution:
     model: DeviationModel
     weather: WeatherModel
     limits: dict[str, LoadLimit]
-    masses: Mapping[str, tuple[str, ...]]  # of bodies whose mass no window tells: the elements at them
+    masses: Mapping[str, tuple[str, ...]]  # bodies whose mass is not identifiable, and the elements at them
 
     @property
     def kinds(self) -> list[str]:
-        """What kind of value each parameter is: "stiffness", "damping"."""
+        """Quantity of each parameter: "stiffness", "damping"."""
         return [name.rpartition(".")[2] for name in self.names]
 
-    def after(self, state: TrackerState, drift: Drift, jump: Jump | None, now: int) -> tuple[Alarm, ...]:
-        """Alarms after a window."""
+    def updated(self, state: TrackerState, drift: Drift, jump: Jump | None, now: int) -> tuple[Alarm, ...]:
+        """Alarms after a window whose centre is at `now`, ns."""
         common = self._common_changes(state)
         overloaded = self._overloads(state)
         quiet = not (state.active or state.changes.active.any() or common or overloaded)
         quiet = quiet and state.misfit_since is None
-        crept = self._crept(state)
-        if quiet and jump is None and not state.stuck and not crept:
+        drifted = self._drifted(state)
+        if quiet and jump is None and not state.stuck and not drifted:
             return state.alarms
-        alarms = [self._kept_open(alarm, state, drift, now) for alarm in state.alarms]
-        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMPED[jump.kind]:
+        alarms = [self._present(alarm, state, drift, now) for alarm in state.alarms]
+        if jump is not None and jump.kind in ("gain", "delay") and abs(jump.size) >= dev.JUMP_LIMIT[jump.kind]:
             alarms = self._with_sensor(alarms, jump, now)
-        alarms = self._with_crept(alarms, crept, state, now)
+        alarms = self._with_drifted(alarms, drifted, state, now)
         alarms = self._with_stuck(alarms, state, now)
         alarms = self._with_common(alarms, common, drift, now)
         alarms = self._with_changes(alarms, state, drift, now)
@@ -107,57 +108,57 @@ class Attribution:
             alarms.append(Alarm("misfit", None, state.misfit_since, now, "warning"))
         return self._latest(alarms)
 
-    def _kept_open(self, alarm: Alarm, state: TrackerState, drift: Drift, now: int) -> Alarm:
-        """The alarm as it is now: followed, or closed."""
+    def _present(self, alarm: Alarm, state: TrackerState, drift: Drift, now: int) -> Alarm:
+        """The alarm with its present values, or closed."""
         if alarm.closed is not None:
             return alarm
         if alarm.kind == "misfit":
             return alarm if state.misfit_since is not None else _closed(alarm, now)
         if alarm.kind == "sensor":
-            return self._sensor_followed(alarm, state, now)
+            return self._sensor_updated(alarm, state, now)
         if alarm.kind == "load":
-            return self._load_followed(alarm, state, now)
+            return self._load_updated(alarm, state, now)
         name = alarm.parameter or ""
         if "*" in name:
             members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
             still = any(fnmatchcase(pattern, name) for pattern, *_ in self._common_changes(state, RECOVERED))
-            if np.isnan(drift.whole[members]).all():  # all baselines begin anew: nothing is left to compare with
+            if np.isnan(drift.whole[members]).all():  # all baselines are learned anew: there is nothing to compare with
                 return _closed(alarm, now)
             change, std = _common(replace(drift, change=drift.whole), members)
-            moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._least_together
-            if not (still or moved):  # one that has changed by itself does not keep the alarm of all open
+            moved = state.changes.active[members].any() and abs(change) > RECOVERED * self._common_limit
+            if not (still or moved):  # a change of one element alone does not keep the alarm of all open
                 return _closed(alarm, now)
-            return self._followed(alarm, change, std)
+            return self._updated(alarm, change, std)
         i = self.names.index(name)
         if state.changes.active[i] == 0:
             return _closed(alarm, now)
-        return self._followed(alarm, float(drift.change[i]), float(drift.std[i]))
+        return self._updated(alarm, float(drift.change[i]), float(drift.std[i]))
 
     def _common_changes(self, state: TrackerState, share: float = 1.0) -> list[tuple[str, float, float]]:
-        """Kinds that moved as no weather does: name, change and its standard deviation.
+        """Kinds that changed more than weather can explain: name, change and its standard deviation.
 
-        share: of what opens an alarm.  Kinds of one quantity that move alike are one.
+        share: of the limits that open an alarm.  Kinds of one quantity that changed alike are reported as one.
         """
         weather, model = state.weather, self.weather
         if weather is None or not model.groups:
             return []
-        odd = weathers.unusual(weather, model, share)
+        odd = weathers.beyond_weather(weather, model, share)
         if not odd.any():
             return []
-        out, told = [], set()
+        out, names = [], set()
         for g in np.flatnonzero(odd).tolist():
             quantity = self.kinds[int(np.flatnonzero(model.group == g)[0])]
             alike = [o for o in range(model.groups) if self.kinds[int(np.flatnonzero(model.group == o)[0])] == quantity]
             everything = all(weather.common[o] * weather.common[g] > 0.25 * weather.common[g] ** 2 for o in alike)
             name = f"*.{quantity}" if everything else self._kind_name(g)
-            if name not in told:
-                told.add(name)
+            if name not in names:
+                names.add(name)
                 change = float(np.expm1(np.mean(weather.common[alike if everything else [g]])))
                 out.append((name, change, float(np.sqrt(weather.variance[g]))))
         return out
 
     def _kind_name(self, group: int) -> str:
-        """`primary_*.damping`: what the names of a kind have in common."""
+        """Pattern of the names of a kind, `primary_*.damping`."""
         members = [self.names[i] for i in np.flatnonzero(self.weather.group == group)]
         quantity = members[0].rpartition(".")[2]
         letters = zip(*(m.rpartition(".")[0] for m in members), strict=False)
@@ -167,7 +168,7 @@ class Attribution:
     def _with_common(
         self, alarms: list[Alarm], common: list[tuple[str, float, float]], drift: Drift, now: int
     ) -> list[Alarm]:
-        """Opens one alarm for a kind that moved together."""
+        """Opens one alarm for each kind whose elements changed together."""
         opened = [a.parameter or "" for a in alarms if a.closed is None and a.kind == "change"]
         whole = replace(drift, change=drift.whole)
         out = list(alarms)
@@ -177,11 +178,11 @@ class Attribution:
             members = np.flatnonzero([fnmatchcase(n, name) for n in self.names])
             heavier = self._masses_of(members.tolist(), whole)
             alarm = Alarm("change", name, now, now, "warning", 0.0, 0.0, 0.0, alternatives=heavier)
-            out.append(self._followed(alarm, change, std))
+            out.append(self._updated(alarm, change, std))
         return out
 
     def _overloads(self, state: TrackerState, certain: float = CERTAIN) -> dict[str, tuple[float, float]]:
-        """Bodies that carry more, or less, than they may: by how much of the empty mass, and its standard deviation."""
+        """Bodies whose load is beyond its limits: excess relative to the empty mass, and its standard deviation."""
         found = {}
         H = len(self.deviations)
         for h, deviation in enumerate(self.deviations):
@@ -194,7 +195,7 @@ class Attribution:
                 found[deviation.name] = (excess, std * float(np.exp(value)))
         return found
 
-    def _load_followed(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
+    def _load_updated(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
         body = (alarm.parameter or "").removesuffix(".load")
         found = self._overloads(state, 0.0).get(body)
         return _closed(alarm, now) if found is None else self._overload(alarm, *found)
@@ -204,7 +205,7 @@ class Attribution:
         return replace(alarm, change=excess, std=std, peak=peak)
 
     def _with_changes(self, alarms: list[Alarm], state: TrackerState, drift: Drift, now: int) -> list[Alarm]:
-        """Opens alarms of parameters whose test has left the baseline."""
+        """Opens alarms of parameters whose change test has fired."""
         alarmed = {alarm.parameter for alarm in alarms if alarm.closed is None and alarm.kind == "change"}
         out = list(alarms)
         for i in np.flatnonzero(state.changes.active).tolist():
@@ -212,7 +213,7 @@ class Attribution:
             members = self._of_kind(self.kinds[i])
             kinds = [name for name in alarmed if name and "*" in name and fnmatchcase(self.names[i], name)]
             whole = replace(drift, change=drift.whole)
-            along = self._moves_along(int(i), whole, members)
+            along = self._changed_with(int(i), whole, members)
             if self.names[i] in alarmed or (kinds and along):
                 continue
             since = state.changes.up_since if state.changes.active[i] > 0 else state.changes.down_since
@@ -221,7 +222,7 @@ class Attribution:
                 continue
             others = (*others, *self._masses_of([int(i)], whole))
             name, change, std = self.names[i], float(drift.change[i]), float(drift.std[i])
-            if not kinds and along and self._all_move(whole, members):
+            if not kinds and along and self._all_changed(whole, members):
                 name, (change, std), others = (
                     together,
                     _common(whole, members),
@@ -229,51 +230,51 @@ class Attribution:
                 )
             alarm = Alarm("change", name, int(since[i]), now, "warning", 0.0, 0.0, 0.0, alternatives=others)
             alarmed.add(name)
-            out.append(self._followed(alarm, change, std))
+            out.append(self._updated(alarm, change, std))
         return out
 
     def _of_kind(self, kind: str) -> IntArray:
         return np.flatnonzero([k == kind for k in self.kinds])
 
-    def _all_move(self, drift: Drift, members: IntArray) -> bool:
-        """Whether all elements of a kind have changed alike."""
+    def _all_changed(self, drift: Drift, members: IntArray) -> bool:
+        """Whether most of `members` have changed alike, and significantly."""
         known = members[np.isfinite(drift.change[members])]
         if len(known) < FEWEST:
             return False
         middle, std = _common(drift, known)
-        with_it = np.array([self._moves_along(i, drift, known) for i in known])
-        return bool(with_it.mean() >= MOST_OF and abs(middle) > max(self._least_together, 4 * std))
+        with_it = np.array([self._changed_with(i, drift, known) for i in known])
+        return bool(with_it.mean() >= MOST_OF and abs(middle) > max(self._common_limit, 4 * std))
 
     @property
-    def _least_together(self) -> float:
-        """Change that all elements of a kind must show for an alarm of theirs: a middle is surer than one element."""
+    def _common_limit(self) -> float:
+        """Common change that opens an alarm of a kind; a median is more precise than one element."""
         return self.settings.change / 4
 
     def _masses_of(self, changed: Sequence[int], drift: Drift) -> tuple[str, ...]:
-        """Masses that would explain what `changed` as well: of bodies at which all springs and dampers did alike."""
+        """Masses that explain the changes of `changed`, too: all springs and dampers at the body changed alike."""
         found = []
         for body, elements in self.masses.items():
             at = np.flatnonzero([n.rpartition(".")[0] in elements for n in self.names])
-            if np.isin(changed, at).any() and len({self.kinds[k] for k in at}) > 1 and self._all_move(drift, at):
+            if np.isin(changed, at).any() and len({self.kinds[k] for k in at}) > 1 and self._all_changed(drift, at):
                 found.append(f"{body}.mass")
         return tuple(found)
 
-    def _moves_along(self, i: int, drift: Drift, members: IntArray) -> bool:
+    def _changed_with(self, i: int, drift: Drift, members: IntArray) -> bool:
         middle, std = _common(drift, members)
-        apart = abs(drift.change[i] - middle)
-        return bool(apart < max(ALIKE * abs(middle), 3 * float(np.hypot(drift.std[i], std))))
+        distance = abs(drift.change[i] - middle)
+        return bool(distance < max(ALIKE * abs(middle), 3 * float(np.hypot(drift.std[i], std))))
 
     def _alternatives(self, i: int, state: TrackerState, drift: Drift, since: int, now: int) -> tuple[str, ...] | None:
-        """Deviations that would explain the change of parameter `i` as well; None: too early to say.
+        """Deviations that explain the change of parameter `i` equally well; None: not decided yet.
 
-        The parameters are profiled out of the evidence on deviations: what it says of one does not depend on springs.
+        The parameters are profiled out of the evidence on deviations: it does not depend on changes of springs.
         """
         if not self.deviations:
             return ()
         calibration = state.calibration
-        if calibration.recent[-1] == 0:  # estimates that never speak of deviations
+        if calibration.recent[-1] == 0:  # estimates without information on deviations
             return ()
-        undecided = calibration.recent[0] < since or calibration.ratio.max(initial=0.0) >= dev.POINTING
+        undecided = calibration.recent[0] < since or calibration.ratio.max(initial=0.0) >= dev.SUSPECTED
         if undecided and (now - since) * 1e-9 < PATIENCE:
             return None
         moved = np.log1p(drift.change[i])
@@ -282,7 +283,7 @@ class Attribution:
             slope = calibration.cross[i, h]
             if deviation.kind not in LARGEST or calibration.curvature[h] <= 0 or slope == 0:
                 continue
-            needed = moved / -slope  # a reading that is too large by this moves the estimate so
+            needed = moved / -slope  # deviation that shifts the estimate by this much
             std = calibration.curvature[h] ** -0.5
             seen = calibration.slope[h] / calibration.curvature[h]
             if (
@@ -301,27 +302,27 @@ class Attribution:
         alarm = Alarm("sensor", name, jump.since, now, "warning", jump.size, None, jump.size)
         return [*alarms, alarm]
 
-    def _crept(self, state: TrackerState) -> list[MeasurementFault]:
-        """Gains and delays that are no longer those of the baseline by more than electronics do."""
+    def _drifted(self, state: TrackerState) -> list[MeasurementFault]:
+        """Gains and delays that have left the reference of the baseline by more than electronics drift."""
         if not self.deviations:
             return []
-        off, far = dev.crept(state.calibration, self.model, state.belief)
+        off, far = dev.drifted(state.calibration, self.model, state.belief)
         return list(named(self.deviations, off, np.zeros(len(off)), far)) if far.any() else []
 
-    def _with_crept(
-        self, alarms: list[Alarm], crept: list[MeasurementFault], state: TrackerState, now: int
+    def _with_drifted(
+        self, alarms: list[Alarm], drifted: list[MeasurementFault], state: TrackerState, now: int
     ) -> list[Alarm]:
-        """Opens alarms of gains and delays that crept away, those apart that jumped, or are told with others."""
-        told = {
+        """Opens alarms of gains and delays that drifted away, unless an open alarm contains them."""
+        reported = {
             (channel, kind)
             for a in alarms
             if a.closed is None and a.kind == "sensor"
             for names, _, kind in [(a.parameter or "").rpartition(".")]
             for channel in names.split("|")
         }
-        fresh = [f for f in crept if not all((channel, f.kind) in told for channel in f.channel.split("|"))]
+        fresh = [f for f in drifted if not all((channel, f.kind) in reported for channel in f.channel.split("|"))]
         return alarms + [
-            self._sensor_followed(Alarm("sensor", f"{f.channel}.{f.kind}", now, now, "warning"), state, now)
+            self._sensor_updated(Alarm("sensor", f"{f.channel}.{f.kind}", now, now, "warning"), state, now)
             for f in fresh
         ]
 
@@ -329,27 +330,27 @@ class Attribution:
         channels = [d.name for d, part in zip(self.deviations, direction, strict=True) if part]
         return f"{'|'.join(channels)}.{kind}"
 
-    def _sensor_followed(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
+    def _sensor_updated(self, alarm: Alarm, state: TrackerState, now: int) -> Alarm:
         channel, _, kind = (alarm.parameter or "").rpartition(".")
-        if kind in HARD:
+        if kind in HARD_FAULTS:
             there = any(s.channel == channel and s.kind == kind for s in state.stuck)
             return alarm if there else _closed(alarm, now)
         members = [h for h, d in enumerate(self.deviations) if d.kind == kind and d.name in channel.split("|")]
         if not members:
             return _closed(alarm, now)
         H = len(self.deviations)
-        apart = state.belief.mean[-H:] - state.calibration.reference
+        away = state.belief.mean[-H:] - state.calibration.reference
         others = ~np.isin(np.arange(H), members)
-        off = float(np.mean((apart - self.model.common(apart, others))[members]))
+        off = float(np.mean((away - self.model.common_value(away, others))[members]))
         own = self.model.relative_std(state.belief.covariance[-H:, -H:])[members]
-        # That of the baseline is known as well as this one, or wrong by what is no straying yet.
-        strays = dev.STRAYED / 3 * self.model.crept[members]
-        of_baseline = np.where(state.calibration.moved[members] > 0, own, strays)
+        # The reference is as uncertain as the present value, or wrong by a drift that is not detected yet.
+        undetected = dev.DRIFT_SHARE / 3 * self.model.drift_limit[members]
+        of_reference = np.where(state.calibration.moved[members] > 0, own, undetected)
         known = float(np.sqrt(np.mean(own**2)))
-        spread = float(np.mean(own**2 + of_baseline**2 + dev.pending(state.calibration, self.model)[members]))
-        bent = float(dev.bending(np.asarray(off))) if kind == "gain" else 0.0
-        std = float(np.hypot(np.sqrt(spread), bent))
-        if abs(off) + 2 * known < max(dev.JUMPED[kind], MENDED * abs(alarm.peak or 0.0)):
+        spread = float(np.mean(own**2 + of_reference**2 + dev.pending_variance(state.calibration, self.model)[members]))
+        linear = float(dev.linearisation_std(np.asarray(off))) if kind == "gain" else 0.0
+        std = float(np.hypot(np.sqrt(spread), linear))
+        if abs(off) + 2 * known < max(dev.JUMP_LIMIT[kind], SENSOR_RECOVERED * abs(alarm.peak or 0.0)):
             return _closed(replace(alarm, change=off, std=std), now)
         peak = off if abs(off) > abs(alarm.peak or 0.0) else alarm.peak
         return replace(alarm, change=off, std=std, peak=peak)
@@ -359,10 +360,10 @@ class Attribution:
         return alarms + [
             Alarm("sensor", f"{s.channel}.{s.kind}", s.since, now, "warning", s.value)
             for s in state.stuck
-            if s.count >= WINDOWS and f"{s.channel}.{s.kind}" not in opened
+            if s.count >= HARD_FAULT_WINDOWS and f"{s.channel}.{s.kind}" not in opened
         ]
 
-    def _followed(self, alarm: Alarm, change: float, std: float) -> Alarm:
+    def _updated(self, alarm: Alarm, change: float, std: float) -> Alarm:
         """An active alarm with its change as it is now; severity falls only with hysteresis."""
         limit = self.settings.alarm_change
         if alarm.severity == "alarm":
@@ -379,7 +380,7 @@ class Attribution:
 
 
 def _closed(alarm: Alarm, now: int) -> Alarm:
-    """Closed now, or when it was opened if a clock that was wrong then says that this is later."""
+    """Closed now, but not before it was opened: a wrong clock may have dated the opening later."""
     return replace(alarm, closed=max(now, alarm.opened))
 
 
@@ -389,14 +390,16 @@ def _common(drift: Drift, members: IntArray) -> tuple[float, float]:
     return float(np.nanmedian(change)), float(1.25 * np.sqrt(np.nanmean(std**2) / len(members)))
 
 
-def counted(stuck: Sequence[Stuck], said: Sequence[tuple[str, FaultKind, float]], time: int) -> tuple[Stuck, ...]:
-    """Counts of frozen, saturated, reversed and exchanged channels after a window that said so of some."""
+def counted(stuck: Sequence[Stuck], found: Sequence[tuple[str, FaultKind, float]], time: int) -> tuple[Stuck, ...]:
+    """Counts of frozen, saturated, reversed and exchanged channels after a window that found some."""
     old = {(s.channel, s.kind): s for s in stuck}
-    now: dict[tuple[str, FaultKind], float] = {(channel, kind): value for channel, kind, value in said if kind in HARD}
+    now: dict[tuple[str, FaultKind], float] = {
+        (channel, kind): value for channel, kind, value in found if kind in HARD_FAULTS
+    }
     out = []
     for key in dict.fromkeys([*old, *now]):
         s = old.get(key) or Stuck(key[0], key[1], now[key], 0, time)
-        count = min(s.count + 1, 2 * WINDOWS) if key in now else s.count - 1
+        count = min(s.count + 1, 2 * HARD_FAULT_WINDOWS) if key in now else s.count - 1
         if count > 0:
             out.append(replace(s, count=count, value=now.get(key, s.value)))
     return tuple(out)

@@ -1,8 +1,8 @@
-"""Loads: what air-spring pressure says of them, and when one is beyond what the system file allows.
+"""Loads from air-spring pressures.
 
-The pressure of an air spring is in proportion to the weight on it, so log p = a + log(loaded mass / empty mass).  The
-constant a is learned: every ride between two stops gives one value of it, from what the windows alone said of the
-load.  From then on the pressure at the next departure is the load's prior, and with it the load is known at once.
+The pressure of an air spring is proportional to the weight on it: log p = a + log(loaded mass / empty mass).  The
+constant a is learned: every ride between two stops gives one value of it, from the load that the windows alone
+determine.  Afterwards the pressure at a departure is the prior of the load, which is then known from the first window.
 
 L loads.
 """
@@ -16,23 +16,23 @@ import numpy as np
 from sprung.model.signals import FloatArray
 
 GAUGE = 0.015  # of a pressure: hysteresis of levelling valves and the gauge
-UNKNOWN = 1e6  # variance of a constant that nothing is known of
+UNKNOWN = 1e6  # variance of a constant before the first ride
 MEMORY = 0.05  # weight of the newest window's pressure in the mean of a ride
-BELIED = 4.0  # standard deviations of what windows say against a pressure from which on it is not believed
-CAUGHT = 3.0  # standard deviations of one ride that a gauge as good as stated errs by at most
-SOON = 0.3  # weight of the newest ride in how wrong a gauge has been
+CONTRADICTION = 4.0  # standard deviations between windows and a pressure from which on the pressure is discarded
+GAUGE_LIMIT = 3.0  # standard deviations of one ride beyond which the gauge is less accurate than stated
+SCATTER_MEMORY = 0.3  # weight of the newest ride in the additional variance of a gauge
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cargo:
-    """The constants of the pressures, and this ride so far."""
+    """Constants of the pressures, and the current ride."""
 
     constant: FloatArray  # a, shape (L,)
     variance: FloatArray  # of it, shape (L,)
     pressure: FloatArray  # logarithm of the mean pressure of this ride, NaN: none, shape (L,)
     prior: FloatArray  # of the load's logarithm at departure, shape (L,)
     prior_variance: FloatArray  # shape (L,)
-    scatter: FloatArray  # variance of a pressure beyond that of a good gauge, as rides have shown it, shape (L,)
+    scatter: FloatArray  # variance of a pressure beyond GAUGE, estimated from rides, shape (L,)
 
 
 def start(prior_variance: FloatArray) -> Cargo:
@@ -41,59 +41,59 @@ def start(prior_variance: FloatArray) -> Cargo:
     return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero)
 
 
-def arrived(cargo: Cargo, load: FloatArray, variance: FloatArray) -> Cargo:
-    """At the end of a ride after which the loads (L,) were believed with `variance`: constants learn from it."""
-    seen, told = _of_windows(cargo, load, variance)
-    fit = np.isfinite(cargo.pressure) & (told > 1 / 0.03**2)
-    told = np.where(fit, told, 1.0)
-    noise = 1 / told + GAUGE**2
+def after_ride(cargo: Cargo, load: FloatArray, variance: FloatArray) -> Cargo:
+    """Constants learned from a ride at whose end the loads (L,) are known with `variance`."""
+    seen, information = _of_windows(cargo, load, variance)
+    fit = np.isfinite(cargo.pressure) & (information > 1 / 0.03**2)
+    information = np.where(fit, information, 1.0)
+    noise = 1 / information + GAUGE**2
     gain = np.where(fit, cargo.variance / (cargo.variance + noise + cargo.scatter), 0.0)
     off = np.where(fit, cargo.pressure, 0.0) - seen - cargo.constant
-    beyond = np.maximum(off**2 - CAUGHT**2 * (cargo.variance + noise), 0.0)
+    beyond = np.maximum(off**2 - GAUGE_LIMIT**2 * (cargo.variance + noise), 0.0)
     return replace(
         cargo,
         constant=cargo.constant + gain * off,
         variance=(1 - gain) * cargo.variance,
-        scatter=cargo.scatter + np.where(fit, SOON, 0.0) * (beyond - cargo.scatter),
+        scatter=cargo.scatter + np.where(fit, SCATTER_MEMORY, 0.0) * (beyond - cargo.scatter),
     )
 
 
 def contradicted(cargo: Cargo, load: FloatArray, variance: FloatArray, open_: FloatArray) -> bool:
-    """Whether windows speak against what a pressure said at departure; loads (L,) are believed with `variance` now.
+    """Whether windows contradict the pressure at departure; loads (L,) are known with `variance` now.
 
-    open_: variances (L,) of loads of which no pressure speaks.
+    open_: variances (L,) of loads without a pressure.
     """
-    seen, told = _of_windows(cargo, load, variance)
-    said = (cargo.prior_variance < 0.5 * open_) & (told > 0)
-    spread = cargo.prior_variance + 1 / np.where(said, told, 1.0)
-    return bool(np.any(said & ((seen - cargo.prior) ** 2 > BELIED**2 * spread)))
+    seen, information = _of_windows(cargo, load, variance)
+    measured = (cargo.prior_variance < 0.5 * open_) & (information > 0)
+    spread = cargo.prior_variance + 1 / np.where(measured, information, 1.0)
+    return bool(np.any(measured & ((seen - cargo.prior) ** 2 > CONTRADICTION**2 * spread)))
 
 
 def _of_windows(cargo: Cargo, load: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """What windows alone have said of the loads since departure, (L,), and their information."""
+    """Loads (L,) that windows alone determine since departure, and their information (inverse variance)."""
     precision = 1 / np.maximum(variance, 1e-12)
-    told = precision - 1 / cargo.prior_variance
-    seen = (load * precision - cargo.prior / cargo.prior_variance) / np.where(told > 0, told, 1.0)
-    return seen, told
+    information = precision - 1 / cargo.prior_variance
+    seen = (load * precision - cargo.prior / cargo.prior_variance) / np.where(information > 0, information, 1.0)
+    return seen, information
 
 
-def departed(cargo: Cargo, pressure: FloatArray, prior: FloatArray) -> Cargo:
-    """Before a ride: prior of the loads, variances `prior` (L,) where pressures (L,), Pa, do not say more."""
+def before_ride(cargo: Cargo, pressure: FloatArray, prior: FloatArray) -> Cargo:
+    """Prior of the loads at departure: pressures (L,), Pa or NaN, combined with variances `prior` (L,)."""
     logarithm = _log(pressure)
     variance = cargo.variance + GAUGE**2 + cargo.scatter
-    said = np.where(np.isfinite(logarithm), logarithm - cargo.constant, 0.0)
+    measured = np.where(np.isfinite(logarithm), logarithm - cargo.constant, 0.0)
     weight = np.where(np.isfinite(logarithm), 1 / variance, 0.0)
     total = weight + 1 / prior
-    return replace(cargo, pressure=logarithm, prior=weight * said / total, prior_variance=1 / total)
+    return replace(cargo, pressure=logarithm, prior=weight * measured / total, prior_variance=1 / total)
 
 
-def felt(cargo: Cargo, pressure: FloatArray) -> Cargo:
-    """During a ride: its mean pressure."""
+def during_ride(cargo: Cargo, pressure: FloatArray) -> Cargo:
+    """Mean pressure of the current ride, updated by pressures (L,), Pa or NaN."""
     if np.isnan(pressure).all():
         return cargo
     logarithm = _log(pressure)
-    moved = np.where(np.isfinite(cargo.pressure), cargo.pressure + MEMORY * (logarithm - cargo.pressure), logarithm)
-    return replace(cargo, pressure=np.where(np.isfinite(moved), moved, cargo.pressure))
+    mean = np.where(np.isfinite(cargo.pressure), cargo.pressure + MEMORY * (logarithm - cargo.pressure), logarithm)
+    return replace(cargo, pressure=np.where(np.isfinite(mean), mean, cargo.pressure))
 
 
 def _log(pressure: FloatArray) -> FloatArray:

@@ -1,8 +1,8 @@
 """Kalman filter over level and rate of every log-ratio, with full covariance.
 
-State (2P + H,): levels first, then rates, then deviations of the measurements (see `model.tracking.deviations`; none
-unless the tracker was told of them).  One window measures the identifiable levels with the correlated errors that
-its covariance states.  Robust: influence of a component, and of the window as a whole, is bounded.
+State (2P + H,): levels first, then rates, then deviations of measurements and loads (`model.tracking.deviations`; none
+by default).  One window measures the identifiable levels with the correlated errors that its covariance states.
+Robust: the influence of a component, and of the window as a whole, is bounded.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """What a window said beyond the prediction."""
+    """Difference between a window and its prediction."""
 
     score: FloatArray  # in standard deviations of prediction and one window, shape (P,); NaN: not measured
     bounded: bool  # the window as a whole lies too far out, and its influence was bounded
@@ -125,10 +125,10 @@ def correct(
     covariance: FloatArray,  # of one window, scatter included, shape (P, P)
     mask: BoolArray,  # components that the window measures, shape (P,)
     *,
-    share: float,  # of the window that no earlier window saw, in (0, 1]
+    share: float,  # of the window that no earlier window contains, in (0, 1]
     bound: float,  # standard deviations beyond which influence no longer grows
-    cross: FloatArray | None = None,  # change of `value` per deviation, shape (P, H); taken at the believed ones
-    silent: BoolArray | None = None,  # deviations (H,) of which the window says nothing, though they move it
+    cross: FloatArray | None = None,  # sensitivity of `value` to the deviations, shape (P, H)
+    considered: BoolArray | None = None,  # deviations (H,) that the window depends on but does not estimate
 ) -> tuple[Belief, Innovation]:
     """Belief after one window.
 
@@ -157,8 +157,8 @@ def correct(
     noise = noise * (max(1.0, distance / limit) / share)
     gain = _solve(own + noise, across.T).T
     posterior = belief.covariance - gain @ across.T
-    if silent is not None:  # Schmidt's filter: what is silent stays as it is, its covariance with the levels does not
-        kept = 2 * belief.size + np.flatnonzero(silent)
+    if considered is not None:  # Schmidt-Kalman filter: their mean and covariance stay, cross-covariances are updated
+        kept = 2 * belief.size + np.flatnonzero(considered)
         posterior[np.ix_(kept, kept)] = belief.covariance[np.ix_(kept, kept)]
         gain[kept] = 0.0
     posterior = 0.5 * (posterior + posterior.T)
@@ -175,9 +175,9 @@ def _solve(matrix: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def reopen(belief: Belief, variance: FloatArray, process: ProcessNoise) -> Belief:
-    """Forgets what was known of levels whose `variance` (P,) is positive: their value has jumped.
+    """Adds `variance` (P,) to levels that have jumped, where it is positive (covariance reset).
 
-    The rate starts anew from its stationary law, uncorrelated with everything else.
+    The rate restarts from its stationary distribution, uncorrelated with everything else.
     """
     p = belief.size
     rows = np.flatnonzero(variance > 0)

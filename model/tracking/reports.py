@@ -1,4 +1,4 @@
-"""Where a vehicle stands: every parameter in physical units, and its health."""
+"""State of a vehicle in physical units: every parameter, and its health."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from sprung.model.signals import BoolArray, FloatArray
-from sprung.model.tracking.alarms import HARD, Drift
+from sprung.model.tracking.alarms import HARD_FAULTS, Drift
 from sprung.model.tracking.fusion import KNOWN
 from sprung.model.tracking.settings import TrackerSettings
 from sprung.model.tracking.state import Health, TrackerState
@@ -28,7 +28,7 @@ class ParameterLike(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class ParameterReport:
-    """Where one parameter stands."""
+    """Value of one parameter, against nominal and against the vehicle's baseline."""
 
     name: str
     unit: str
@@ -56,7 +56,7 @@ def reported(
     """Every parameter in physical units, against nominal and against the vehicle's own baseline.
 
     base: log-ratios to nominal of the healthy state, (P,); doubt: variance of all log-ratios (P,) that is the same in
-    all windows, and so no part of changes.
+    all windows: part of the stated uncertainty, not of that of changes.
     """
     log_std = np.sqrt(state.belief.level_variance + doubt)
     nominal = np.array([parameter.nominal for parameter in parameters])
@@ -65,8 +65,8 @@ def reported(
     since = (healthy, healthy * np.sqrt(state.changes.baseline_variance), drift.whole, drift.std)
     learned = (state.changes.learned >= settings.learning).tolist()
     return tuple(
-        ParameterReport(p.name, p.unit, p.nominal, *standing, *(changed if known else _LEARNING))
-        for p, standing, changed, known in zip(parameters, _rows(now), _rows(since), learned, strict=True)
+        ParameterReport(p.name, p.unit, p.nominal, *present, *(changed if known else _LEARNING))
+        for p, present, changed, known in zip(parameters, _rows(now), _rows(since), learned, strict=True)
     )
 
 
@@ -80,13 +80,13 @@ _LEARNING = (None, None, None, None)  # baseline and drift, with their deviation
 def health_of(state: TrackerState, settings: TrackerSettings) -> Health:
     """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M.
 
-    A vehicle of which nothing came, or too little lately that could be used, is not monitored: check function.
+    A vehicle without windows, or with too few usable ones of late, is not monitored: check function.
     """
     changes = [abs(alarm.change or 0.0) for alarm in state.active if alarm.kind == "change"]
     severities = {(alarm.kind, alarm.severity) for alarm in state.active}
     if max(changes, default=0.0) >= settings.failure_change:
         return "failure"
-    broken = any(a.kind == "sensor" and (a.parameter or "").endswith(HARD) for a in state.active)
+    broken = any(a.kind == "sensor" and (a.parameter or "").endswith(HARD_FAULTS) for a in state.active)
     if broken or any(kind == "misfit" for kind, _ in severities) or not state.coverage.monitored:
         return "check_function"
     if ("change", "alarm") in severities:

@@ -16,6 +16,7 @@ from sprung.model.tracking import deviations
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.changes import Changes
 from sprung.model.tracking.coverage import Coverage
+from sprung.model.tracking.deviation_model import model_of
 from sprung.model.tracking.deviations import DeviationRecord
 from sprung.model.tracking.filter import Belief
 from sprung.model.tracking.inflation import VarianceInflation
@@ -196,9 +197,9 @@ def _belief(data: Mapping[str, Any]) -> Belief:
 
 
 def _calibration(data: Mapping[str, Any]) -> DeviationRecord:
-    """Format 1, and a tracker that was not told of deviations, have none."""
+    """Format 1, and trackers without deviations, have none."""
     if "calibration" not in data:
-        return deviations.start(len(data["names"]), deviations.model_of(()))
+        return deviations.start(len(data["names"]), model_of(()))
     arrays = _unpack_all(data["calibration"])
     arrays.setdefault("origin", np.full(len(arrays["reference"]), np.nan))
     shape = len(data["names"]), len(arrays["reference"])

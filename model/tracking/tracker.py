@@ -19,12 +19,14 @@ from sprung.model.tracking import coverage, inflation, innovation, misfit
 from sprung.model.tracking import deviations as dev
 from sprung.model.tracking import filter as kalman
 from sprung.model.tracking import weather as weathers
-from sprung.model.tracking.alarms import WINDOWS, Attribution, LoadLimit, counted
-from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds, proper
+from sprung.model.tracking.alarms import HARD_FAULT_WINDOWS, Attribution, LoadLimit, counted
+from sprung.model.tracking.deviation_model import model_of as deviation_model
+from sprung.model.tracking.fusion import KNOWN, Fusion, nanoseconds
 from sprung.model.tracking.reports import ParameterLike, ParameterReport, health_of, reported
 from sprung.model.tracking.settings import TrackerSettings, TrackerSettingsError
 from sprung.model.tracking.state import Alarm, Health, Stuck, TrackerState, TrackerStateError
 from sprung.model.tracking.weather import WeatherModel
+from sprung.model.tracking.window import is_covariance
 
 __all__ = [
     "Alarm",
@@ -37,15 +39,15 @@ __all__ = [
     "TrackerStateError",
 ]
 
-MOVING = 10.0  # m/s, from which on wheels move on any track: inputs that are still are not measured
-CRAWLING = 5.0  # m/s, below which a vehicle need not be watched either: nothing shakes it
+MOVING = 10.0  # m/s, above which wheels move on any track: inputs without motion are not measured
+CRAWLING = 5.0  # m/s, below which a vehicle need not be monitored: there is no excitation
 
 
 class Tracker:
     """Fuses window estimates of `parameters` (P of them, in the order of the estimates).
 
-    deviations: gains, delays and loads that estimates may speak of (H of them, see `Estimate.deviating`); with none,
-    what the system file says is taken as it stands.
+    deviations: gains, delays and loads that estimates may contain (H of them, see `Estimate.deviating`); without them
+    the values of the system file are taken as exact.
     """
 
     def __init__(
@@ -58,11 +60,11 @@ class Tracker:
         doubt: tuple[FloatArray, FloatArray] | None = None,
         masses: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
     ) -> None:
-        """weather: what conditions do to parameters, by their names unless given; limits: of loads, by body.
+        """weather: effects of conditions on parameters, by default from their names; limits: of loads, by body.
 
-        doubt: variance of the log-ratios (P,), and covariance of the deviations (H, H), that no window will ever take
-        away, since all have it alike: masses that are not quite those of the file.  It is part of what is stated, not
-        of changes.  masses: bodies whose mass is the scale of what is estimated, and the elements at them.
+        doubt: variance of the log-ratios (P,), and covariance of the deviations (H, H), of an error that is the same in
+        all windows, as that of the masses in the system file: part of the stated uncertainty, not of that of changes.
+        masses: bodies whose mass scales what is estimated, and the elements at them.
         """
         if not parameters:
             raise TrackerSettingsError("a tracker needs at least one parameter to estimate")
@@ -70,7 +72,7 @@ class Tracker:
         self.names = tuple(parameter.name for parameter in self.parameters)
         self.settings = settings or TrackerSettings()
         self.deviations = tuple(deviations)
-        self.model = dev.model_of(self.deviations)
+        self.model = deviation_model(self.deviations)
         nominal = [parameter.nominal for parameter in self.parameters]
         self.weather = weather or weathers.model_of(self.names, nominal)
         self._doubt = doubt or (np.zeros(len(self.names)), np.zeros((self.model.size, self.model.size)))
@@ -102,8 +104,8 @@ class Tracker:
             cargo=cargos.start(np.diag(self.model.prior)[self.model.loads]),
         )
 
-    def newcomer(self, others: Iterable[TrackerState]) -> TrackerState:
-        """Nothing seen yet, but what other vehicles of the system have learned of weather, load and speed."""
+    def initial_state_from(self, others: Iterable[TrackerState]) -> TrackerState:
+        """Initial state with the effects of weather, load and speed that other vehicles of the system have learned."""
         known = [s.weather for s in others if s.weather is not None and s.names == self.names]
         whole = [w for w in known if len(w.common) == self.weather.groups]
         return replace(self.initial_state(), weather=weathers.start(weathers.pooled(self.weather, whole)))
@@ -113,17 +115,17 @@ class Tracker:
     ) -> TrackerState:
         """State after the window that starts at `time_ns`; a window not later than the last is ignored.
 
-        One without excitation speaks neither for nor against anything: it only passes the time.  One that does not
-        fit in a curve is passed over likewise, where curves are measured.
+        A window without excitation carries no information: only the time advances.  The same holds for one that does
+        not fit in a curve, where curves are measured.
         """
         self._check(state, estimate)
-        state = self.whole(state)
+        state = self.upgraded(state)
         if state.time is not None and time_ns <= state.time:
             return state
         centre = time_ns + nanoseconds(self.settings.window / 2)
         curving = conditions is not None and conditions.curving and not estimate.adequate
         if curving or not estimate.informative:
-            return self._passed_over(state, estimate, time_ns, centre, conditions)
+            return self._skipped(state, estimate, time_ns, centre, conditions)
         stuck = _stuck(state, estimate, centre)
         usable = estimate.adequate and estimate.converged
         mask = estimate.identifiable & np.isfinite(estimate.log_ratio)
@@ -131,14 +133,14 @@ class Tracker:
         if (
             usable
             and mask.any()
-            and not self._fusion.bent(state, estimate)
-            and proper(estimate.covariance if mask.all() else estimate.covariance[mask][:, mask])
+            and not self._fusion.effects.too_large(state, estimate)
+            and is_covariance(estimate.covariance if mask.all() else estimate.covariance[mask][:, mask])
         ):
             new, jump = self._fusion.fuse(state, estimate, mask, time_ns, centre, conditions)
-        if usable or not estimate.faults:  # a window whose fault is named is not a riddle
+        if usable or not estimate.faults:  # an identified sensor fault is no misfit of the model
             fit = misfit.update(
                 state.fit,
-                self._fusion.chi_square(new, estimate),
+                self._fusion.effects.chi_square(new, estimate),
                 adequate=estimate.adequate,
                 inflation=float(new.inflation.factor.max()),
                 time=centre,
@@ -146,17 +148,17 @@ class Tracker:
             new = replace(new, fit=fit)
         seen = coverage.update(state.coverage, usable=new.used > state.used)
         new = replace(new, time=time_ns, stuck=stuck, coverage=seen)
-        told = jump if jump is not None and self._fusion.armed(state) else None
-        return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), told, centre))
+        jump = jump if self._fusion.armed(state) else None
+        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), jump, centre))
 
-    def _passed_over(
+    def _skipped(
         self, state: TrackerState, estimate: Estimate, time_ns: int, centre: int, conditions: Conditions | None
     ) -> TrackerState:
-        """State after a window that speaks neither for nor against anything.
+        """State after a window that carries no information.
 
-        Nobody can watch a vehicle that stands.  One that runs is not watched meanwhile: where inputs are still though
-        it is fast, or frozen, and where a window does not fit in a curve; a yaw rate whose zero is off makes every
-        window one.  Where it runs too slowly to tell anything, what was told last holds for a while.
+        A vehicle at standstill counts as monitored.  A running one does not where its inputs show no motion or are
+        frozen, or where windows do not fit in a curve (with a zero error of the yaw rate every window is a curve).
+        Where it runs too slowly for an estimate, the last one stays valid for a while.
         """
         speed = np.nan if conditions is None else conditions.speed
         runs = estimate.informative or speed > MOVING or bool(estimate.faults)
@@ -166,16 +168,16 @@ class Tracker:
         if estimate.informative or not estimate.faults:
             return new
         new = replace(new, stuck=_stuck(state, estimate, centre))
-        return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), None, centre))
+        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), None, centre))
 
-    def whole(self, state: TrackerState) -> TrackerState:
-        """One of an older format, or of a pooled prior that is gone, knows nothing of weather, pressures, centres.
+    def upgraded(self, state: TrackerState) -> TrackerState:
+        """The state with everything that this tracker follows: older formats lack weather, pressures, body constants.
 
-        Errors: `TrackerStateError` for one that knows of more than this tracker.
+        Errors: `TrackerStateError` for a state with more deviations than this tracker has.
         """
         if state.belief.deviations > self.model.size:
             raise TrackerStateError("stored tracker state is of a version that followed more; start a new state")
-        calibration, belief = dev.grown(state.calibration, state.belief, self.model)
+        calibration, belief = dev.extended(state.calibration, state.belief, self.model)
         if calibration is not state.calibration:
             state = replace(state, calibration=calibration, belief=belief)
         known = state.weather is not None and len(state.weather.common) == self.weather.groups
@@ -190,20 +192,20 @@ class Tracker:
         )
 
     def missed(self, state: TrackerState) -> TrackerState:
-        """State after a window that was of no use (samples lost, a gap): nobody watched the vehicle meanwhile."""
+        """State after a window that could not be used (lost samples, a gap): the vehicle was not monitored."""
         return replace(state, coverage=coverage.update(state.coverage, usable=False))
 
     def rebase(self, state: TrackerState, time_ns: int) -> TrackerState:
         """State before a window that starts at `time_ns`, though the last one was stamped later: a clock was wrong.
 
-        What is under way (anchors, onsets that are not alarms yet) moves along, as if one window followed the other;
-        what was stated with its time stays as it was stated.
+        Times of pending evidence (anchors, onsets without an alarm yet) are shifted, as if the windows followed each
+        other; alarms keep the times with which they were reported.
         """
         if state.time is None or time_ns > state.time:
             return state
         shift = time_ns - nanoseconds(self.settings.hop) - state.time
         changes, fit, calibration = state.changes, state.fit, state.calibration
-        weighed = calibration.recent != 0
+        used = calibration.recent != 0
         weather = state.weather
         if weather is not None:
             weather = replace(weather, began=np.where(weather.began != 0, weather.began + shift, 0))
@@ -221,7 +223,7 @@ class Tracker:
             calibration=replace(
                 calibration,
                 since=calibration.since + shift,
-                recent=np.where(weighed, calibration.recent + shift, 0),
+                recent=np.where(used, calibration.recent + shift, 0),
             ),
             stuck=tuple(replace(s, since=s.since + shift) for s in state.stuck),
             weather=weather,
@@ -242,8 +244,8 @@ class Tracker:
         rows = np.array([name in chosen for name in self.names])
         new = replace(state, changes=change_test.relearn(state.changes, rows))
         if new.weather is not None:
-            new = replace(new, weather=weathers.forgotten(new.weather, self.weather, rows))
-        return replace(new, alarms=self._attribution.after(new, self._fusion.drift(new), None, state.time or 0))
+            new = replace(new, weather=weathers.reset_offsets(new.weather, self.weather, rows))
+        return replace(new, alarms=self._attribution.updated(new, self._fusion.drift(new), None, state.time or 0))
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""
@@ -271,30 +273,30 @@ class Tracker:
             )
 
     def sensors(self, state: TrackerState) -> tuple[MeasurementFault, ...]:
-        """What is wrong with measurements: stuck channels, and gains and delays that differ from the system file."""
-        stuck = [MeasurementFault(s.channel, s.kind, s.value) for s in state.stuck if s.count >= WINDOWS]
+        """Sensor faults: stuck channels, and gains and delays that differ from the system file."""
+        stuck = [MeasurementFault(s.channel, s.kind, s.value) for s in state.stuck if s.count >= HARD_FAULT_WINDOWS]
         H = self.model.size
         if H == 0 or state.calibration.recent[-1] == 0:
             return tuple(stuck)
         value = state.belief.mean[-H:]
-        off = value - self.model.common(value)
-        far = np.abs(off) > self.model.named
+        off = value - self.model.common_value(value)
+        far = np.abs(off) > self.model.report_limit
         if not far.any():
             return tuple(stuck)
         std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._doubt[1])
-        bent = np.where(self.model.gains, dev.bending(off), 0.0)
-        std = np.sqrt(std**2 + dev.pending(state.calibration, self.model) + bent**2)
+        linear = np.where(self.model.gains, dev.linearisation_std(off), 0.0)
+        std = np.sqrt(std**2 + dev.pending_variance(state.calibration, self.model) + linear**2)
         chosen = far & (np.abs(off) > 3 * std)
         return (*stuck, *named(self.deviations, off, std, chosen))
 
-    def built(self, state: TrackerState) -> tuple[BuiltOtherwise, ...]:
-        """What windows tell of how bodies are built otherwise than the system file says."""
+    def body_constants(self, state: TrackerState) -> tuple[BuiltOtherwise, ...]:
+        """Constants of bodies (inertias over mass, sensor distances) that differ from the system file."""
         H = self.model.size
         found = []
-        for h in np.flatnonzero(self.model.own).tolist():
+        for h in np.flatnonzero(self.model.constant).tolist():
             value = float(state.belief.mean[-H:][h])
             std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._doubt[1][h, h]))
-            if abs(value) > max(dev.BUILT, 3 * std):
+            if abs(value) > max(dev.BODY_LIMIT, 3 * std):
                 deviation = self.deviations[h]
                 found.append(BuiltOtherwise(deviation.name, OWN[deviation.kind], float(np.expm1(value)), std))
         return tuple(found)
@@ -310,8 +312,7 @@ class Tracker:
         return found
 
     def loads_as_of(self, state: TrackerState) -> int | None:
-        """Start of the last window that told of the loads, ns, where any other is possible by now: people board while a
-        vehicle stands.  None: what `loads` says holds."""
+        """Start of the last used window, ns, if loads may have changed since, during a stop; None: `loads` holds."""
         if state.last is None or state.time is None:
             return None
         idle = (state.time - state.last) * 1e-9 - self.settings.window

@@ -1,12 +1,12 @@
-"""What load, temperature and speed do to healthy springs and dampers, and what all of a kind do together.
+"""Effects of load, temperature and speed on healthy springs and dampers, and changes common to all of a kind.
 
 A parameter's healthy value is b + (s_kind + s)' x: its own baseline, and slopes over the conditions x, measured from
 those in which the baseline was learned.  Slopes are learned from the vehicle's own first weeks by Bayesian linear
-regression, those of a kind from the middle of its elements, those of a parameter from how it differs from its kind;
-the prior is physics (oil thins by 0.2 % per kelvin, rubber stiffens in the cold), or what the fleet's other vehicles
-have shown.  What is left and common to all elements of a kind is followed as one level: air that nobody measures,
-oil that runs warm.  Elements are compared with their kind, so that weather accuses none of
-them, and one that leaves the others is seen.
+regression, those of a kind from the median of its elements, those of a parameter from its difference to its kind; the
+prior comes from physics (oil thins by 0.2 % per kelvin, rubber stiffens in the cold) or from other vehicles.
+The remaining change that is common to all elements of a kind is tracked as one level (air temperature that is not
+measured, oil that warms up).  Elements are compared with their kind: weather raises no alarm of a single element, and
+an element that differs from the others is detected.
 
 P parameters, G groups of like elements, K = 3 conditions: temperature in 10 K, logarithm of the loaded mass over the
 empty one, speed in 10 m/s.
@@ -26,21 +26,21 @@ from sprung.model.tracking.middle import median
 
 CONDITIONS = 3
 KELVIN, SPEED = 10.0, 10.0  # units of the conditions
-FEWEST = 4  # elements that are a kind: below, a middle is not robust
+FEWEST = 4  # elements of a kind: with fewer, a median is not robust
 ALIKE = 1.5  # ratio of nominal values within which elements of a quantity are of one kind
 MOST_OF = 0.75  # of a kind that must move together
-FEWEST_VEHICLES = 3  # that must have learned a slope before others are told
+FEWEST_VEHICLES = 3  # that must have learned a slope before it becomes a prior of others
 FIRST_WEEKS = 21 * 86400.0  # s in which slopes are learned
-CORRELATED = 600.0, 0.005  # s, and 1: what one window says of a slope is no better than this, for that long
-OF_KINDS = 3600.0, 0.01  # the same of a kind's, since oil and air differ
-COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), of what a kind has in common while the vehicle runs
-RESTED = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands
-MOST_RESTED = 0.08  # what a pause may bring at most
-FAST = 0.05  # log-ratio by which a kind may leave its settled level: oil that warms up, a front that passes
-SETTLING = 6 * 3600.0  # s in which a common level becomes the weather that it is compared with
-NEAR = 0.025  # of a kind's middle: elements within this, or within their errors, move with it
+CORRELATED = 600.0, 0.005  # correlation time in s, and standard deviation, of errors that windows have in common
+OF_KINDS = 3600.0, 0.01  # the same for a kind: oil and air temperature differ
+COMMON_WALK = 0.005 / math.sqrt(600.0)  # per sqrt(s), random walk of a kind's common level while the vehicle runs
+PAUSE_WALK = 0.02 / math.sqrt(3600.0)  # per sqrt(s), while it stands
+MAX_PAUSE = 0.08  # largest change during a pause
+FAST = 0.05  # log-ratio by which a kind may leave its settled level: oil that warms up, a weather front
+SETTLING = 6 * 3600.0  # s, time constant with which the settled level follows the common level
+NEAR = 0.025  # log-ratio about a kind's median: elements within this, or within their errors, move with it
 _NOTHING = np.zeros(1)
-RANGE = {"damping": 0.2, "stiffness": 0.12}  # what weather alone may do, where nobody measures it
+RANGE = {"damping": 0.2, "stiffness": 0.12}  # largest effect of weather that is not measured
 OTHERS_RANGE = 0.1  # of other quantities
 
 
@@ -49,11 +49,11 @@ class WeatherModel:
     """Constants of one system."""
 
     group: IntArray  # of each parameter; -1: too few like it, shape (P,)
-    mean: FloatArray  # of [offset, slopes], in a kind measured from the kind's, shape (P, 1 + K)
+    mean: FloatArray  # of [offset, slopes], in a kind relative to the kind's, shape (P, 1 + K)
     std: FloatArray  # shape (P, 1 + K)
     kind_mean: FloatArray  # of kinds, shape (G, 1 + K)
     kind_std: FloatArray  # shape (G, 1 + K)
-    most: FloatArray  # log-ratio that weather alone may bring a kind to, shape (G,)
+    most: FloatArray  # largest log-ratio of a kind that weather can explain, shape (G,)
 
     @cached_property
     def groups(self) -> int:
@@ -71,7 +71,7 @@ class WeatherModel:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Weather:
-    """What is known of slopes and of what kinds have in common."""
+    """Posterior of the slopes, and the common levels of the kinds."""
 
     mean: FloatArray  # of [offset, slopes], shape (P, 1 + K)
     covariance: FloatArray  # shape (P, 1 + K, 1 + K)
@@ -79,10 +79,10 @@ class Weather:
     kind_covariance: FloatArray  # shape (G, 1 + K, 1 + K)
     reference: FloatArray  # conditions in which the baseline was learned, shape (K,)
     weight: FloatArray  # windows in that mean, shape (K,)
-    common: FloatArray  # log-ratio that all of a kind have in common beyond the slopes, shape (G,)
+    common: FloatArray  # log-ratio common to all of a kind beyond the slopes, shape (G,)
     variance: FloatArray  # shape (G,)
     settled: FloatArray  # the slow part of it, shape (G,)
-    slack: FloatArray  # how far both may be apart beyond the usual, after a rest, shape (G,)
+    slack: FloatArray  # additional difference allowed between both after a pause, shape (G,)
     began: IntArray  # ns, of the first window, and of the last, shape (2,); 0: none
     effect: FloatArray  # of the conditions of the last window on each parameter, shape (P,)
     doubt: FloatArray  # its variance, shape (P,)
@@ -90,7 +90,7 @@ class Weather:
 
 
 def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection[str] = ()) -> WeatherModel:
-    """From parameters' names and nominal values; `by_load`: elements whose stiffness goes with the load."""
+    """From parameters' names and nominal values; `by_load`: elements whose stiffness is proportional to the load."""
     group = _groups(names, nominal)
     G = int(group.max(initial=-1)) + 1
     mean, std = np.zeros((len(names), 1 + CONDITIONS)), np.zeros((len(names), 1 + CONDITIONS))
@@ -101,7 +101,7 @@ def model_of(names: Sequence[str], nominal: Sequence[float], by_load: Collection
         physics = 0.0, {"damping": -0.02, "stiffness": 0.0 if air else -0.005}.get(quantity, 0.0), float(air), 0.0
         open_ = 0.01, {"damping": 0.01, "stiffness": 0.006}.get(quantity, 0.003), 0.2 if air else 0.05, 0.004
         std[i] = 0.005, {"damping": 0.003, "stiffness": 0.002}.get(quantity, 0.001), 0.05 if air else 0.01, 0.002
-        if group[i] < 0:  # nobody of its kind to be compared with
+        if group[i] < 0:  # no others of its kind to compare with
             mean[i], std[i] = physics, np.hypot(std[i], np.multiply(open_, [0, 1, 1, 1]))
         else:
             kind_mean[group[i]], kind_std[group[i]] = physics, open_
@@ -136,10 +136,10 @@ def start(model: WeatherModel) -> Weather:
     )  # fmt: skip
 
 
-def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather:
-    """After a repair of the parameters `rows` (P,): their baseline is learned anew, with what was known of slopes.
+def reset_offsets(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather:
+    """After a repair of the parameters `rows` (P,): offsets return to their prior, slopes are kept.
 
-    A kind of which nothing old is left has nothing in common with its past either.
+    The common level of a kind is reset if all of its elements are.
     """
     mean, covariance = weather.mean.copy(), weather.covariance.copy()
     mean[rows, 0] = 0.0
@@ -151,10 +151,10 @@ def forgotten(weather: Weather, model: WeatherModel, rows: BoolArray) -> Weather
 
 
 def features(weather: Weather, conditions: Conditions | None, load: float | None) -> FloatArray:
-    """Conditions (K,), NaN where nobody knows; `load`: logarithm of the loaded mass over the empty one.
+    """Conditions (K,), NaN where unknown; `load`: logarithm of the loaded mass over the empty one.
 
-    A temperature that is measured no more is that of the last window that knew it: weather does not jump when a probe
-    is lost, and what it does from then on is followed as where nobody measures it.
+    After the loss of a temperature probe the last measured temperature is kept; later effects of weather are tracked
+    by the common level, as without a probe.
     """
     temperature = math.nan if conditions is None else conditions.temperature
     warmth = temperature / KELVIN if math.isfinite(temperature) else float(weather.warmth[0])
@@ -162,10 +162,10 @@ def features(weather: Weather, conditions: Conditions | None, load: float | None
     return np.array([warmth, math.nan if load is None else load, speed / SPEED])
 
 
-def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning: bool) -> Weather:
-    """`weather` with the effect of conditions `at` (K,); `learning`: the baseline is, so these are its conditions.
+def at_conditions(weather: Weather, model: WeatherModel, at: FloatArray, *, learning: bool) -> Weather:
+    """`weather` with the effect of conditions `at` (K,); `learning`: the baseline is being learned under them.
 
-    The offset corrects the baseline itself, so that it is part of the effect and of its doubt.
+    The offset corrects the baseline itself: it is part of the effect and of its variance.
     """
     weather = replace(weather, warmth=at[:1])
     known = np.isfinite(at)
@@ -175,26 +175,26 @@ def foreseen(weather: Weather, model: WeatherModel, at: FloatArray, *, learning:
         moved = np.where(taken, np.where(known, at, 0.0) - weather.reference, 0.0) / np.maximum(weight, 1)
         weather = replace(weather, reference=weather.reference + moved, weight=weight)
     x = np.concatenate([[0.0 if learning else 1.0], np.where(known, at - weather.reference, 0.0)])
-    kinds = weather.kind_mean[:, 1:] @ x[1:]  # a kind's own offset is part of what it has in common
+    kinds = weather.kind_mean[:, 1:] @ x[1:]  # a kind's own offset is part of its common level
     return replace(weather, effect=weather.mean @ x + model.of_kinds(kinds), doubt=(weather.covariance @ x) @ x)
 
 
-def learned(
+def update_slopes(
     weather: Weather,
     model: WeatherModel,
-    left: FloatArray,  # log-ratios less baseline, before any effect, shape (P,)
+    residual: FloatArray,  # log-ratios less baseline, before any effect, shape (P,)
     variance: FloatArray,  # of one window's, independent, shape (P,)
-    usable: BoolArray,  # measured, the baseline is known, and nothing speaks for a change, shape (P,)
+    usable: BoolArray,  # measured, with a baseline, and without evidence for a change, shape (P,)
     at: FloatArray,  # conditions, shape (K,)
     time: int,  # ns
     seconds: float,  # of signal that no earlier window held
 ) -> Weather:
     """Slopes after one window."""
-    young = (time - int(weather.began[0])) * 1e-9 < FIRST_WEEKS
-    if not young or not usable.any():
+    in_time = (time - int(weather.began[0])) * 1e-9 < FIRST_WEEKS
+    if not in_time or not usable.any():
         return weather
     x = np.concatenate([[1.0], np.where(np.isfinite(at), at - weather.reference, 0.0)])
-    own = left - shared(weather, model) - (weather.effect - weather.mean @ x)
+    own = residual - common_effect(weather, model) - (weather.effect - weather.mean @ x)
     mean, covariance = _regressed(
         weather.mean, weather.covariance, x, own, _floored(variance, CORRELATED, seconds), usable
     )
@@ -202,7 +202,7 @@ def learned(
     if not model.groups or not np.isfinite(at).any():
         return weather
     middle, noise, fit = (np.zeros(model.groups) for _ in range(3))
-    without = left - weather.mean @ x
+    without = residual - weather.mean @ x
     for g, members in enumerate(model.members):
         rows = members[usable[members]]
         if len(rows) >= FEWEST:
@@ -232,26 +232,26 @@ def _regressed(
     return mean + gain * off[:, None], 0.5 * (covariance + covariance.transpose(0, 2, 1))
 
 
-def together(
-    weather: Weather, model: WeatherModel, left: FloatArray, variance: FloatArray, usable: BoolArray, time: int
+def update_common(
+    weather: Weather, model: WeatherModel, residual: FloatArray, variance: FloatArray, usable: BoolArray, time: int
 ) -> Weather:
-    """After one window at `time`, ns: the middle of every kind is followed, as long as most of it is near.
+    """Common levels after one window at `time`, ns: the median of a kind is tracked while most elements are near it.
 
-    left: log-ratios less baseline, shape (P,), with `variance`; usable: measured, and the baseline is known.
+    residual: log-ratios less baseline, shape (P,), with `variance`; usable: measured, with a baseline.
     """
     elapsed = (time - int(weather.began[1])) * 1e-9 if weather.began[1] else 0.0
     weather = replace(weather, began=np.array([weather.began[0] or time, time]))
-    left, variance = left - weather.effect, variance + weather.doubt
+    residual, variance = residual - weather.effect, variance + weather.doubt
     common, spread = weather.common.copy(), weather.variance.copy()
-    rest = min(RESTED**2 * max(elapsed - 60.0, 0.0), MOST_RESTED**2)
+    rest = min(PAUSE_WALK**2 * max(elapsed - 60.0, 0.0), MAX_PAUSE**2)
     spread += COMMON_WALK**2 * min(elapsed, 60.0) + rest
     reach = np.maximum(NEAR, 3 * np.sqrt(variance))
     for g, members in enumerate(model.members):
         rows = members[usable[members]]
         if len(rows) < FEWEST:
             continue
-        middle = median(left[rows])
-        near = np.abs(left[rows] - middle) < reach[rows]
+        middle = median(residual[rows])
+        near = np.abs(residual[rows] - middle) < reach[rows]
         if np.count_nonzero(near) < MOST_OF * len(rows):
             continue
         noise = 1.57 * float(variance[rows].sum()) / len(rows) ** 2  # of a median
@@ -259,34 +259,34 @@ def together(
         common[g] += gain * (middle - common[g])
         spread[g] *= 1 - gain
     weather = replace(weather, common=common, variance=spread)
-    slack = np.minimum(weather.slack * math.exp(-min(elapsed, 60.0) / SETTLING) + math.sqrt(rest), MOST_RESTED)
+    slack = np.minimum(weather.slack * math.exp(-min(elapsed, 60.0) / SETTLING) + math.sqrt(rest), MAX_PAUSE)
     part = -math.expm1(-elapsed / SETTLING)
-    usual_ = np.abs(common - weather.settled) < FAST + slack  # what no weather does is not taken for weather later
-    settled = weather.settled + np.where(usual_, part * (common - weather.settled), 0.0)
+    slow = np.abs(common - weather.settled) < FAST + slack  # faster changes are no weather and never settle
+    settled = weather.settled + np.where(slow, part * (common - weather.settled), 0.0)
     return replace(weather, settled=settled, slack=slack)
 
 
-def shared(weather: Weather, model: WeatherModel) -> FloatArray:
-    """What each parameter has in common with its kind, shape (P,)."""
+def common_effect(weather: Weather, model: WeatherModel) -> FloatArray:
+    """Common level of each parameter's kind, shape (P,)."""
     return model.of_kinds(weather.common)
 
 
-def usual(weather: Weather, model: WeatherModel) -> FloatArray:
-    """The slow part of it, which is weather, shape (P,)."""
+def settled_effect(weather: Weather, model: WeatherModel) -> FloatArray:
+    """Slow part of the common level, attributed to weather, shape (P,)."""
     return model.of_kinds(weather.settled)
 
 
-def unusual(weather: Weather, model: WeatherModel, share: float = 1.0) -> BoolArray:
-    """Kinds that moved faster than weather does, or further, shape (G,); `share` of the limits."""
+def beyond_weather(weather: Weather, model: WeatherModel, share: float = 1.0) -> BoolArray:
+    """Kinds that changed faster or further than weather can explain, shape (G,); `share` of the limits."""
     certain = 4.0 * np.sqrt(weather.variance)
     fast = np.abs(weather.common - weather.settled) > share * (FAST + weather.slack) + certain
     return np.asarray(fast | (np.abs(weather.common) > share * model.most + certain))
 
 
 def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
-    """The prior of a new vehicle from what others of the same system have learned: mean and spread of their slopes.
+    """Prior of a new vehicle from others of the same system: mean and standard deviation of their slopes.
 
-    Elements of a kind are pooled, too.  A slope that none of them has learned keeps the prior of physics.
+    Elements of a kind are pooled, too.  A slope that no vehicle has learned keeps the prior from physics.
     """
     if not found:
         return model
@@ -299,14 +299,14 @@ def pooled(model: WeatherModel, found: Sequence[Weather]) -> WeatherModel:
 
 
 def _spread(
-    mean: FloatArray, std: FloatArray, found: Sequence[tuple[FloatArray, FloatArray]], together: Sequence[IntArray]
+    mean: FloatArray, std: FloatArray, found: Sequence[tuple[FloatArray, FloatArray]], groups: Sequence[IntArray]
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean and deviation of slopes over vehicles, and over the rows of one kind."""
+    """Mean and standard deviation of slopes over vehicles, and over the rows of one group."""
     mean, std = mean.copy(), std.copy()
     means = np.array([m for m, _ in found])  # (V, rows, 1 + K)
     variances = np.array([np.diagonal(c, axis1=1, axis2=2) for _, c in found])
     informed = variances < 0.5 * std**2
-    for rows in together:
+    for rows in groups:
         for k in range(1, 1 + CONDITIONS):
             chosen = informed[:, rows, k]
             if chosen.sum() < FEWEST_VEHICLES:
@@ -320,6 +320,6 @@ def _spread(
 
 
 def _kinds(model: WeatherModel) -> list[IntArray]:
-    """Rows of parameters that are pooled: those of a kind, and every other alone."""
+    """Rows of parameters that are pooled: those of a kind together, every other one alone."""
     alone = [np.array([i]) for i in np.flatnonzero(model.group < 0)]
     return [*model.members, *alone]

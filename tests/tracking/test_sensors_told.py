@@ -11,6 +11,7 @@ import pytest
 from sprung.model.identification.deviations import Deviation
 from sprung.model.signals import Deviating, Estimate, FloatArray
 from sprung.model.tracking import deviations as dev
+from sprung.model.tracking.deviation_model import DRIFT_LIMIT, model_of
 from sprung.model.tracking.tracker import Tracker, TrackerState
 from tests.tracker_windows import EPOCH, TrackedParameter, correlated, estimate
 
@@ -52,7 +53,7 @@ def test_a_channel_is_known_among_others_although_their_common_clock_is_open() -
 
 
 def test_relative_deviations_are_those_of_the_closed_form() -> None:
-    rng, model = np.random.default_rng(2), dev.model_of(LOADED)
+    rng, model = np.random.default_rng(2), model_of(LOADED)
     factor = rng.normal(size=(6, 6))
     covariance = factor @ factor.T
     draws = rng.multivariate_normal(np.zeros(6), covariance, 40_000)
@@ -75,7 +76,7 @@ def test_a_change_waits_while_the_windows_speak_more_and_more_for_a_sensor() -> 
         calibration = replace(state.calibration, slope=slope, curvature=np.ones_like(slope), recent=recent)
         asked = replace(state, changes=changed, calibration=calibration)
         drift = tracker._fusion.drift(asked)
-        return [a.kind for a in tracker._attribution.after(asked, drift, None, at)]
+        return [a.kind for a in tracker._attribution.updated(asked, drift, None, at)]
 
     quiet = np.zeros(len(tracker.model.directions))
     rising = quiet.copy()
@@ -103,7 +104,7 @@ def test_a_state_that_did_not_know_how_loads_are_spread_goes_on() -> None:
 
 
 def test_a_jump_is_looked_for_along_all_clocks_of_a_node_together() -> None:
-    model = dev.model_of([Deviation(f"c{i}", "delay", 5e-3, i // 2, i // 4) for i in range(6)])
+    model = model_of([Deviation(f"c{i}", "delay", 5e-3, i // 2, i // 4) for i in range(6)])
     directions = {tuple(np.flatnonzero(row)) for row in model.directions}
     assert {(0, 1), (2, 3), (4, 5), (0, 1, 2, 3)} <= directions
     assert len(model.directions) == 6 + 3 + 1  # the second node has one clock, which is there already
@@ -162,7 +163,7 @@ def test_a_gain_that_drifts_slowly_is_an_alarm_where_it_is_more_than_ageing(begi
         state = tracker.update(state, gained(rng, np.array([drift, 0, 0, 0, 0, 0])), EPOCH + k * SECOND)
         state = TrackerState.from_dict(state.to_dict()) if k % 100 == 0 else state
     assert all(a.kind == "sensor" for a in state.alarms)
-    assert [a.parameter for a in state.active] == ([] if to < dev.CREPT["gain"] else ["c0.gain"])
+    assert [a.parameter for a in state.active] == ([] if to < DRIFT_LIMIT["gain"] else ["c0.gain"])
     for alarm in state.active:
         assert alarm.change is not None and alarm.std is not None
         assert abs(alarm.change - to) < 3 * alarm.std < 0.02
@@ -208,10 +209,10 @@ def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jum
         state = tracker.update(state, gained(rng, np.zeros(6)), EPOCH + k * SECOND)
     record = replace(state.calibration, slope=np.full(6, 3e4), curvature=np.full(6, 1e8))  # 3 deviations
     along, information = np.full(6, -1e3), np.full(6, 1e7)
-    after, jump = dev._judged(record, tracker.model, along, information, 1.0, EPOCH)
+    after, jump = dev._test_jumps(record, tracker.model, along, information, 1.0, EPOCH)
     assert jump is None
     np.testing.assert_allclose(after.slope, dev.FORGETTING * 3e4 - 1e3)
-    turned, _ = dev._judged(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
+    turned, _ = dev._test_jumps(record, tracker.model, np.full(6, -3e4), 10 * information, 1.0, EPOCH)
     np.testing.assert_allclose(turned.slope, -3e4)  # begins anew
 
 

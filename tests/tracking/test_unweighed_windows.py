@@ -94,7 +94,7 @@ def test_a_window_that_was_not_weighed_tells_no_load_that_a_wrong_gain_has_moved
     assert abs(mean[0]) < 3 * deviation[0]
 
 
-def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated() -> None:
+def test_considered_deviations_keep_their_belief_and_the_errors_are_as_stated() -> None:
     rng = np.random.default_rng(3)
     factor = rng.normal(size=(5, 5))
     covariance, cross, noise = factor @ factor.T + np.eye(5), np.array([[1.0], [-0.5]]), np.diag([0.5, 0.8])
@@ -102,10 +102,12 @@ def test_what_is_silent_keeps_its_belief_and_the_errors_are_as_stated() -> None:
     truth = rng.multivariate_normal(np.zeros(5), covariance, 20_000)
     values = truth[:, :2] - truth[:, 4:] @ cross.T + rng.normal(size=(20_000, 2)) @ np.sqrt(noise)
     everything = np.ones(2, dtype=bool)
-    silent = np.ones(1, dtype=bool)
+    considered = np.ones(1, dtype=bool)
 
     def corrected(value: FloatArray) -> kalman.Belief:
-        return kalman.correct(belief, value, noise, everything, share=1.0, bound=1e9, cross=cross, silent=silent)[0]
+        return kalman.correct(
+            belief, value, noise, everything, share=1.0, bound=1e9, cross=cross, considered=considered
+        )[0]
 
     after = corrected(values[0])
     assert after.mean[4] == 0.0

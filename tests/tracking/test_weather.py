@@ -175,7 +175,7 @@ def test_the_fleet_teaches_a_new_vehicle_its_slopes() -> None:
                     lambda k: Conditions(temperature=warm(k)[0]), every=5)  # fmt: skip
         others.append(state)
     prior = weather.pooled(tracker().weather, [s.weather for s in others if s.weather is not None])
-    taught = tracker().newcomer(others).weather
+    taught = tracker().initial_state_from(others).weather
     assert taught is not None and np.array_equal(taught.kind_mean, prior.kind_mean)
     dampers = prior.kind_mean[:, 1] < -0.01
     assert np.allclose(prior.kind_mean[dampers, 1] / weather.KELVIN, slope, atol=3e-4)

@@ -1,0 +1,148 @@
+"""Constants of the deviations of one vehicle: prior, random walk, directions of jumps, thresholds.
+
+H deviations (gains, delays, loads, body constants; `model.identification.deviations`), V directions in which a jump is
+tested: each deviation alone, the delays of one clock, and those of all clocks of a node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sprung.model.identification.deviations import CARGO, OWN, Deviation
+from sprung.model.signals import BoolArray, FloatArray, IntArray
+from sprung.model.tracking.middle import median
+
+GROUP_SHARE = 0.97  # of a delay's variance, common to the channels of one clock
+GAIN_WALK = 1e-4  # per sqrt(s): 0.6 % in an hour, 2 % in a working day
+CLOCK_WALK = 2e-5  # s per sqrt(s), of a node's clock; 1.2 ms in an hour
+# Per sqrt(s), of a running vehicle: in two minutes 1 % of the mass and 0.3 % of its moments of inertia; a passenger who
+# walks 10 m along the car, or from one side to the other, is 1e-3.
+CARGO_WALK = {"load": 1e-3, "roll_inertia": 3e-4, "pitch_inertia": 3e-4, "centre": 1e-4, "side": 1e-4}
+OWN_WALK = 1e-6  # s per sqrt(s), of one channel against its node
+REPORT_LIMIT = {"gain": 0.012, "delay": 6e-4}  # a smaller deviation is within the tolerance of electronics
+DRIFT_LIMIT = {"gain": 0.03, "delay": 2e-3}  # a slow drift beyond it is an alarm: electronics age by 2 % a month
+
+
+@dataclass(frozen=True, eq=False)
+class DeviationModel:
+    """Prior and random walk of the deviations, and the directions in which jumps are tested."""
+
+    kinds: tuple[str, ...]
+    prior: FloatArray  # covariance, shape (H, H)
+    walk: FloatArray  # covariance per second, shape (H, H)
+    directions: FloatArray  # shape (V, H)
+    loads: BoolArray  # True at the masses of loads, shape (H,)
+    cargo: BoolArray  # True at everything that describes loads, their masses included, shape (H,)
+    constant: BoolArray  # True at constants of bodies (inertia over mass, distances), which never change, shape (H,)
+
+    @property
+    def size(self) -> int:
+        return len(self.kinds)
+
+    def common_value(self, values: FloatArray, among: BoolArray | None = None) -> FloatArray:
+        """The median of the gains, and of the delays, (H,): a value common to all channels is not identifiable.
+
+        among: the deviations (H,) that the median is taken of, all by default.
+        """
+        out = np.zeros(self.size)
+        for at in self.groups:
+            chosen = at if among is None or not among[at].any() else at[among[at]]
+            out[at] = median(values[chosen])
+        return out
+
+    def relative_std(self, covariance: FloatArray) -> FloatArray:
+        """Standard deviations (H,) of deviations less the mean of their group, from their covariance (H, H).
+
+        The delay common to all clocks may be uncertain by milliseconds while differences between channels are known.
+        """
+        return np.asarray(np.sqrt(((self.centering @ covariance) * self.centering).sum(axis=1).clip(0.0)))
+
+    @cached_property
+    def groups(self) -> tuple[IntArray, ...]:
+        """Indices of the gains, and of the delays; the mean of a group is not identifiable."""
+        found = (np.flatnonzero([kind == of for kind in self.kinds]) for of in ("gain", "delay"))
+        return tuple(at for at in found if len(at))
+
+    @cached_property
+    def centering(self) -> FloatArray:
+        """Matrix that subtracts the mean of their group from deviations, (H, H)."""
+        centering = np.eye(self.size)
+        for at in self.groups:
+            centering[np.ix_(at, at)] -= 1 / len(at)
+        return centering
+
+    @cached_property
+    def cargo_at(self) -> IntArray:
+        """Indices of everything that describes loads."""
+        return np.flatnonzero(self.cargo)
+
+    @cached_property
+    def refined(self) -> BoolArray:
+        """True at the deviations that every window estimates together with its parameters, (H,)."""
+        return self.cargo | self.constant
+
+    @cached_property
+    def refined_at(self) -> IntArray:
+        """Indices of those."""
+        return np.flatnonzero(self.refined)
+
+    @cached_property
+    def loads_at(self) -> IntArray:
+        """Indices of the masses of loads."""
+        return np.flatnonzero(self.loads)
+
+    @cached_property
+    def gains(self) -> BoolArray:
+        """True at gains, (H,)."""
+        return np.array([kind == "gain" for kind in self.kinds], dtype=bool)
+
+    @cached_property
+    def report_limit(self) -> FloatArray:
+        """Size from which each deviation is reported, (H,); infinite for loads."""
+        return np.array([REPORT_LIMIT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+
+    @cached_property
+    def channel_directions(self) -> BoolArray:
+        """True at directions of jumps that consist of gains and delays only, (V,)."""
+        return np.asarray(self.directions @ np.isinf(self.drift_limit) == 0)
+
+    @cached_property
+    def drift_limit(self) -> FloatArray:
+        """Slow drift of each deviation up to which there is no alarm, (H,); infinite for loads."""
+        return np.array([DRIFT_LIMIT.get(kind, np.inf) for kind in self.kinds], dtype=np.float64)
+
+
+def model_of(deviations: Sequence[Deviation]) -> DeviationModel:
+    """Delays of one clock share most of their variance; everything else is independent.
+
+    Jumps are tested along each deviation, along the delays of a clock, and along those of all clocks of a node.
+    """
+    H = len(deviations)
+    kinds = tuple(d.kind for d in deviations)
+    std = np.array([d.std for d in deviations], dtype=np.float64)
+    group = np.array([d.group for d in deviations], dtype=np.int64)
+    late = np.array([kind == "delay" for kind in kinds], dtype=bool)
+    together = late[:, None] & late[None, :] & (group[:, None] == group[None, :])
+    constant = np.array([kind in OWN for kind in kinds], dtype=bool)
+    own = np.eye(H)
+    shared = np.where(together, GROUP_SHARE, 0.0) + own * np.where(late, 1 - GROUP_SHARE, 1.0)
+    own_walk = {"gain": GAIN_WALK, "delay": OWN_WALK, **CARGO_WALK}
+    walk = np.diag([own_walk.get(kind, 0.0) ** 2 for kind in kinds]).reshape(H, H) + together * CLOCK_WALK**2
+    rows = [*own[~constant]]
+    for number in np.unique(group[late]):
+        members = (late & (group == number)).astype(float)
+        if members.sum() > 1:
+            rows.append(members)
+    node = np.array([d.node for d in deviations], dtype=np.int64)
+    for number in np.unique(node[late & (node >= 0)]):
+        members = late & (node == number)
+        if len(np.unique(group[members])) > 1:  # the direction of a single clock is there already
+            rows.append(members.astype(float))
+    loads = np.array([kind == "load" for kind in kinds], dtype=bool)
+    cargo = np.array([kind in CARGO for kind in kinds], dtype=bool)
+    directions = np.array(rows).reshape(len(rows), H)
+    return DeviationModel(kinds, shared * np.outer(std, std), walk, directions, loads, cargo, constant)
