@@ -1,14 +1,14 @@
-"""Gains, zeros and delays of instruments in order: as data sheets leave them, they are part of the model, no fault.
+"""Calibration errors: gains, zeros and delays within the tolerances of data sheets are part of the model, not faults.
 
-No rig has gains of one, zeros of nothing and channels that are sampled at the same instant.  A recording of little
-noise shows a gain of one per cent or a delay of a hundredth of a sample at once, and names for whatever else fits a
-little better beside it: a mass that hangs, an elastic mode.  So once one shows, gains, zeros and delays of all sensors
-and gains and zeros of measured forces are fitted beside the structure, expected to be as far off as data sheets leave
-them (`gain_std`, `offset_std`, `delay_std` of an address), and findings are sought anew.  Within the tolerance they are
-told and decide nothing; the deviations of all other values contain theirs.
+No rig has exact gains and zeros and exactly simultaneous samples.  With little noise a gain error of one per cent or a
+delay of a hundredth of a sample is significant, and other laws that imitate it, such as a hung mass or an elastic mode,
+fit a little better.  Once one is found, gains, zeros and delays of all sensors and gains and zeros of measured forces
+become parameters of the model with the tolerances as prior (`gain_std`, `offset_std`, `delay_std` of an address), and
+the search restarts.  Values within tolerance are reported and have no effect on the verdict; their uncertainty is part
+of that of all other values.
 
-Where many channels tell, it is by them that one is judged: one that is off by far more than any other of its kind is a
-fault, however small, since the instruments of one rig are of one kind.
+With enough channels, one whose error is far larger than all others of its kind is a fault, however small: the
+instruments of one rig are comparable.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ from sprung.model.laws.base import DataSheet
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
 
-_STEPS = 12, 6  # of a fit of the structure beside the calibration, and of one that begins near
+_STEPS = 12, 6  # of a fit of the structure with the calibration, and of one from a close start
 
 
 def expected(system: System, signals: Signals, law: Law, location: str) -> float:
-    """Standard deviation of a fault's parameter at a channel in order; 0: no instrument in order has it."""
+    """Standard deviation of a fault's parameter by the data sheet of its channel; 0: not a calibration error."""
     names = [channel.name for channel in system.channels][-len(system.tolerances) :]
     if not isinstance(law, SensorLaw) or law.of_instrument is None or location not in names:
         return 0.0
@@ -48,40 +48,40 @@ def expected(system: System, signals: Signals, law: Law, location: str) -> float
 
 
 def _size(signals: Signals, location: str) -> float:
-    """Standard deviation of what a channel shows."""
+    """Standard deviation of a channel's samples."""
     if location in signals.sensor_names:
         series = signals.sensors[:, signals.sensor_names.index(location)]
     elif location in signals.force_names:
         series = signals.force[:, signals.force_names.index(location)]
     else:
-        return 0.0  # of motions that are measured, nothing but the gain is asked
+        return 0.0  # of measured motions only the gain is calibrated, which does not need it
     return float(np.std(series))
 
 
-def in_order(state: Investigation, term: Term) -> bool:
-    """Whether a fault is no more than the data sheet of its channel leaves, on a rig where that shows."""
-    return bool(state.calibrations) and within_sheet(state, term)
+def within_tolerance(state: Investigation, term: Term) -> bool:
+    """Whether a fault is within the data sheet of its channel, and calibration errors are part of the model."""
+    return bool(state.calibrations) and within_data_sheet(state, term)
 
 
-def within_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool:
-    """Whether a fault is no more than the data sheet of its channel leaves.
+def within_data_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool:
+    """Whether a fault is within the data sheet of its channel.
 
-    instruments: as bad ones at most; what one sensor shows is told against what drives everything, which is another.
+    instruments: factor on the tolerance; 2 where a sensor is compared with an input, whose error is contained, too.
     """
     spread = expected(state.system, state.signals, term.law, term.location)
     off = abs(term.parameters[0] - term.law.absent[0]) if spread > 0 else np.inf
     return bool(off <= instruments * state.options.rules.plausible.calibration * spread)
 
 
-def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
-    """Whether a fault is further off than anything else, and than its kind scatters (Student's t).
+def is_outlier(terms: Sequence[Term], key: tuple[str, str, str], rules: PlausibleRules) -> bool:
+    """Whether an error is larger than all others, and an outlier of its kind by Student's t-test.
 
-    In units of what data sheets leave, and from what is usual of its kind: all may share what the file has too large.
+    Errors are in standard deviations of the data sheets, relative to the median of their kind, which all may share.
     """
-    place, effect, _ = key  # a lag's form is told by little
+    place, effect, _ = key  # the form of a lag is hardly identifiable
     kinds, away = {term.law.name for term in terms}, dict[tuple[str, str], float]()
     for kind in kinds:
-        of_kind = {term.location: _off(term) for term in terms if term.law.name == kind}
+        of_kind = {term.location: _relative_deviation(term) for term in terms if term.law.name == kind}
         middle = float(np.median(list(of_kind.values())))
         away |= {(location, kind): off - middle for location, off in of_kind.items()}
     own = away.pop((place, effect), None)
@@ -93,17 +93,17 @@ def stands_alone(terms: Sequence[Term], key: tuple[str, str, str], rules: Plausi
     return bool(2 * stdtr(len(others) - 1, -distance) * (len(others) + 1) < rules.by_chance)
 
 
-def _off(term: Term) -> float:
+def _relative_deviation(term: Term) -> float:
     return (term.parameters[0] - term.law.absent[0]) / term.known[0]
 
 
 def is_gain(term: Term) -> bool:
-    """Whether a term is a gain that an instrument in order may have."""
+    """Whether a term is a gain that may be a calibration error."""
     return isinstance(term.law, SensorLaw) and term.law.of_instrument is not None and term.law.slope().gain != 0
 
 
 def shared_gain(terms: Sequence[Term]) -> tuple[float, float]:
-    """Gain that terms with expected deviations share, least far off together, and its deviation; 1 and 0 of none."""
+    """Most likely common gain of the terms with a tolerance, and its standard deviation; 1 and 0 without any."""
     gains = [(term.parameters[0], term.known[0]) for term in terms if term.known and is_gain(term)]
     if not gains:
         return 1.0, 0.0
@@ -113,9 +113,9 @@ def shared_gain(terms: Sequence[Term]) -> tuple[float, float]:
 
 
 def centred(terms: Sequence[Term]) -> tuple[Term, ...]:
-    """Terms with gains around one: what all channels show too large is the same rig at another size.
+    """Terms with their gains divided by the common one, which is not identifiable.
 
-    Other values of its laws explain it as well, so that no fit knows it better than data sheets do.
+    The same rig at another size, with other values of its laws, gives the same recording.
     """
     shared, _ = shared_gain(terms)
     return tuple(
@@ -124,12 +124,12 @@ def centred(terms: Sequence[Term]) -> tuple[Term, ...]:
     )
 
 
-def calibrated(state: Investigation, shown: Term) -> Investigation:
-    """The investigation with the gains and zeros of all channels in its model, at the beginning of its search.
+def calibrated(state: Investigation, first: Term) -> Investigation:
+    """The investigation with the calibration errors of all channels in its model, at the beginning of its search.
 
-    shown: the first that was found; where it stands alone it is a fault, and nothing of this is done.
-    What is beyond the tolerance beside the findings so far stays out, to be found as the fault that it is.  Gains of
-    what drives everything are kept as they are from now on: their common part shows in a law's curvature alone.
+    first: the first that was found; if it is an outlier, it is a fault, and the model is not changed.
+    Errors beyond the tolerance beside the findings so far are left out, to be found as faults.  Gains of the inputs are
+    kept fixed from now on: their common part is only identifiable from the curvature of a law.
     """
     file, terms = state.fit.point.terms[: state.given], _of_all_channels(state)
     keys = {term.key for term in terms}
@@ -139,12 +139,12 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
         if fit is None:
             return replace(state, calibrations=0)
         fitted = centred(fit.point.terms[len(file) : len(file) + len(terms)])
-        if stands_alone(fitted, shown.key, state.options.rules.plausible):
+        if is_outlier(fitted, first.key, state.options.rules.plausible):
             return replace(state, calibrations=0)
-        terms = tuple(term for term in fitted if within_sheet(state, term))
+        terms = tuple(term for term in fitted if within_data_sheet(state, term))
         if len(terms) == len(fitted):
             break
-    held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they take up part of what a law leaves out
+    held = tuple(replace(term, fixed=(True,)) for term in terms)  # else they absorb part of the missing law
     problem = replace(state.problem, noise=state.base.noise)
     base = try_optimise(problem, replace(state.base.point, terms=(*state.base.point.terms, *held)), _STEPS[0])
     if base is None:
@@ -154,48 +154,48 @@ def calibrated(state: Investigation, shown: Term) -> Investigation:
     begun = replace(state, problem=problem, base=base, fit=base, found=(), first=screening, last=screening, wider=None)
     begun = replace(begun, held=replace(state.held, noise=problem.noise), calibrations=len(held))
     if float(np.max(misfit(base))) > state.options.rules.setup.misfit:
-        return begun  # kept until the law stands that is left out: beside it they would run away from any start
-    base = freed(begun, base)
+        return begun  # fixed until the missing law is found: before, they would diverge
+    base = with_free_gains(begun, base)
     return replace(begun, base=base, fit=base)
 
 
-def freed(state: Investigation, fit: Fit) -> Fit:
-    """A fit whose next steps move gains, zeros and delays of sensors; those of what drives everything are kept."""
+def with_free_gains(state: Investigation, fit: Fit) -> Fit:
+    """A fit with gains, zeros and delays of sensors free; those of the inputs stay fixed."""
     sensors, terms = state.signals.sensor_names, list(fit.point.terms)
-    for index in channels(state):
+    for index in calibration_indices(state):
         if terms[index].location in sensors:
             terms[index] = replace(terms[index], fixed=())
     return replace(fit, point=replace(fit.point, terms=tuple(terms)))
 
 
-def channels(state: Investigation) -> range:
-    """Which terms of the investigation's fits are gains and zeros: the last that are given."""
+def calibration_indices(state: Investigation) -> range:
+    """Indices of the terms of the investigation's fits that are calibration errors: the last of the given ones."""
     return range(state.given - (state.calibrations or 0), state.given)
 
 
-def of_others(state: Investigation) -> Screening:
-    """What was screened last, without gains and zeros that are in the model: of these no more than rounding is left."""
-    among = {state.fit.point.terms[index].key[:2] for index in channels(state)}
+def without_calibrations(state: Investigation) -> Screening:
+    """The last screening without calibration errors that are in the model, whose rest is rounding."""
+    among = {state.fit.point.terms[index].key[:2] for index in calibration_indices(state)}
     kept = tuple(candidate for candidate in state.last.candidates if candidate.term.key[:2] not in among)
     return replace(state.last, candidates=kept)
 
 
 def faulty(state: Investigation) -> list[int]:
-    """Those of them that are beyond the tolerance beside everything that was found, by more than they are uncertain."""
+    """Indices of calibration errors that are significantly beyond their tolerance beside all findings."""
     fit, rules = state.fit, state.options.rules.plausible
-    beyond = (index for index in channels(state) if not in_order(state, fit.point.terms[index]))
+    beyond = (index for index in calibration_indices(state) if not within_tolerance(state, fit.point.terms[index]))
     return [index for index in beyond if not hardly_there(fit, rules, index)]
 
 
-def _shows(law: SensorLaw, *, rate: bool, support: bool) -> bool:
-    """Whether a fault shows: a rate has no offset, and supports are taken to be sampled at their time."""
+def _is_observable(law: SensorLaw, *, rate: bool, support: bool) -> bool:
+    """Whether a fault is observable: rates have no offset, and supports are assumed to be sampled in time."""
     slope = law.slope()
     moved = slope.lag or slope.delay
     return bool(slope.gain or (moved and not support) or (slope.offset and not rate))
 
 
 def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
-    """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; off as found."""
+    """Gain, zero and delay of every sensor, the first two of measured forces, gains of supports; values as found."""
     signals, part = state.signals, state.problem.part
     laws = [law for law in state.problem.system.catalogue if isinstance(law, SensorLaw)]
     rates = {name for name, rate in zip(signals.sensor_names, part.differentiated, strict=True) if rate}
@@ -214,7 +214,7 @@ def _of_all_channels(state: Investigation) -> tuple[Term, ...]:
                 spread = expected(state.system, signals, law, name)
                 if not spread or channel not in law.at or (name, law.name) in given:
                     continue
-                if _shows(law, rate=name in rates, support=channel == "support"):
+                if _is_observable(law, rate=name in rates, support=channel == "support"):
                     nothing = Term(law, str(name), law.absent, scales=(spread,), known=(spread,))
                     found.append(replace(nothing, parameters=values.get(nothing.key, law.absent)))
     return tuple(found)

@@ -1,12 +1,12 @@
-"""What is left unexplained leaves values open: they have taken up a part of it that nobody sees.
+"""Additional uncertainty of values from unexplained residuals: parameters absorb an unknown part of model-form error.
 
-Noise alone gives the covariance (J^T J)^-1.  Where more than noise is left, three things are added:
+Noise alone gives the covariance (J^T J)^-1.  If the residual is more than noise, three terms are added:
 
 - that covariance by as much as chi-square exceeds its degrees of freedom (Birge 1932);
 - the sandwich  (J^T J)^-1 [sum over stretches of the spectrum of g g^T] (J^T J)^-1,  g = J^T r of a stretch, where it
-  is larger: errors that hang together within a stretch do not average out (White 1980);
-- a force of no law at every element (Kennedy and O'Hagan 2001): static functions of deflection and rate whose sizes
-  are drawn at random, with the variance that explains the part of them that is seen in the residual.
+  is larger: errors correlated within a stretch do not average out (White 1980);
+- a discrepancy force at every element (Kennedy and O'Hagan 2001): static functions of deflection and rate with random
+  amplitudes, whose variance explains their observable part in the residual.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from sprung.model.laws import observe
 from sprung.model.laws.basis import static_law, trials
 from sprung.model.signals import FloatArray
 
-_SEEN = 1e-6  # of a force's power: less of it is not seen beside the fit
+_SEEN = 1e-6  # share of a force's power below which it is not observable beside the fit
 
 
-def by_what_is_left(problem: Problem, fit: Fit) -> FloatArray:
-    """What is to be added to a fit's covariance where it leaves more than noise, (P + p, P + p)."""
+def misfit_covariance(problem: Problem, fit: Fit) -> FloatArray:
+    """Term that is added to a fit's covariance if its residual is more than noise, (P + p, P + p)."""
     free = len(fit.covariance)
     normal = information(problem, fit)
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -36,7 +36,7 @@ def by_what_is_left(problem: Problem, fit: Fit) -> FloatArray:
     grow = np.sqrt(np.maximum(np.diag(sandwich)[:free] / np.maximum(np.diag(own), 1e-300), 1.0))
     slopes = np.concatenate([np.ones(len(fit.point.theta)), *[term.slopes for term in fit.point.terms]])
     added = own * np.outer(grow, grow) - inverse[:free, :free]
-    if not problem.process_noise:  # there, forces that nobody measured have taken the part of it that is seen
+    if not problem.process_noise:  # with process noise, unmeasured forces have absorbed the observable part
         added = added + _of_forces(problem, fit, inverse)[:free, :free]
     return np.asarray(added * np.outer(slopes, slopes))
 
@@ -50,7 +50,7 @@ def _of_stretches(fit: Fit, count: int) -> FloatArray:
 
 
 def _of_forces(problem: Problem, fit: Fit, inverse: FloatArray) -> FloatArray:
-    """What forces of no law as large as what is left make of the values, unseen, a covariance."""
+    """Covariance of the values from discrepancy forces of the size of the residual."""
     columns = _forces(problem, fit)
     columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     along = fit.jacobian.T @ columns
@@ -67,7 +67,7 @@ def _of_forces(problem: Problem, fit: Fit, inverse: FloatArray) -> FloatArray:
 
 
 def _forces(problem: Problem, fit: Fit) -> FloatArray:
-    """What the whitened sensors show of unnamed forces at every element, (R, m)."""
+    """Whitened sensor responses to discrepancy forces at every element, (R, m)."""
     projector, system = Projector(problem, fit), problem.system
     found = []
     for index, name in enumerate(system.elements):

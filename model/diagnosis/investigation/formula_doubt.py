@@ -1,7 +1,7 @@
-"""Why a formula that fits is not told: it is uncertain, another one says as much, or something is missing beside it.
+"""Reasons to reject a formula that fits: uncertain values, an equally good rival, or a remaining dependence on motion.
 
-What counts is the element's whole force, spring and damper included, along the motion of the fit, over the rms of what
-no spring or damper imitates of the formula: two formulas that differ by a spring are one.
+Forces are compared along the motion of the fit, spring and damper of the element included, relative to the rms of the
+formula's part that no spring and damper can imitate: two formulas that differ by a spring are equivalent.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
 from sprung.model.diagnosis.fit.problem import Problem
-from sprung.model.diagnosis.investigation.formula_search import FormulaSearch, taken_out
+from sprung.model.diagnosis.investigation.formula_search import FormulaSearch, without_last_term
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.screening.score import Projector
 from sprung.model.diagnosis.selection.compete import Trial
@@ -23,18 +23,18 @@ _STEP = 1e-4  # of a parameter's scale, for derivatives
 
 
 def doubt_of(problem: Problem, trial: Trial, trials: Sequence[Trial]) -> str:
-    """Why a formula is not told, in words; empty where it is.  trials: the other formulas that were fitted."""
+    """Reason to reject a formula, in words; empty if there is none.  trials: all formulas that were fitted."""
     rules = problem.rules.formula
-    size = own_size(trial.fit)
+    size = nonlinear_rms(trial.fit)
     if uncertainty(problem, trial.fit) > rules.agree * size:
         return "the values of the best formula leave its force uncertain"
     for rival in trials:
         near = rival is not trial and rival.finished and rival.evidence > trial.evidence - rules.rival
         if near and np.std(whole_force(trial.fit) - whole_force(rival.fit, trial.fit)) > rules.agree * size:
-            told, other = trial.term.element_law.formula, rival.term.element_law.formula
-            return f"{told} and {other} say as much and differ where it moved"
+            own, other = trial.term.element_law.formula, rival.term.element_law.formula
+            return f"{own} and {other} explain as much and differ in the range of the motion"
     if missing(problem, trial.fit) > rules.missing:
-        return "what the best formula leaves follows the element's motion"
+        return "the residual of the best formula depends on the element's motion"
     return ""
 
 
@@ -49,8 +49,8 @@ def whole_force(fit: Fit, motion: Fit | None = None) -> FloatArray:
     return np.asarray((element.stiffness * d + element.damping * v + force)[::OVERSAMPLING])
 
 
-def own_size(fit: Fit) -> float:
-    """rms of what spring and damper cannot imitate of the force of a fit's last term, N."""
+def nonlinear_rms(fit: Fit) -> float:
+    """rms of the part of the last term's force that spring and damper cannot imitate, N."""
     term = fit.point.terms[-1]
     port = term.port(fit.forward.system)
     d, v = ((part @ port)[::OVERSAMPLING] for part in fit.element_motion)
@@ -87,9 +87,12 @@ def uncertainty(problem: Problem, fit: Fit) -> float:
 
 
 def missing(problem: Problem, fit: Fit) -> float:
-    """What the residual says is missing beside a formula, as any shape of the grammar, over the formula; 0: noise."""
+    """Significant rest of the residual along the element's motion, relative to the formula; 0: noise.
+
+    The rest is the score of the best shape of the grammar beside the formula.
+    """
     most = FormulaSearch.beside(problem, fit).most()
     if most < problem.rules.formula.chance * min(fit.reduced, 1.0):
         return 0.0
-    before = Projector(problem, taken_out(problem, fit)).residual
+    before = Projector(problem, without_last_term(problem, fit)).residual
     return float(np.sqrt(most / max(float(before @ before) - fit.chi_square, 1e-300)))

@@ -58,7 +58,7 @@ class Scored:
         return tuple(found)
 
 
-def taken_out(problem: Problem, fit: Fit) -> Fit:
+def without_last_term(problem: Problem, fit: Fit) -> Fit:
     """A fit whose last term, a force along an element, is left in its motion and is missing in its residual."""
     point, term = fit.point, fit.point.terms[-1]
     projector = Projector(problem, fit)
@@ -88,7 +88,7 @@ class FormulaSearch:
     def along(cls, problem: Problem, fit: Fit) -> FormulaSearch:
         """Along the motion of a fit, in place of its last term."""
         location = fit.point.terms[-1].location
-        motion = TrialElement.of(Projector(problem, taken_out(problem, fit)), location)
+        motion = TrialElement.of(Projector(problem, without_last_term(problem, fit)), location)
         return cls(motion, problem.rules.formula)
 
     @classmethod
@@ -220,7 +220,7 @@ class _Columns:
         p, r = product * scale, gram * scale * scale[:, None]
         with np.errstate(all="ignore"):
             score = (p**2 + p[:, None] ** 2 - 2 * r * p * p[:, None]) / (1 - r**2)
-        score[~(np.abs(r) < _ALIKE) | self._strangers()] = 0.0
+        score[~(np.abs(r) < _ALIKE) | self._unequal_memories()] = 0.0
         best = np.maximum.reduceat(np.maximum.reduceat(score, self.first, axis=0), self.first, axis=1)
         worth = np.triu(best - self._costs(2), 1)
         ends = [*self.first, len(self.inner)]
@@ -240,7 +240,7 @@ class _Columns:
         found: FloatArray = np.vectorize(self.search.cost, otypes=[float])(parts, values)
         return found
 
-    def _strangers(self) -> BoolArray:
+    def _unequal_memories(self) -> BoolArray:
         """Pairs of columns with hidden states of different times, (M, M)."""
         ends = np.append(self.first, len(self.inner))
         memory = np.repeat([form.memory for form in self.shapes], np.diff(ends))

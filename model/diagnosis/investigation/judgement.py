@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
-from sprung.model.diagnosis.investigation.calibration import faulty, in_order
+from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
 from sprung.model.diagnosis.investigation.excess_noise import upper_ratio
 from sprung.model.diagnosis.investigation.setup_effects import WRONG_BODY
 from sprung.model.diagnosis.investigation.state import Investigation, Judgement, NoiseFault
@@ -73,7 +73,7 @@ def judged(
 
 def _kind(state: Investigation, term: Term, law: Law) -> EffectKind:
     """The kind of a finding, by its value, too: instruments are as far off as their data sheets leave them."""
-    return EffectKind.NUISANCE if in_order(state, term) else kind_of(law)
+    return EffectKind.NUISANCE if within_tolerance(state, term) else kind_of(law)
 
 
 def leaves_more_than_noise(state: Investigation) -> bool:

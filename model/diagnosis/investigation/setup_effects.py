@@ -1,4 +1,4 @@
-"""What may be wrong with a set-up: each kind with its words, how it is undone and how what is left of it is weighed.
+"""Configuration faults of a set-up: name, sentence, correction, and estimate of the remaining fault of each kind.
 
 A new kind is a new value here and an iterator of hypotheses beside the others.
 """
@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from sprung.model.diagnosis.investigation import setup_changes as changes
 from sprung.model.diagnosis.investigation.setup_response import NOTHING, Group, ModelResponse
-from sprung.model.diagnosis.investigation.setup_scores import SetupScores, Weighed
+from sprung.model.diagnosis.investigation.setup_scores import ChangeEstimate, SetupScores
 from sprung.model.laws import StructureLaw
 from sprung.model.laws.sensor_faults import SENSOR_GAIN, SENSOR_LAG
 from sprung.model.laws.structure import WRONG_POSITION
@@ -31,8 +31,8 @@ class SetupPlace:
 
 
 @dataclass(frozen=True)
-class Weighing:
-    """A fit with a fault undone, on which what is left of it can be weighed."""
+class CorrectedFit:
+    """A fit with a corrected fault, on which the remaining fault is estimated."""
 
     scores: SetupScores
     response: ModelResponse
@@ -46,10 +46,12 @@ class SetupEffect:
     name: str  # a word of the contract
     sentence: str = ""  # with {place}, {value}, {axis}, {detail}
     parameter: tuple[str, str] | None = None  # name and unit of its value
-    relative: bool = False  # what is left of its value is a share of it
-    ordinary: bool = False  # a fault of one sensor that screening seeks: it only has to be beaten
+    relative: bool = False  # the remaining fault is a share of its value
+    ordinary: bool = False  # a fault of one sensor that screening tests: here only a rival
     undo: Callable[[SetupPlace, float], changes.Undo] | None = None  # of a value
-    left: Callable[[SetupPlace, Weighing], tuple[Weighed, float]] | None = None  # of its value, in units of the second
+    remaining: Callable[[SetupPlace, CorrectedFit], tuple[ChangeEstimate, float]] | None = (
+        None  # in units of the second value
+    )
     law: StructureLaw | None = field(default=None, compare=False)  # the same in a system file, its variant the axis
 
     def undone(self, site: SetupPlace, value: float) -> changes.Undo:
@@ -58,14 +60,14 @@ class SetupEffect:
         return self.undo(site, value)
 
     def further(self, value: float, change: float) -> float:
-        """A value with what was left of it."""
+        """A value, corrected by the remaining fault."""
         return value * (1 + change) if self.relative else value + change
 
     def remainder(self, site: SetupPlace, change: float) -> changes.Undo:
-        """The change that undoes what was left of it, too."""
+        """The change that undoes the remaining fault, too."""
         return self.undone(site, 1 + change if self.relative else change)
 
-    def told(self, site: SetupPlace, value: str) -> str:
+    def describe(self, site: SetupPlace, value: str) -> str:
         """In words."""
         place = site.location.replace("|", " and ")
         return self.sentence.format(place=place, value=value, axis="xy"[site.axis], detail=site.detail)
@@ -78,25 +80,27 @@ class Hypothesis:
     effect: SetupEffect
     site: SetupPlace
     value: float | None  # time s, ratio, offset m
-    left: float  # misfit by spectra
+    misfit: float  # by spectra
     undo: changes.Undo
-    by_mass: bool = False  # told above all modes: to be fitted whatever spectra at wrong resonances say
-    unranked: bool = False  # the same under a measured force only, after those that spectra rank
+    by_mass: bool = False  # from frequencies above all modes: fitted whatever spectra at wrong resonances say
+    unranked: bool = False  # the same under a measured force only, after hypotheses that spectra rank
 
     @classmethod
-    def of(cls, effect: SetupEffect, site: SetupPlace, value: float, left: float, by_mass: bool = False) -> Hypothesis:
+    def of(
+        cls, effect: SetupEffect, site: SetupPlace, value: float, misfit: float, by_mass: bool = False
+    ) -> Hypothesis:
         """With a value, which the kind of fault knows how to undo."""
-        return cls(effect, site, value, left, effect.undone(site, value), by_mass)
+        return cls(effect, site, value, misfit, effect.undone(site, value), by_mass)
 
 
 def _advanced(site: SetupPlace, late: float) -> changes.Undo:
     return changes.advance(site.group.sensors, site.group.supports, late, site.group.forces)
 
 
-def _late(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+def _late(site: SetupPlace, fitted: CorrectedFit) -> tuple[ChangeEstimate, float]:
     one = fitted.response
     unit = _SMALL * one.step
-    return fitted.scores.of(one.late(site.group, unit) - one.shown), unit
+    return fitted.scores.of(one.late(site.group, unit) - one.predicted), unit
 
 
 def _rescaled(site: SetupPlace, ratio: float) -> changes.Undo:
@@ -104,9 +108,9 @@ def _rescaled(site: SetupPlace, ratio: float) -> changes.Undo:
     return changes.scale(group.sensors, group.supports, group.supports, ratio, group.forces)
 
 
-def _scaled(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+def _scaled(site: SetupPlace, fitted: CorrectedFit) -> tuple[ChangeEstimate, float]:
     one = fitted.response
-    return fitted.scores.of(one.scaled(site.group, 1 + _SMALL) - one.shown), _SMALL
+    return fitted.scores.of(one.scaled(site.group, 1 + _SMALL) - one.predicted), _SMALL
 
 
 def _moved(
@@ -117,11 +121,11 @@ def _moved(
     def undo(site: SetupPlace, offset: float) -> changes.Undo:
         return changes.in_system(lambda system: move(system, site.location, site.axis, offset))
 
-    def left(site: SetupPlace, fitted: Weighing) -> tuple[Weighed, float]:
+    def remaining(site: SetupPlace, fitted: CorrectedFit) -> tuple[ChangeEstimate, float]:
         return fitted.scores.of_system(move(fitted.system, site.location, site.axis, NEAR)), NEAR
 
     words = "{place}: sits {value} along {axis} from where the system file says"
-    return SetupEffect(name, words, ("offset", "m"), undo=undo, left=left, law=law)
+    return SetupEffect(name, words, ("offset", "m"), undo=undo, remaining=remaining, law=law)
 
 
 SIGN_REVERSED = SetupEffect("sign_reversed", "{place}: the sign is reversed")
@@ -131,7 +135,7 @@ NODE_DELAY = SetupEffect(
     "{place}: all of them are late by {value}, as a whole node is",
     ("time", "s"),
     undo=_advanced,
-    left=_late,
+    remaining=_late,
 )
 WRONG_SCALE = SetupEffect(
     "wrong_scale",
@@ -139,13 +143,13 @@ WRONG_SCALE = SetupEffect(
     ("ratio", "1"),
     relative=True,
     undo=_rescaled,
-    left=_scaled,
+    remaining=_scaled,
 )
 SENSOR_POSITION = _moved(changes.moved_sensor, "wrong_position")
 ELEMENT_POSITION = _moved(changes.moved_element, WRONG_POSITION.name, WRONG_POSITION)
 WRONG_BODY = SetupEffect("wrong_body", "{place}: is not fixed to what the system file says; its {detail} fits")
-ONE_GAIN = SetupEffect(SENSOR_GAIN.name, relative=True, ordinary=True, undo=_rescaled, left=_scaled)
-ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced, left=_late)
+ONE_GAIN = SetupEffect(SENSOR_GAIN.name, relative=True, ordinary=True, undo=_rescaled, remaining=_scaled)
+ONE_LAG = SetupEffect(SENSOR_LAG.name, ordinary=True, undo=_advanced, remaining=_late)
 SETUP_EFFECTS = (
     SIGN_REVERSED, CHANNELS_SWAPPED, NODE_DELAY, WRONG_SCALE, SENSOR_POSITION, ELEMENT_POSITION, WRONG_BODY,
 )  # fmt: skip

@@ -135,21 +135,21 @@ def _signs(one: ModelResponse, signals: Signals, wired: Wiring) -> Iterator[Hypo
         name = wired.name(group)
         if len(group.supports) == 1 and not group.sensors:
             name = signals.support_names[group.supports[0]]
-        left = one.left(one.turned(group))
+        misfit = one.misfit(one.turned(group))
         undo, alone = changes.turn(group.sensors, group.supports), len(group.sensors) + len(group.supports) == 1
-        yield Hypothesis(SIGN_REVERSED, SetupPlace(name, group), None, left, undo, unranked=alone)
+        yield Hypothesis(SIGN_REVERSED, SetupPlace(name, group), None, misfit, undo, unranked=alone)
     for j, name in enumerate(signals.force_names):
-        left = one.left(one.shown - 2 * one.of_force[:, :, j])
-        yield Hypothesis(SIGN_REVERSED, SetupPlace(name), None, left, changes.turn(forces=[j]), unranked=True)
+        misfit = one.misfit(one.predicted - 2 * one.of_force[:, :, j])
+        yield Hypothesis(SIGN_REVERSED, SetupPlace(name), None, misfit, changes.turn(forces=[j]), unranked=True)
 
 
 def _exchanges(one: ModelResponse, system: System, signals: Signals, wired: Wiring) -> Iterator[Hypothesis]:
     def hypothesis(sensors: Sequence[tuple[int, int]], supports: Sequence[tuple[int, int]]) -> Hypothesis:
         names = [signals.sensor_names[i] for pair in sensors for i in pair]
         names += [signals.support_names[j] for pair in supports for j in pair]
-        left = one.left(_exchanged(one, sensors, supports))
+        misfit = one.misfit(_exchanged(one, sensors, supports))
         undo = changes.exchange(list(sensors), list(supports))
-        return Hypothesis(CHANNELS_SWAPPED, SetupPlace("|".join(names)), None, left, undo, unranked=len(names) == 2)
+        return Hypothesis(CHANNELS_SWAPPED, SetupPlace("|".join(names)), None, misfit, undo, unranked=len(names) == 2)
 
     for i, j in combinations(range(len(wired.sensors)), 2):
         if wired.kind[i] == wired.kind[j]:
@@ -168,13 +168,13 @@ def _exchanged(
 ) -> ComplexArray:
     plant, part = one.forward.plant, one.forward.part
     band = slice(1, part.grid.band.stop)
-    shown = one.shown.copy()
+    predicted = one.predicted.copy()
     for i, j in supports:
         G, u = plant.sensor_of_support[band], part.support[band]
-        shown = shown + (G[:, :, i] - G[:, :, j]) * (u[:, j] - u[:, i])[:, None]
+        predicted = predicted + (G[:, :, i] - G[:, :, j]) * (u[:, j] - u[:, i])[:, None]
     for i, j in sensors:
-        shown[:, [i, j]] = shown[:, [j, i]]
-    return shown
+        predicted[:, [i, j]] = predicted[:, [j, i]]
+    return predicted
 
 
 def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -188,7 +188,9 @@ def _delays(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
             continue
         late = one.delay(group, rules)
         if late > 0:
-            yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, one.left(one.late(group, late)))
+            yield Hypothesis.of(
+                NODE_DELAY, SetupPlace(wired.name(group), group), late, one.misfit(one.late(group, late))
+            )
 
 
 def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -199,8 +201,8 @@ def _scales(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hy
             continue  # the same as all sensors the other way
         ratio = one.ratio(group)
         if np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale):
-            left = one.left(one.scaled(group, ratio))
-            yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, left)
+            misfit = one.misfit(one.scaled(group, ratio))
+            yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, misfit)
 
 
 def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -213,7 +215,7 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     if len(wired.sensors) < 2:
         return
     inert = one.above(rules.above * one.highest_mode)
-    before = inert.left(inert.shown)
+    before = inert.misfit(inert.predicted)
     sensors, forces = (
         Group(tuple(range(len(wired.sensors)))),
         Group((), (), tuple(range(len(wired.signals.force_names)))),
@@ -221,17 +223,17 @@ def _against_forces(one: ModelResponse, wired: Wiring, rules: SetupRules) -> Ite
     late = inert.delay(sensors, rules)
     group = sensors if late > 0 else forces
     late = late if late > 0 else inert.delay(forces, rules)
-    if late > rules.soonest * one.step and inert.left(inert.late(group, late)) < rules.by_mass * before:
-        left = one.left(one.late(group, late))
-        yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, left, by_mass=True)
+    if late > rules.soonest * one.step and inert.misfit(inert.late(group, late)) < rules.by_mass * before:
+        misfit = one.misfit(one.late(group, late))
+        yield Hypothesis.of(NODE_DELAY, SetupPlace(wired.name(group), group), late, misfit, by_mass=True)
     ratio = inert.ratio(sensors)
     if not (np.isfinite(ratio) and (ratio > rules.scale or 0 < ratio < 1 / rules.scale)):
         return
     group = sensors if abs(abs(np.log(ratio)) - np.log(_STANDARD_GRAVITY)) < rules.gravity else forces
     ratio = ratio if group is sensors else 1 / ratio
-    if inert.left(inert.scaled(group, ratio)) < rules.by_mass * before:
-        left = one.left(one.scaled(group, ratio))
-        yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, left, by_mass=True)
+    if inert.misfit(inert.scaled(group, ratio)) < rules.by_mass * before:
+        misfit = one.misfit(one.scaled(group, ratio))
+        yield Hypothesis.of(WRONG_SCALE, SetupPlace(wired.name(group), group), ratio, misfit, by_mass=True)
 
 
 def _positions(one: ModelResponse, system: System, signals: Signals, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -246,9 +248,9 @@ def _positions(one: ModelResponse, system: System, signals: Signals, rules: Setu
                 continue
             offset, change = sensor_offset(one, system, i, name, axis)
             if abs(offset) >= rules.offset:
-                shown = one.shown.copy()
-                shown[:, i] += offset * change
-                yield Hypothesis.of(SENSOR_POSITION, SetupPlace(name, Group((i,)), axis), offset, one.left(shown))
+                predicted = one.predicted.copy()
+                predicted[:, i] += offset * change
+                yield Hypothesis.of(SENSOR_POSITION, SetupPlace(name, Group((i,)), axis), offset, one.misfit(predicted))
 
 
 def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: int) -> tuple[float, ComplexArray]:
@@ -257,7 +259,7 @@ def sensor_offset(one: ModelResponse, system: System, i: int, name: str, axis: i
     assert isinstance(sensor, MotionSensor)
     dof = system.mechanics.dofs.index(f"{sensor.body}.{('pitch', 'roll')[axis]}")
     change = (1j * one.omega) ** _ORDERS[KINDS[sensor.kind].shows] * one.motion[:, dof]
-    error = one.measured[:, i] - one.shown[:, i]
+    error = one.measured[:, i] - one.predicted[:, i]
     size = max(float(np.sum(np.abs(change) ** 2)), 1e-300)
     return float(np.sum(np.real(change.conj() * error)) / size), change
 
@@ -272,5 +274,5 @@ def _ordinary(one: ModelResponse, signals: Signals, rules: SetupRules) -> Iterat
         site = SetupPlace(name, group := Group((i,)))
         ratio, late = one.ratio(group), one.delay(group, rules)
         if ratio > 0:
-            yield Hypothesis.of(ONE_GAIN, site, ratio, one.left(one.scaled(group, ratio)))
-        yield Hypothesis.of(ONE_LAG, site, late, one.left(one.late(group, late)))
+            yield Hypothesis.of(ONE_GAIN, site, ratio, one.misfit(one.scaled(group, ratio)))
+        yield Hypothesis.of(ONE_LAG, site, late, one.misfit(one.late(group, late)))

@@ -40,17 +40,17 @@ def _power(spectrum: ComplexArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class ModelResponse:
-    """Compared bins but the first, without free motion."""
+    """Predictions over the compared bins but the first, without free motion."""
 
     forward: Forward
     measured: ComplexArray  # (F, S)
-    of_support: ComplexArray  # shown of each support, (F, S, supports)
-    of_force: ComplexArray  # shown of each measured force, (F, S, forces)
+    of_support: ComplexArray  # response to each support, (F, S, supports)
+    of_force: ComplexArray  # response to each measured force, (F, S, forces)
     motion: ComplexArray  # degrees of freedom, (F, n)
     omega: FloatArray
     step: float  # s, of the samples
     samples: int
-    of_raw_force: ComplexArray  # as `of_force`, of the force as it was measured: a fit may bend it to its needs
+    of_raw_force: ComplexArray  # as `of_force`, of the force as it was measured, not as smoothed by a fit
 
     @classmethod
     def of(cls, problem: Problem, forward: Forward) -> ModelResponse:
@@ -70,14 +70,14 @@ class ModelResponse:
         )
 
     @cached_property
-    def shown(self) -> ComplexArray:
+    def predicted(self) -> ComplexArray:
         """(F, S)."""
         found: ComplexArray = self.of_support.sum(axis=2) + self.of_force.sum(axis=2)
         return found
 
-    def left(self, shown: ComplexArray) -> float:
-        """Misfit of all sensors if this is what they show."""
-        return float(np.sum(_power(self.measured - shown) / self.size))
+    def misfit(self, predicted: ComplexArray) -> float:
+        """Misfit of all sensors to a prediction."""
+        return float(np.sum(_power(self.measured - predicted) / self.size))
 
     @cached_property
     def size(self) -> FloatArray:
@@ -85,30 +85,30 @@ class ModelResponse:
         return np.maximum(_power(self.measured), 1e-300)
 
     def turned(self, group: Group) -> ComplexArray:
-        """Shown if a group has the other sign."""
-        shown = self.shown - 2 * self._of(group)
-        shown[:, list(group.sensors)] *= -1
-        return shown
+        """Prediction if a group has the other sign."""
+        predicted = self.predicted - 2 * self._of(group)
+        predicted[:, list(group.sensors)] *= -1
+        return predicted
 
     def late(self, group: Group, late: float) -> ComplexArray:
-        """Shown if a group is late: sensors show later, what late inputs drive comes earlier."""
+        """Prediction if a group is delayed: sensors are later, the response to delayed inputs is earlier."""
         turn = np.exp(-1j * self.omega * late)[:, None]
         driven = self._of(group)
-        shown = self.shown - driven + driven / turn
+        predicted = self.predicted - driven + driven / turn
         at = list(group.sensors)
-        shown[:, at] *= turn
-        found: ComplexArray = shown
+        predicted[:, at] *= turn
+        found: ComplexArray = predicted
         return found
 
     def scaled(self, group: Group, ratio: float) -> ComplexArray:
-        """Shown if a group is too large by a ratio."""
+        """Prediction if a group is too large by a ratio."""
         driven = self._of(group)
-        shown = self.shown - driven + driven / ratio
-        shown[:, list(group.sensors)] *= ratio
-        return shown
+        predicted = self.predicted - driven + driven / ratio
+        predicted[:, list(group.sensors)] *= ratio
+        return predicted
 
     def _of(self, group: Group) -> ComplexArray:
-        """Shown of the inputs of a group, (F, S)."""
+        """Response to the inputs of a group, (F, S)."""
         moved = self.of_support[:, :, list(group.supports)].sum(axis=2)
         return np.asarray(moved + self.of_force[:, :, list(group.forces)].sum(axis=2))
 
@@ -124,30 +124,30 @@ class ModelResponse:
 
     @property
     def highest_mode(self) -> float:
-        """Angular frequency of the fastest mode of the model, rad/s: above it masses alone tell what a force does."""
+        """Angular frequency of the fastest mode of the model, rad/s: above it, masses alone determine the response."""
         s = self.forward.plant.structure
         return float(np.sqrt(np.max(np.abs(np.linalg.eigvals((s.H.T * s.stiffness) @ s.H / s.mass[:, None])))))
 
     def delay(self, group: Group, rules: SetupRules) -> float:
-        """The delay of a group that leaves the least misfit, s: the best of all whole samples, then between them."""
+        """The delay of a group with the least misfit, s: the best whole number of samples, then refined."""
         weight = 1 / np.sqrt(self.size)
-        driven, shown, at = self._of(group), self.shown, list(group.sensors)
+        driven, predicted, at = self._of(group), self.predicted, list(group.sensors)
         own = np.zeros(len(weight), dtype=bool)
         own[at] = True
         # later sensors: (rest) e^-jwt + driven against Y;   earlier drive: rest + driven e^jwt against Y
         product = np.where(
             own,
-            (shown - driven).conj() * (self.measured - driven),
-            driven * (self.measured - shown + driven).conj(),
+            (predicted - driven).conj() * (self.measured - driven),
+            driven * (self.measured - predicted + driven).conj(),
         )
         full = np.zeros(self.samples // 2 + 1, dtype=complex)
-        full[1 : len(shown) + 1] = (product * weight**2).sum(axis=1)
+        full[1 : len(predicted) + 1] = (product * weight**2).sum(axis=1)
         agree = np.fft.irfft(full, self.samples)
         reach = int(min(rules.latest / self.step, rules.late_share * self.samples))
         lags = np.arange(-reach, reach + 1)
         best = float(lags[int(np.argmax(agree[lags]))]) * self.step
         found = minimize_scalar(
-            lambda late: self.left(self.late(group, late)),
+            lambda late: self.misfit(self.late(group, late)),
             bounds=(best - self.step, best + self.step),
             method="bounded",
             options={"xatol": 1e-3 * self.step},
@@ -159,10 +159,10 @@ class ModelResponse:
         weight = 1 / self.size
         at = list(group.sensors)
         if at:
-            shown, measured, weight = self.shown[:, at], self.measured[:, at], weight[at]
+            predicted, measured, weight = self.predicted[:, at], self.measured[:, at], weight[at]
         else:
-            shown = self._of(group)
-            measured = self.measured - self.shown + shown
-        product = np.sum(np.real(shown.conj() * measured) * weight)
-        found = float(product / max(np.sum(np.abs(shown) ** 2 * weight), 1e-300))
+            predicted = self._of(group)
+            measured = self.measured - self.predicted + predicted
+        product = np.sum(np.real(predicted.conj() * measured) * weight)
+        found = float(product / max(np.sum(np.abs(predicted) ** 2 * weight), 1e-300))
         return found if at else 1 / found if found else np.inf

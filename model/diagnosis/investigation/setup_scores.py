@@ -1,6 +1,6 @@
-"""Changes of a set-up weighed with the sensitivities of all parameters projected out, in the metric of the misfit.
+"""Least-squares estimates of changes of a set-up in the misfit's metric, sensitivities of parameters projected out.
 
-Spring and damper values absorb much of a wrong set-up: what a change leaves beside them is what is weighed.
+Spring and damper values absorb much of a configuration fault; only the rest is informative.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ _STEP = 1e-3  # of a log-ratio, of differences
 
 
 @dataclass(frozen=True)
-class Weighed:
-    """How much of a change least squares asks for beside all parameters."""
+class ChangeEstimate:
+    """Least-squares amount of a change beside all parameters."""
 
     amount: float
     std: float
-    left: float  # misfit
+    misfit: float  # that remains
 
 
 class SetupScores:
-    """Changes of the set-up weighed on the residual of a fit, or of the nominal values."""
+    """Estimates of changes of the set-up on the residual of a fit, or of the nominal values."""
 
     def __init__(self, problem: Problem, fit: Fit, nominal: bool = False, most: int | None = None) -> None:
-        """most: bins that are looked at, evenly spread over those that are compared; None: all of them."""
+        """most: number of bins that are used, evenly spread over the compared ones; None: all of them."""
         self.problem, part = problem, problem.part
         self.theta = np.zeros_like(fit.point.theta) if nominal else fit.point.theta
         stride = 1 if most is None else max(1, part.grid.band.stop // most)
         self.grid = ThinnedGrid(part.grid.samples, part.grid.step, part.grid.start, stride)
         self.band = slice(stride, part.grid.band.stop, stride)  # the same, without zero frequency
         self.weight = 1 / np.sqrt(np.maximum(np.sum(np.abs(part.sensors[self.band]) ** 2, axis=0), 1e-300))
-        self.shown = self._shown(problem.system, self.theta)
+        self.predicted = self._predict(problem.system, self.theta)
         columns = [
-            (self._shown(problem.system, self.theta + _STEP * one) - self.shown) / _STEP
+            (self._predict(problem.system, self.theta + _STEP * one) - self.predicted) / _STEP
             for one in np.eye(len(self.theta))
         ]
         matrix = np.column_stack([self._flat(column) for column in columns])
         self.basis, triangle = np.linalg.qr(matrix)
         self.basis = self.basis[:, np.abs(np.diag(triangle)) > 1e-9 * np.abs(np.diag(triangle)).max()]
-        left = part.sensors[self.band] - self.shown if nominal else fit.spectrum[self.band]
-        self.residual = self._apart(self._flat(left))
+        residual = part.sensors[self.band] - self.predicted if nominal else fit.spectrum[self.band]
+        self.residual = self._projected(self._flat(residual))
 
-    def of_system(self, system: System, renewed: str = "") -> Weighed:
-        """A changed system file; the element `renewed` has its nominal values: at a wrong body it was fitted away."""
+    def of_system(self, system: System, renewed: str = "") -> ChangeEstimate:
+        """A changed system file; the element `renewed` has its nominal values: a wrong body voids its fit."""
         theta = [0.0 if p.element == renewed else x for p, x in zip(system.parameters, self.theta, strict=True)]
-        return self.of(self._shown(system, np.array(theta)) - self.shown)
+        return self.of(self._predict(system, np.array(theta)) - self.predicted)
 
-    def of(self, change: ComplexArray) -> Weighed:
-        """A change of what the sensors show, (F, S)."""
-        column = self._apart(self._flat(change))
+    def of(self, change: ComplexArray) -> ChangeEstimate:
+        """A change of the predicted sensors, (F, S)."""
+        column = self._projected(self._flat(change))
         size = float(column @ column)
         if size < 1e-12:
-            return Weighed(0.0, np.inf, float(self.residual @ self.residual))
+            return ChangeEstimate(0.0, np.inf, float(self.residual @ self.residual))
         amount = float(column @ self.residual) / size
         rest = self.residual - amount * column
-        left = float(rest @ rest)
-        return Weighed(amount, float(np.sqrt(left / len(rest) / size)), left)
+        misfit = float(rest @ rest)
+        return ChangeEstimate(amount, float(np.sqrt(misfit / len(rest) / size)), misfit)
 
-    def _shown(self, system: System, theta: FloatArray) -> ComplexArray:
+    def _predict(self, system: System, theta: FloatArray) -> ComplexArray:
         forward = Forward(system, self.problem.part, self.problem.sensors, theta)
         plant, part = replace(forward.plant, grid=self.grid), self.problem.part
         return plant.sensors_once(part.support[self.band], part.force[self.band])
@@ -75,5 +75,5 @@ class SetupScores:
         flat = (spectrum * self.weight).ravel()
         return np.concatenate([flat.real, flat.imag])
 
-    def _apart(self, column: FloatArray) -> FloatArray:
+    def _projected(self, column: FloatArray) -> FloatArray:
         return np.asarray(column - self.basis @ (self.basis.T @ column))

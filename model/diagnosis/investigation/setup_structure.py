@@ -46,7 +46,7 @@ def _elsewhere(scores: SetupScores, system: System, name: str, rules: SetupRules
         found = scores.of_system(changes.moved_element(system, name, axis, NEAR))
         offset = found.amount * NEAR
         if abs(offset) >= rules.offset:
-            yield Hypothesis.of(ELEMENT_POSITION, SetupPlace(name, axis=axis), offset, found.left)
+            yield Hypothesis.of(ELEMENT_POSITION, SetupPlace(name, axis=axis), offset, found.misfit)
 
 
 def _attached(scores: SetupScores, system: System, name: str, rules: SetupRules) -> Iterator[Hypothesis]:
@@ -64,7 +64,7 @@ def _attached(scores: SetupScores, system: System, name: str, rules: SetupRules)
                 continue
             if found.amount > rules.asked:
                 site = SetupPlace(name, detail=f"{end} {to}")
-                yield Hypothesis(WRONG_BODY, site, None, found.left, attaches(name, end, to))
+                yield Hypothesis(WRONG_BODY, site, None, found.misfit, attaches(name, end, to))
 
 
 def attaches(name: str, end: str, to: str) -> changes.Undo:

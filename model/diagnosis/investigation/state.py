@@ -96,7 +96,7 @@ class Found:
     trials: tuple[Trial, ...]  # that could have been chosen instead
     runner_up: Trial | None  # the best with another law
     p_value: float
-    disbelieved: tuple[Trial, ...] = ()  # that say more, with values that their laws cannot have
+    implausible: tuple[Trial, ...] = ()  # that say more, with values that their laws cannot have
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""Laws that were found, in their wider forms: valves and stops that differ in the two directions.
+"""Wider forms of the laws found: valves and stops that differ in the two directions.
 
-Two laws of one element are fitted as a sum of forces, but act on each other: a damper that is harder in extension and
-blows off does so from a harder slope.  Their sum fits nearly as well and has other values, with deviations that know
-nothing of it.  So a law's wider form competes with what would be found next, and where it cannot be told from the
-narrow one, values are uncertain by what both say.
+Two laws of one element are fitted as a sum of forces, but interact: a damper that is harder in extension and blows off
+does so from a harder slope.  Their sum fits nearly as well with biased values and too small stated errors.  So a law's
+wider form competes with the next finding, and where it cannot be distinguished from the narrow one, the difference of
+their values is part of the uncertainty.
 """
 
 from __future__ import annotations
@@ -30,35 +30,35 @@ from sprung.model.signals import FloatArray
 _FIRST, _MORE, _ROUNDS = 3, 10, 3  # iterations of a start, and of the best one in a round; rounds while it falls
 
 
-def tried_wider(state: Investigation) -> Investigation:
+def with_wider_tried(state: Investigation) -> Investigation:
     """The investigation with the laws found so far tried in their wider forms, if that has not been done."""
     if state.wider is not None and state.wider.of is state.fit:
         return state
     return replace(state, wider=TriedWider(state.fit, _best_widened(state)))
 
 
-def widest(state: Investigation) -> Widened | None:
-    """The wider form of a law of the present fit that gains most, where it was tried and has one."""
+def best_wider(state: Investigation) -> Widened | None:
+    """The best wider form of a law of the present fit, if forms were tried and a law has one."""
     known = state.wider
     return known.best if known is not None and known.of is state.fit else None
 
 
 def _best_widened(state: Investigation) -> Widened | None:
-    """The law found so far that gains most by its wider form; None: none has one."""
+    """The wider form of highest evidence among the laws found so far; None: no law has one."""
     if state.problem.process_noise:
         return None
     tried = [(index, _widened(state, index)) for index in range(state.given, len(state.fit.point.terms))]
     fits = [(index, fit) for index, fit in tried if fit is not None]
     rules = state.problem.rules.evidence
     least = min((fit.reduced for _, fit in fits), default=1.0)
-    # where one leaves less than the noise that the narrower one's misfit was taken for, by its own
+    # if one leaves less than the noise level estimated with the narrow form, that smaller level counts
     quiet = rules.quiet * (least if least < rules.quiet else 1.0)
     judged = [_judged(state, index, fit, quiet) for index, fit in fits]
     return max(judged, key=lambda one: one.evidence, default=None)
 
 
-def outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
-    """Whether the wider form of a law found says more than what would be found next."""
+def is_better(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
+    """Whether the wider form of a law found explains more than the best of the next trials."""
     if wide.evidence <= 0 or doubt(wide.fit, wide.fit.point.terms[wide.index], state.options.rules.plausible):
         return False
     if trials and trials[0].named and trials[0].evidence > wide.evidence:
@@ -69,22 +69,21 @@ def outdoes(state: Investigation, wide: Widened, trials: list[Trial]) -> bool:
     return not (held_out and state.held.compare(state.fit, wide.fit).refuted)
 
 
-def with_wider(state: Investigation, wide: Widened) -> Investigation:
+def adopt_wider(state: Investigation, wide: Widened) -> Investigation:
     """The investigation with a law that was found in its wider form."""
     problem, fit = refreshed(state.problem, wide.fit)
     last = screen(problem, fit, state.problem.system.catalogue, state.options.project)
     return replace(state, problem=problem, fit=fit, held=replace(state.held, noise=problem.noise), last=last)
 
 
-def left_open(state: Investigation) -> FloatArray:
-    """What the shapes of laws that act together leave open of parameters and laws, a covariance, (P + p, P + p).
+def form_covariance(state: Investigation) -> FloatArray:
+    """Covariance of parameters and laws from the choice between narrow and wider form, (P + p, P + p).
 
-    The present form is chosen; between it and the best wider one lies what the recording does not tell, by the odds of
-    the two, a commoner form being no likelier than a rarer one here (Bayesian model averaging, Hoeting et al. 1999).
+    Bayesian model averaging (Hoeting et al. 1999) over the present form and the best wider one, with equal prior odds.
     """
     fit = state.fit
     nothing = np.zeros_like(fit.covariance)
-    wide = widest(tried_wider(state)) if act_together(state) else None
+    wide = best_wider(with_wider_tried(state)) if share_an_element(state) else None
     if wide is None:
         return nothing
     rules = state.problem.rules.evidence
@@ -97,8 +96,8 @@ def left_open(state: Investigation) -> FloatArray:
     return share * (1 - share) * np.outer(between, between) if np.all(np.isfinite(between)) else nothing
 
 
-def act_together(state: Investigation) -> bool:
-    """Whether several laws were found at one element, whose forces may be no mere sum."""
+def share_an_element(state: Investigation) -> bool:
+    """Whether several laws were found at one element: their forces may interact."""
     places = [found.trial.term.location for found in state.found if isinstance(found.trial.term.law, ElementLaw)]
     return len(set(places)) < len(places)
 
@@ -106,7 +105,7 @@ def act_together(state: Investigation) -> bool:
 def with_wider_rivals(state: Investigation, trials: list[Trial]) -> list[Trial]:
     """Trials with the wider forms of the best of them at elements where a law was found already.
 
-    Beside a stop, valves that differ in the two directions are told as friction sooner than as valves that do not.
+    Beside a stop, friction fits valves that differ in the two directions better than symmetric valves do.
     """
     taken = {found.trial.term.location for found in state.found}
     beside = [trial for trial in trials if trial.finished and trial.evidence > 0 and trial.term.location in taken]
@@ -136,7 +135,7 @@ def _widened(state: Investigation, index: int) -> Fit | None:
 
 
 def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> Widened:
-    """What the wider form is worth over the present fit."""
+    """Evidence of the wider form over the present fit."""
     base, rules = state.fit, state.problem.rules.evidence
     gain = profile_gain(base.residual, fit.residual, len(state.problem.sensors), quiet, rules)
     fall = base.chi_square - fit.chi_square
@@ -145,7 +144,7 @@ def _judged(state: Investigation, index: int, fit: Fit, quiet: float) -> Widened
 
 
 def _cost(state: Investigation, fit: Fit, index: int) -> float:
-    """What the further parameters of a widened law cost in evidence."""
+    """Cost in evidence of the additional parameters of a widened law."""
     term, place = fit.point.terms[index], fit.place(index)
     more = slice(len(state.fit.point.terms[index].parameters), None)
     told = fit.covariance[place, place][more, more] / np.outer(term.slopes[more], term.slopes[more])
@@ -155,7 +154,7 @@ def _cost(state: Investigation, fit: Fit, index: int) -> float:
 
 
 def _starts(base: Fit, index: int) -> Iterator[Point]:
-    """Starts of the wider form of a term: as other laws of the element have it, and as the law itself says."""
+    """Starts of the wider form of a term: from values of the element's other laws, and the law's own starts."""
     term = base.point.terms[index]
     law = term.law
     wider = law.wider if isinstance(law, ElementLaw) else None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sprung.model.diagnosis.investigation.calibration import channels, faulty, in_order
+from sprung.model.diagnosis.investigation.calibration import calibration_indices, faulty, within_tolerance
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.diagnosis.report.values import law_parameters
@@ -16,16 +16,16 @@ def calibration_of(outcome: Outcome) -> tuple[IdentifiedLaw, ...]:
     """Those off by more than their deviation, the surest first; a gain that all channels share is told by none."""
     state, final = outcome.investigation, outcome.final
     faults = faulty(state)
-    indices = [index for index in channels(state) if index not in faults]
+    indices = [index for index in calibration_indices(state) if index not in faults]
     terms = state.fit.point.terms
-    indices += [state.given + at for at in range(len(state.found)) if in_order(state, terms[state.given + at])]
+    indices += [state.given + at for at in range(len(state.found)) if within_tolerance(state, terms[state.given + at])]
     found = []
     for index in indices:
         term = terms[index]
         (parameter,) = law_parameters(final, index, state.options.rules.plausible)
         found.append((abs(parameter.value - term.law.absent[0]) / parameter.std, term, parameter))
     for fault in state.input_faults:
-        if in_order(state, fault.term):
+        if within_tolerance(state, fault.term):
             spec, (value,) = fault.term.law.parameters[0], fault.term.parameters
             parameter = LawParameter(spec.name, value, fault.std, spec.unit)
             found.append((abs(value - fault.term.law.absent[0]) / max(fault.std, 1e-300), fault.term, parameter))

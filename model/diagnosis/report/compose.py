@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.calibration import channels
+from sprung.model.diagnosis.investigation.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.state import Investigation, Outcome, Recorded
 from sprung.model.diagnosis.report.advice import nothing_fits, search_ended, undecided
@@ -82,7 +82,7 @@ def _laws(outcome: Outcome, calibration: tuple[IdentifiedLaw, ...]) -> tuple[Ide
     count = state.given + (len(state.found) if outcome.judgement.carried else 0)
     found = []
     for index, term in enumerate(fit.point.terms[:count]):
-        moot = index in channels(state) and (term.location, term.law.name) not in told
+        moot = index in calibration_indices(state) and (term.location, term.law.name) not in told
         everywhere = isinstance(term.law, StructureLaw) and term.law.branches is not None  # no file has room for it
         if term.law.named and not moot and not everywhere:
             values, texts = law_parameters(fit, index, state.options.rules.plausible), formula_of(term)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sprung.model.diagnosis.investigation.calibration import faulty, in_order
+from sprung.model.diagnosis.investigation.calibration import faulty, within_tolerance
 from sprung.model.diagnosis.investigation.setup import SetupFault
 from sprung.model.diagnosis.investigation.state import Found, InputFault, NoiseFault, Outcome
 from sprung.model.diagnosis.investigation.verdict import EffectKind, kind_of
@@ -27,7 +27,7 @@ def findings_of(outcome: Outcome) -> list[Finding]:
         return []
     ranked = [(np.inf, _stuck_finding(name, at)) for name, at in state.prepared.stuck]
     ranked += [(np.inf, _setup_finding(f)) for f in state.setup_faults]
-    ranked += [(f.score, _input_finding(f)) for f in state.input_faults if not in_order(state, f.term)]
+    ranked += [(f.score, _input_finding(f)) for f in state.input_faults if not within_tolerance(state, f.term)]
     ranked += [_out_of_order(outcome, index) for index in faulty(state)]
     ranked += [(f.sigmas**2, _noise_finding(f)) for f in outcome.noise_faults]
     if said.carried:
@@ -65,7 +65,7 @@ def _physics(outcome: Outcome) -> list[Finding]:
     state, findings = outcome.investigation, []
     for index, found in enumerate(state.found):
         term = state.fit.point.terms[state.given + index]
-        if in_order(state, term):
+        if within_tolerance(state, term):
             continue
         parameters = _free(term, law_parameters(outcome.final, state.given + index, state.options.rules.plausible))
         rival = found.runner_up
@@ -104,7 +104,7 @@ def _look_alikes(found: Found, rules: ReportRules) -> tuple[str | None, str | No
     """
     best = found.trial
     close = [t for t in found.trials if t.evidence > best.evidence - rules.naming_margin]
-    close += found.disbelieved
+    close += found.implausible
     near = [
         t for t in close if t.named and t.term.location == best.term.location and t.term.law.name != best.term.law.name
     ]
@@ -182,7 +182,7 @@ def _setup_finding(fault: SetupFault) -> Finding:
     if fault.value is not None and fault.effect.parameter is not None:
         name, unit = fault.effect.parameter
         parameters = (LawParameter(name, fault.value, fault.std, unit),)
-    sentence = fault.effect.told(fault.site, parameters[0].words() if parameters else "")
+    sentence = fault.effect.describe(fault.site, parameters[0].words() if parameters else "")
     share = 100 * (1 - fault.after / fault.before)
     return Finding(
         location=fault.site.location,

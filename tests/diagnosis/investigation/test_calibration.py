@@ -22,14 +22,14 @@ def _of_ordinary_instruments(record: MadeRecord) -> MadeRecord:
     return record
 
 
-def _told(report: Report) -> dict[tuple[str, str], tuple[float, float]]:
+def _accepted(report: Report) -> dict[tuple[str, str], tuple[float, float]]:
     return {(one.location, one.effect): (p.value, p.std) for one in report.calibration for p in one.parameters}
 
 
 def test_a_rig_with_ordinary_instruments_is_consistent() -> None:
     report = diagnose(quarter_car(), _of_ordinary_instruments(simulate(seed=41)))
     assert (report.verdict, report.findings) == ("consistent", ())
-    told = _told(report)  # how gains differ is surer than what they are: the road's own is one of them
+    told = _accepted(report)  # how gains differ is surer than what they are: the road's own is one of them
     for key, truth in {("car_a", "sensor_gain"): 1.012, ("bogie_a", "sensor_gain"): 0.99}.items():
         assert abs(told[key][0] - truth) < 3 * told[key][1] < 0.03
     assert told["car_b", "sensor_bias"][0] == pytest.approx(0.012, abs=1e-3)
@@ -46,7 +46,7 @@ def test_beside_ordinary_instruments_a_law_is_the_only_finding() -> None:
     assert [(f.location, f.effect) for f in report.findings] == [("secondary", "coulomb_friction")]
     force = report.findings[0].parameters[0]
     assert abs(force.value - 300) < 3 * force.std
-    assert ("car_b", "sensor_bias") in _told(report)
+    assert ("car_b", "sensor_bias") in _accepted(report)
 
 
 @pytest.mark.slow

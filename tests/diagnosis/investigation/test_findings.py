@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from sprung.model.diagnosis.investigation.diagnose import _takes_up
+from sprung.model.diagnosis.investigation.minor import _absorbed
 from sprung.model.laws import CATALOGUE
 from sprung.model.laws.formula import formula_law
 from sprung.model.system import load_system
@@ -37,5 +37,5 @@ def after(*found: Any) -> Any:
 def test_parts_of_the_bodies_that_an_unlisted_force_pulls_take_up_what_it_leaves(
     law: str, location: str, gain: float, taken: bool
 ) -> None:
-    assert _takes_up(after(trial("formula", "secondary_1l", 900.0)), trial(law, location, gain)) is taken
-    assert not _takes_up(after(trial("coulomb_friction", "secondary_1l", 900.0)), trial(law, location, gain))
+    assert _absorbed(after(trial("formula", "secondary_1l", 900.0)), trial(law, location, gain)) is taken
+    assert not _absorbed(after(trial("coulomb_friction", "secondary_1l", 900.0)), trial(law, location, gain))

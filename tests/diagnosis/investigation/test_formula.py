@@ -13,7 +13,7 @@ import pytest
 from sprung.benchmarks.open_catalogue import OpenLaw, simulated
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
 from sprung.model.diagnosis.api import Options, Report, diagnose
-from sprung.model.diagnosis.investigation import diagnose as steps
+from sprung.model.diagnosis.investigation import formula_trial
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.compete import Trial
@@ -79,7 +79,7 @@ def test_a_spring_that_softens_and_stiffens_again_is_a_formula_and_no_bump_stop(
 def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_follows_the_motion(
     monkeypatch: pytest.MonkeyPatch, gain: float, left: float, expected: str | None
 ) -> None:
-    monkeypatch.setattr(steps, "missing", lambda problem, fit: left)
+    monkeypatch.setattr(formula_trial, "missing", lambda problem, fit: left)
     fit = SimpleNamespace(reduced=0.9, count=10_000)
 
     def trial(law: Any, gain: float, freedom: int) -> Trial:
@@ -99,7 +99,7 @@ def test_a_named_law_is_questioned_where_a_free_force_says_more_or_what_is_left_
     )
     leader, unnamed = trial(stop, 1000.0, 2), trial(force, gain, 18)
     led: dict[str | None, Trial | None] = {"force": unnamed, "stop": leader, None: None}
-    assert steps._led_by(state, [leader, unnamed]) is led[expected]
+    assert formula_trial._force_to_express(state, [leader, unnamed]) is led[expected]
 
 
 def test_a_law_of_the_catalogue_stays_one() -> None:

@@ -8,8 +8,14 @@ import pytest
 from sprung.model.diagnosis.fit.optimise import try_optimise
 from sprung.model.diagnosis.investigation.diagnose import begun
 from sprung.model.diagnosis.investigation.formula import formula_of
-from sprung.model.diagnosis.investigation.formula_doubt import doubt_of, missing, own_size, uncertainty, whole_force
-from sprung.model.diagnosis.investigation.formula_search import FormulaSearch, taken_out
+from sprung.model.diagnosis.investigation.formula_doubt import (
+    doubt_of,
+    missing,
+    nonlinear_rms,
+    uncertainty,
+    whole_force,
+)
+from sprung.model.diagnosis.investigation.formula_search import FormulaSearch, without_last_term
 from sprung.model.diagnosis.investigation.state import Investigation, Options
 from sprung.model.diagnosis.record.spectra import OVERSAMPLING
 from sprung.model.diagnosis.response.terms import Term
@@ -38,7 +44,7 @@ def unnamed() -> tuple[Investigation, Trial]:
 
 def test_the_residual_without_a_force_is_that_force_and_noise(unnamed: tuple[Investigation, Trial]) -> None:
     state, trial = unnamed
-    bare = taken_out(state.problem, trial.fit)
+    bare = without_last_term(state.problem, trial.fit)
     assert bare.chi_square > 5 * trial.fit.chi_square
     assert bare.jacobian.shape[1] == trial.fit.jacobian.shape[1] - len(trial.term.parameters)
     assert len(bare.point.terms) == len(trial.fit.point.terms) - 1
@@ -76,7 +82,7 @@ def test_a_sum_is_told_with_its_force_and_its_half_is_doubted(unnamed: tuple[Inv
     truth = (
         STIFFNESS["secondary"] * d + DAMPING["secondary"] * v + RATE * d * np.abs(v) + STOP * np.maximum(-d - GAP, 0)
     )
-    size = own_size(told.fit)
+    size = nonlinear_rms(told.fit)
     assert np.std(whole_force(told.fit) - truth) < 0.07 * size
     assert missing(state.problem, told.fit) < 0.05 and uncertainty(state.problem, told.fit) < 0.1 * size
     half = law_of((Shape(Factor("d", 1), Factor("abs(v)", 1, -1)),))

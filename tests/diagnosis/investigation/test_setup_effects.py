@@ -38,8 +38,8 @@ from tests.diagnosis_cases import quarter_car, simulate
 def test_every_kind_is_a_fault_of_the_measurement_with_words_of_its_own() -> None:
     for effect in SETUP_EFFECTS:
         assert kind_of(effect) is EffectKind.FAULT and not effect.ordinary
-        told = effect.told(SetupPlace("a|b", detail="lower car"), "7")
-        assert told.startswith("a and b: ") and ("7" in told) == (effect.parameter is not None)
+        words = effect.describe(SetupPlace("a|b", detail="lower car"), "7")
+        assert words.startswith("a and b: ") and ("7" in words) == (effect.parameter is not None)
     assert ONE_GAIN.ordinary
 
 

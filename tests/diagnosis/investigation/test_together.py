@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sprung.model.diagnosis.api import Options
-from sprung.model.diagnosis.investigation import diagnose
-from sprung.model.diagnosis.investigation.by_names import by_names
+from sprung.model.diagnosis.investigation import minor
+from sprung.model.diagnosis.investigation.named_laws import with_named_laws
 from sprung.model.laws import find_law
 from sprung.model.laws.formula import formula_law
 
@@ -63,7 +63,7 @@ def test_laws_with_names_stand_where_they_leave_next_to_nothing(left: float, ref
         return _Stand(left, VALVE_AND_STOP, options=state.options)
 
     unnamed: Any = _Stand(1.0, (SURFACE,), refuted)
-    chosen: Any = by_names(_Stand(40.0), unnamed, search, lambda share, text: None)  # type: ignore[arg-type]
+    chosen: Any = with_named_laws(_Stand(40.0), unnamed, search, lambda share, text: None)  # type: ignore[arg-type]
     assert asked == [False]
     assert (chosen.found == VALVE_AND_STOP) is taken
     assert chosen.options.unnamed
@@ -80,7 +80,7 @@ def test_a_formula_that_leaves_more_than_noise_makes_way_for_names_that_leave_le
         return state if state.found else _Stand(names, VALVE_AND_STOP, options=state.options, bounded=bounded)
 
     told: Any = _Stand(formula, (FORMULA,))
-    chosen: Any = by_names(_Stand(400.0), told, search, lambda share, text: None)  # type: ignore[arg-type]
+    chosen: Any = with_named_laws(_Stand(400.0), told, search, lambda share, text: None)  # type: ignore[arg-type]
     assert (chosen.found == VALVE_AND_STOP) is taken
 
 
@@ -88,7 +88,7 @@ def test_a_formula_that_leaves_more_than_noise_makes_way_for_names_that_leave_le
 def test_a_small_second_law_counts_where_it_explains_most_of_what_is_no_noise(
     worth: float, noisy: bool, counts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(diagnose, "leaves_more_than_noise", lambda state: noisy)
+    monkeypatch.setattr(minor, "leaves_more_than_noise", lambda state: noisy)
     state: Any = SimpleNamespace(options=Options(), fit=SimpleNamespace(chi_square=100.0))
     found: Any = SimpleNamespace(worth=worth)
-    assert diagnose._explains_the_rest(state, found) is counts
+    assert minor._explains_most_of_the_rest(state, found) is counts

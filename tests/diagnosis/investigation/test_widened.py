@@ -12,7 +12,7 @@ from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.fit.optimise import optimise
 from sprung.model.diagnosis.investigation import widened
 from sprung.model.diagnosis.investigation.diagnose import begun
-from sprung.model.diagnosis.investigation.widened import act_together, left_open, tried_wider, widest
+from sprung.model.diagnosis.investigation.widened import best_wider, form_covariance, share_an_element, with_wider_tried
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.diagnosis.selection.starts import start_of
@@ -41,10 +41,10 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> 
         fit = optimise(state.problem, start_of(fit, candidate), 6)
     found: Any = tuple(SimpleNamespace(trial=SimpleNamespace(term=term)) for term in fit.point.terms)
     state = replace(state, fit=fit, found=found)
-    assert act_together(state)
-    state = tried_wider(state)
-    wide = widest(state)
-    assert tried_wider(state) is state  # made once
+    assert share_an_element(state)
+    state = with_wider_tried(state)
+    wide = best_wider(state)
+    assert with_wider_tried(state) is state  # made once
     assert wide is not None and (wide.evidence > 20 if together else wide.evidence < 0)
     if together:
         term, place = wide.fit.point.terms[wide.index], wide.fit.place(wide.index)
@@ -56,13 +56,13 @@ def test_an_asymmetry_takes_part_in_the_valves_where_it_does(together: bool) -> 
 def test_what_a_wider_form_says_otherwise_is_left_open_by_its_odds(monkeypatch: pytest.MonkeyPatch) -> None:
     fit: Any = SimpleNamespace(covariance=np.zeros((2, 2)), point=_point([0.1], (0.2,), 0.0))
     wide: Any = SimpleNamespace(evidence=-12.0, index=0, fit=SimpleNamespace(point=_point([0.1], (0.3, 1.0), 12.0)))
-    monkeypatch.setattr(widened, "act_together", lambda state: True)
-    monkeypatch.setattr(widened, "tried_wider", lambda state: state)
-    monkeypatch.setattr(widened, "widest", lambda state: wide)
+    monkeypatch.setattr(widened, "share_an_element", lambda state: True)
+    monkeypatch.setattr(widened, "with_wider_tried", lambda state: state)
+    monkeypatch.setattr(widened, "best_wider", lambda state: wide)
     state: Any = SimpleNamespace(fit=fit, problem=SimpleNamespace(rules=RULES))
-    np.testing.assert_allclose(left_open(state), [[0.0, 0.0], [0.0, 0.25 * 0.1**2]])
+    np.testing.assert_allclose(form_covariance(state), [[0.0, 0.0], [0.0, 0.25 * 0.1**2]])
     wide.evidence = -60.0
-    assert np.all(left_open(state) < 1e-12)
+    assert np.all(form_covariance(state) < 1e-12)
 
 
 def _point(theta: Sequence[float], parameters: Sequence[float], prior_cost: float) -> Any:

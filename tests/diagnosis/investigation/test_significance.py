@@ -12,9 +12,9 @@ import pytest
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR
 from sprung.model.diagnosis.api import Options
 from sprung.model.diagnosis.fit import baseline
-from sprung.model.diagnosis.investigation.calibration import centred, freed, shared_gain
+from sprung.model.diagnosis.investigation.calibration import centred, shared_gain, with_free_gains
 from sprung.model.diagnosis.investigation.diagnose import begun
-from sprung.model.diagnosis.investigation.standing import standing
+from sprung.model.diagnosis.investigation.significance import without_insignificant
 from sprung.model.diagnosis.investigation.state import Found, Investigation
 from sprung.model.diagnosis.response.point import Point
 from sprung.model.diagnosis.response.terms import Term
@@ -35,7 +35,7 @@ def _heavier(ratio: float) -> Investigation:
 
 @pytest.mark.parametrize(("ratio", "kept"), [(1.0, 0), (1.2, 1)])
 def test_a_finding_no_further_from_nothing_than_its_deviation_is_taken_out(ratio: float, kept: int) -> None:
-    after = standing(_heavier(ratio))
+    after = without_insignificant(_heavier(ratio))
     assert len(after.found) == len(after.fit.point.terms) == kept
 
 
@@ -70,4 +70,4 @@ def test_gains_of_sensors_move_beside_a_law_and_those_of_what_drives_everything_
     law = Term(find_law("coulomb_friction"), "secondary", (300.0, 0.002), fixed=(False, True))
     fit: Any = make_dataclass("_Fit", ["point"])(Point(np.zeros(0), (*kept, law), np.zeros(0)))
     state: Any = SimpleNamespace(signals=SimpleNamespace(sensor_names=("car_a",)), given=2, calibrations=2)
-    assert [term.fixed for term in freed(state, fit).point.terms] == [(), (True,), (False, True)]
+    assert [term.fixed for term in with_free_gains(state, fit).point.terms] == [(), (True,), (False, True)]

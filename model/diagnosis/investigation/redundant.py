@@ -1,4 +1,4 @@
-"""Findings that a later one has made idle: what they explained at first, it explains too."""
+"""Findings that a later one has made redundant: it explains what they explained at first."""
 
 from __future__ import annotations
 
@@ -20,25 +20,25 @@ from sprung.model.laws import StructureLaw
 _STEPS = 8  # of a fit without one finding
 
 
-def without_idle(state: Investigation) -> Investigation:
-    """An investigation without earlier findings that explain next to nothing beside the last one."""
+def without_redundant(state: Investigation) -> Investigation:
+    """The investigation without earlier findings that explain next to nothing beside the last one."""
     rules = state.options.rules
     for index, found in enumerate(state.found[:-1]):
         other = without(state, index)
         if other is None:
             continue
-        dear = cost(state.fit, rules.evidence, state.given + index)
-        if _gain(other, state) < max(dear, rules.acceptance.idle * found.trial.gain):
-            return without_idle(other)
+        needed = cost(state.fit, rules.evidence, state.given + index)
+        if _gain(other, state) < max(needed, rules.acceptance.idle * found.trial.gain):
+            return without_redundant(other)
     return state
 
 
 def without(state: Investigation, index: int) -> Investigation | None:
-    """An investigation without one of its findings, everything else fitted again; None where that diverges."""
+    """The investigation without one of its findings, everything else fitted again; None where that diverges."""
     fit, problem = _without(state, state.given + index), state.problem
     if fit is None:
         return None
-    if problem.process_noise:  # what stands for it is noise of the forces
+    if problem.process_noise:  # the force noise takes its place
         problem, fit = refreshed(problem, fit)
     kept = (*state.found[:index], *state.found[index + 1 :])
     last = screen(problem, fit, problem.system.catalogue, state.options.project)
@@ -58,20 +58,22 @@ def _gain(other: Investigation, state: Investigation) -> float:
 def _without(state: Investigation, index: int) -> Fit | None:
     """The model without one of its terms, fitted again with the same weights; None where that diverges."""
     point, forces = state.fit.point, list(state.fit.point.warm_start)
-    near = [forces.pop(0) if is_waveform(term) and forces else None for term in point.terms]
+    warm = [forces.pop(0) if is_waveform(term) and forces else None for term in point.terms]
     terms = (*point.terms[:index], *point.terms[index + 1 :])
-    start = tuple(force for i, force in enumerate(near) if i != index and force is not None)
+    start = tuple(force for i, force in enumerate(warm) if i != index and force is not None)
     bare = Point(point.theta, terms, np.zeros(0), start)
     bare = replace(bare, state=np.zeros(state.problem.forward(bare).plant.structure.states))
-    tried = (try_optimise(state.problem, one, _STEPS, state.fit.whitener) for one in (bare, *_afresh(state, terms)))
+    tried = (
+        try_optimise(state.problem, one, _STEPS, state.fit.whitener) for one in (bare, *_fresh_starts(state, terms))
+    )
     return min((fit for fit in tried if fit is not None), key=lambda fit: fit.chi_square, default=None)
 
 
-def _afresh(state: Investigation, terms: tuple[Term, ...]) -> list[Point]:
-    """Starts as if the last finding, a part of the structure, had been the first.
+def _fresh_starts(state: Investigation, terms: tuple[Term, ...]) -> list[Point]:
+    """Starts as if the last finding, a change of the structure, had been the first.
 
-    Beside another one its values may be far from its own: two springs between the same bodies are as well one of them
-    moved and a third.
+    Beside another finding its values may be far from those it has alone: two springs between the same bodies are
+    equivalent to one of them moved and a third.
     """
     if len(terms) != state.given + 1 or not isinstance(terms[-1].law, StructureLaw):
         return []

@@ -1,0 +1,114 @@
+"""Selection of the candidates that are tried after the findings so far, and of trials too small to be findings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.investigation.judgement import is_part, leaves_more_than_noise
+from sprung.model.diagnosis.investigation.state import Investigation
+from sprung.model.diagnosis.screening.families import INPUT
+from sprung.model.diagnosis.screening.score import Candidate
+from sprung.model.diagnosis.selection.compete import Trial
+from sprung.model.diagnosis.selection.plausible import harmonic
+from sprung.model.laws import BodyLaw, ElementLaw, Law, StructureLaw
+
+
+def untried(state: Investigation, candidates: Iterable[Candidate]) -> list[Candidate]:
+    """Candidates to be tried: no input faults, not found before, and no harmonics of the excitation."""
+    return [
+        h
+        for h in candidates
+        if h.family is not INPUT
+        and (state.options.unnamed or h.term.law.named)
+        and not _repeats(state, h)
+        and not _hopeless(state, h)
+        and harmonic(state.problem.part, h.term, state.options.rules.plausible) is None
+    ]
+
+
+def _repeats(state: Investigation, candidate: Candidate) -> bool:
+    """Whether a candidate is a law that was found at its place, or any law where an unnamed force was found."""
+    for term in state.fit.point.terms:
+        if candidate.term.key[:2] == term.key[:2]:
+            return True
+        if candidate.location == term.location and not term.law.listed:
+            return True
+    return False
+
+
+def _hopeless(state: Investigation, candidate: Candidate) -> bool:
+    """Whether a candidate at the place of a finding would be minor even if it fitted as well as its score promises.
+
+    Only with process noise: there the predicted decrease of chi-square is a share of the unmeasured forces.
+    """
+    if not state.problem.process_noise:
+        return False
+    there = [found.trial for found in state.found if found.trial.term.location == candidate.location]
+    if there and not candidate.term.law.named:
+        return True
+    rules = state.options.rules.acceptance
+    left = float(np.sum(state.fit.noise.force**2))
+    promised = rules.better_than_promised * left * candidate.score / state.fit.chi_square
+    return any(promised < min(rules.minor_beside * trial.worth, rules.most_left * left) for trial in there)
+
+
+def is_minor(state: Investigation, trial: Trial) -> bool:
+    """Whether a trial explains too little beside the findings: a small residual is an inaccuracy of their laws."""
+    if _absorbed(state, trial):
+        return True
+    rules = state.options.rules.acceptance
+    even = (found.trial.gain for found in state.found if _of_all_springs(found.trial.term.law))
+    if is_part(trial.term.law) and trial.gain < rules.minor_beside * max(even, default=0.0):
+        return True  # material damping varies over frequency more than its law
+    for index, found in enumerate(state.found):
+        if found.trial.term.location != trial.term.location:
+            least = rules.minor_followed if state.problem.process_noise else rules.minor_elsewhere
+            if trial.gain < least * found.trial.gain:
+                return True
+        elif not trial.named:
+            return True
+        elif state.problem.process_noise:
+            left = float(np.sum(state.fit.noise.force**2))
+            if trial.worth < min(rules.minor_beside * found.trial.worth, rules.most_left * left):
+                return True
+        elif trial.worth < rules.minor_beside * _wald_statistic(state.fit, state.given + index, found.trial.term.law):
+            return not _explains_most_of_the_rest(state, trial)
+    return False
+
+
+def _of_all_springs(law: Law) -> bool:
+    return isinstance(law, StructureLaw) and law.branches is not None
+
+
+def _explains_most_of_the_rest(state: Investigation, trial: Trial) -> bool:
+    """Whether a small second law explains most of a residual that is far more than noise."""
+    most = trial.worth > state.options.rules.verdict.carried * state.fit.chi_square
+    return most and leaves_more_than_noise(state)
+
+
+def _absorbed(state: Investigation, trial: Trial) -> bool:
+    """Whether a structural change at the bodies of an unnamed force explains less than that force, and so its error."""
+    if not isinstance(trial.term.law, StructureLaw | BodyLaw):
+        return False
+    parts, elements = set(trial.term.location.split("|")), state.system.file.elements
+    unlisted = [found.trial for found in state.found if not found.trial.term.law.listed]
+    stronger = [one.term.location for one in unlisted if one.gain > trial.gain and one.term.location in elements]
+    return any(parts & {place, elements[place].upper, elements[place].lower} for place in stronger)
+
+
+def _wald_statistic(fit: Fit, index: int, found: Law) -> float:
+    """Wald statistic of a term: the rise of chi-square without it, from its strength and its standard deviation.
+
+    found: its law before it was widened, which has one strength where the wider form may have two.
+    """
+    term = fit.point.terms[index]
+    strength = (found.strength if isinstance(found, ElementLaw) else None) or 0
+    if not term.parameters:
+        return 0.0
+    absent = term.law.absent[strength] if isinstance(term.law, ElementLaw) else 0.0
+    size = term.parameters[strength] - (absent if np.isfinite(absent) else 0.0)
+    place = fit.place(index).start + strength
+    return float(size**2 / max(fit.covariance[place, place], 1e-300))
