@@ -55,7 +55,7 @@ def test_alarms_are_paged_to_the_last_one(client: TestClient, alarmed: int, acti
     while address:
         page = client.get(address)
         assert page.status_code == 200
-        seen += re.findall(r'"Raised">([^<]+)<', page.text)
+        seen += re.findall(r'"Since">([^<]+)<', page.text)
         states = re.findall(r'"State">(<button|<span class="soft">recovered)', page.text)
         assert active or not any("recovered" in one for one in states)
         following = re.search(r'<a href="([^"]+)" rel="next"', page.text)
