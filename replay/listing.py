@@ -77,7 +77,7 @@ def _columns(path: Path, extension: str, time: TimeColumn, notes: list[str]) -> 
         if others:
             notes.append(f"left out, since they hold no plain numbers: {some(others)}")
     else:
-        listed = parquet.listing(path)
+        listed, time = parquet.listing(path, time)
         times = time_name([name for name, _ in listed], time)
     if times is None and time.rate is None:
         notes.append(NO_TIME)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bounds import check_ratio, check_samples
 from sprung.replay.csvlayout import unit_in
 from sprung.replay.extras import needed
-from sprung.replay.tables import ROWS, Rows
+from sprung.replay.tables import ROWS, Rows, time_name
 
 
 def blocks(path: Path, channels: Sequence[Channel], account: Account, time: TimeColumn) -> Iterator[SampleBlock]:
@@ -25,7 +26,7 @@ def blocks(path: Path, channels: Sequence[Channel], account: Account, time: Time
     try:
         with pq.ParquetFile(path) as file:
             names = file.schema_arrow.names
-            rows = Rows(path, names, units(file), channels, time, account)
+            rows = Rows(path, names, units(file), channels, stamped(file.schema_arrow, time), account)
             check_samples(path, file.metadata.num_rows * max(len(rows.columns), 1))
             wanted = ([] if rows.time is None else [names[rows.time]]) + [names[i] for i in rows.columns]
             _check_pages(path, file.metadata, set(wanted))
@@ -36,8 +37,18 @@ def blocks(path: Path, channels: Sequence[Channel], account: Account, time: Time
         raise UnreadableRecording(f"{path}: not a Parquet file that can be read: {error}") from error
 
 
-def listing(path: Path) -> list[tuple[str, str | None]]:
-    """Name and unit of every column of numbers or times."""
+def stamped(schema: Any, time: TimeColumn) -> TimeColumn:
+    """Where the times are: where no name says so, in the only column of time stamps, such as a data frame's index."""
+    import pyarrow as pa
+
+    stamps = [field.name for field in schema if pa.types.is_timestamp(field.type)]
+    if time.rate is not None or len(stamps) != 1 or time_name(schema.names, time) is not None:
+        return time
+    return replace(time, name=stamps[0])
+
+
+def listing(path: Path, time: TimeColumn) -> tuple[list[tuple[str, str | None]], TimeColumn]:
+    """Name and unit of every column of numbers or times, and where the times are."""
     needed("pyarrow", "parquet", path)
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -47,7 +58,8 @@ def listing(path: Path) -> list[tuple[str, str | None]]:
             kinds = file.schema_arrow.types
             numeric = [pa.types.is_floating(k) or pa.types.is_integer(k) or pa.types.is_timestamp(k) for k in kinds]
             pairs = zip(file.schema_arrow.names, units(file), strict=True)
-            return [pair for pair, keep in zip(pairs, numeric, strict=True) if keep]
+            kept = [pair for pair, keep in zip(pairs, numeric, strict=True) if keep]
+            return kept, stamped(file.schema_arrow, time)
     except (pa.ArrowException, OSError) as error:
         raise UnreadableRecording(f"{path}: not a Parquet file that can be read: {error}") from error
 

@@ -12,6 +12,7 @@ import scipy.io
 from sprung.model.signals import Channel, FloatArray, TimeColumn
 from sprung.replay import UnreadableRecording, open_recording, series
 from sprung.replay.extras import needed
+from sprung.replay.listing import signals_of
 from sprung.replay.record import load_record
 from tests.replay.test_tables import SECONDS, START, VALUES, F, X, check, read
 from tests.replay_files import uff58
@@ -100,7 +101,8 @@ def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_pat
         assert "\n" not in str(error.value).strip()
 
 
-def test_parquet_with_real_time_stamps_and_units(tmp_path: Path) -> None:
+@pytest.mark.parametrize("time", [TimeColumn("when"), TimeColumn()])
+def test_parquet_with_real_time_stamps_and_units(tmp_path: Path, time: TimeColumn) -> None:
     stamps = (START + 10_000_000 * np.arange(500)).astype("datetime64[ns]")
     fields = [
         pa.field("when", pa.timestamp("ns")),
@@ -109,7 +111,8 @@ def test_parquet_with_real_time_stamps_and_units(tmp_path: Path) -> None:
     ]
     table = pa.table([pa.array(stamps), pa.array(VALUES[:, 0], pa.float32()), VALUES[:, 1]], schema=pa.schema(fields))
     pq.write_table(table, tmp_path / "a.parquet")
-    times, values, account = read(tmp_path / "a.parquet", time=TimeColumn("when"))
+    times, values, account = read(tmp_path / "a.parquet", time=time)
+    assert [channel.column for channel, _ in signals_of(tmp_path / "a.parquet").signals] == ["x", "F"]
     assert (times[0], times[-1]) == (START, START + 4_990_000_000)
     assert np.allclose(values, VALUES, atol=1e-7)
     assert not account.relative

@@ -45,7 +45,7 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
         found += [Alike(index, valve, here)] if valve is not None and _as_well(valve, here) else []
         near = step.chosen.evidence - task.rules.naming_margin
         for other in (*step.rivals, *step.forms):
-            if other.evidence > near or _leaves(here):
+            if other.evidence > near or here.leaves_more:
                 model = final.model.replaced(index, other.last, other.fit.model.shapes[-1])
                 one = Alike(index, refined(task, model), here)
                 found += (
@@ -54,17 +54,9 @@ def look_alikes(final: ComponentFit, steps: Sequence[Step], first: int) -> tuple
     return tuple(found)
 
 
-def _leaves(found: ComponentFit) -> bool:
-    """Whether a model leaves more than noise."""
-    return min(found.error, found.held_out) > found.task.rules.above * found.floor**2
-
-
 def _as_well(other: ComponentFit, found: ComponentFit) -> bool:
-    rules, noise, task = found.task.rules, found.floor**2, found.task
+    rules, task = found.task.rules, found.task
     behind = level_gain(other.error, found.error, effective_count(found.residual[: task.split]))
     if behind < rules.naming_margin or other.at_noise:
         return True
-    return _leaves(found) and all(
-        there - noise < rules.hardly_more * (here - noise)
-        for there, here in ((other.error, found.error), (other.held_out, found.held_out))
-    )
+    return found.leaves_more and other.leaves_hardly_more(found)

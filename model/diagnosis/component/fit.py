@@ -192,6 +192,17 @@ class ComponentFit:
         most = self.task.rules.declared * float(np.std(self.task.force))
         return float(np.hypot(self.task.bounded_noise, min(self.motion_noise, most)))
 
+    @property
+    def leaves_more(self) -> bool:
+        """Whether more than noise is left: then the model is not quite what is there."""
+        return max(self.error, self.held_out) > self.task.rules.above * self.floor**2
+
+    def leaves_hardly_more(self, best: ComponentFit) -> bool:
+        """Whether hardly more power is left beyond noise than another model leaves, in either part."""
+        noise, most = best.floor**2, self.task.rules.hardly_more
+        pairs = ((self.error, best.error), (self.held_out, best.held_out))
+        return all(here - noise < most * (there - noise) for here, there in pairs)
+
     def strengths_of(self, index: int) -> FloatArray:
         counts = [len(piece.signs) for piece in self.model.pieces]
         first = sum(counts[:index])

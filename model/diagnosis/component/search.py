@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 
@@ -261,6 +262,18 @@ def _determined(fit: ComponentFit) -> bool:
     return all(told)
 
 
+def _told_instead(ranked: list[Ranked]) -> list[Ranked]:
+    """Of laws whose force the record tells, best first, the first that leaves hardly more than the very best.
+
+    Where that leaves more than noise it is not quite what is there, and fits better because it may be many things.
+    """
+    best = ranked[0].fit
+    if not best.leaves_more:
+        return []
+    close = (r for r in ranked if r.fit.leaves_hardly_more(best) and _determined(r.fit))
+    return list(islice(close, 1))
+
+
 def _accepted(
     current: Ranked, ranked: list[Ranked], base: ComponentFit, rules: ComponentRules, tests: int
 ) -> Step | None:
@@ -273,7 +286,7 @@ def _accepted(
     if not near:
         return None
     # a law whose force the record does not tell is no name; what else it does not tell apart, the held-out part may
-    told = [r for r in near if _determined(r.fit)]
+    told = [r for r in near if _determined(r.fit)] or _told_instead(ranked)
     near = told or near
     # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
     alone = len(current.fit.model.pieces) == len(base.model.pieces)

@@ -5,11 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.signal import butter, chirp, sosfiltfilt
 
 from sprung.benchmarks.real_reference import bouc_wen
 from sprung.model.diagnosis.api import Report, diagnose
+from sprung.model.diagnosis.component.fit import ComponentTask
+from sprung.model.diagnosis.component.motion import element_motion
 from sprung.model.diagnosis.component.piece import FittedPiece
 from sprung.model.diagnosis.component.pieces import PIECES
+from sprung.model.diagnosis.component.search import search
 from sprung.model.diagnosis.rules import RULES
 from sprung.model.laws import SpringDamper
 from sprung.model.system import parse_system
@@ -66,6 +70,24 @@ def test_friction_that_falls_has_been_above_what_it_falls_to(smoothing: float, b
         values, np.array([128.0, 77.0]), shape, SpringDamper(K, C), D, 1e-3, RULES.component, 1 / RATE, 20.0
     )
     assert piece.believed(fit) is believed
+
+
+def test_friction_whose_fall_is_not_told_is_plain_friction_where_more_than_noise_is_left() -> None:
+    """A swept sine through the bench's low pass, with hum: Stribeck's law fits a little better, with a friction of none."""
+    fine, seconds = 4000.0, 20.0
+    t, random = np.arange(int(seconds * fine)) / fine, np.random.default_rng(1)
+    d = 0.02 * chirp(t, 0.1, seconds, 6.0) * np.linspace(1.0, 0.4, len(t))
+    v = np.gradient(d) * fine
+    low_pass = butter(8, 0.4 * RATE, fs=fine, output="sos")
+    force = sosfiltfilt(low_pass, 660.0 * d + 150.0 * v + 160.0 * np.tanh(v / 1e-3))[:: int(fine / RATE)]
+    seen = d[:: int(fine / RATE)] + 5e-6 * random.standard_normal(len(force))
+    force += 5.0 * np.sin(2 * np.pi * 50.0 * np.arange(len(force)) / RATE) + random.standard_normal(len(force))
+    motion = element_motion(seen, None, RATE)
+    task = ComponentTask(motion, force, int(0.7 * len(force)), noise=11.0, declared=1.0)
+    frictions = tuple(piece for piece in PIECES if piece.effect in ("coulomb_friction", "stribeck"))
+    found = search(task, frictions)
+    assert [step.chosen.last.effect for step in found.steps] == ["coulomb_friction"]
+    assert [rival.last.effect for rival in found.steps[0].rivals] == ["stribeck"]
 
 
 def test_presliding_is_dahls_with_its_force_and_stiffness() -> None:
