@@ -20,6 +20,7 @@ from sprung.service.store.vehicle_models import SERVICE_FILE
 log = logging.getLogger("sprung.engine")
 LATELY_SECONDS = 10.0  # for which it is taken for granted that nobody gave a vehicle another model
 MOST_LATELY = 10_000  # vehicles
+MOST_LAWS = 12  # in a vehicle's own file: a window with twice as many takes ten seconds, and others wait for it
 KEPT = 16  # engines of single vehicles in memory; one that is asked for again is loaded in a second
 
 
@@ -135,6 +136,8 @@ class Engines:
         differing = _differing(shared, system)
         if differing:
             raise UserError(f"{what}: {differing} of the service's system file are other ones")
+        if len(system.laws) > MOST_LAWS:
+            raise UserError(f"{what}: {len(system.laws)} laws; windows can be identified with {MOST_LAWS} at most")
         try:
             return self._make(self.shared.engine, system)
         except ValueError as error:  # a law that windows cannot hold

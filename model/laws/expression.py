@@ -14,6 +14,7 @@ Python is admitted, so that a formula from a file cannot do anything but calcula
 from __future__ import annotations
 
 import ast
+import math
 import operator
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+_LONGEST = 1000  # characters of a formula
+_MOST_INTEGER = 2**53  # beyond it integers are no doubles; larger numbers are written as 1e20
 MOTION = ("d", "v", "t", "z", "k", "c")  # what a formula may name besides the law's parameters
 
 
@@ -83,6 +86,8 @@ class Expression:
 
 def parse(text: str, known: Collection[str]) -> Expression:
     """Check a formula; `known` are the names that it may use.  Errors: `FormulaError`."""
+    if len(text) > _LONGEST:
+        raise FormulaError(f"formula {text[:40]!r}...: longer than {_LONGEST} characters")
     try:
         tree = ast.parse(text.strip(), mode="eval").body
         names = frozenset(_names(tree, text))
@@ -96,10 +101,17 @@ def parse(text: str, known: Collection[str]) -> Expression:
     return Expression(text.strip(), names, tree, _calculation(tree))
 
 
+def _is_number(value: int | float) -> bool:
+    """Whether a constant of a formula is a finite double."""
+    if isinstance(value, float):
+        return math.isfinite(value)
+    return not isinstance(value, bool) and abs(value) <= _MOST_INTEGER
+
+
 def _names(node: ast.expr, text: str) -> set[str]:
     """Names used below a node; raises for anything that is no arithmetic."""
     match node:
-        case ast.Constant(value=int() | float() as value) if not isinstance(value, bool) and np.isfinite(value):
+        case ast.Constant(value=int() | float() as value) if _is_number(value):
             return set()
         case ast.Name(id=name):
             return {name}

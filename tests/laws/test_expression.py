@@ -43,6 +43,8 @@ def test_a_laws_formula_is_its_force(law: ElementLaw) -> None:
     [
         "__import__('os')",
         "d.real",
+        "d * 1" + 40 * "0",
+        "d" + 600 * " + d",
         "d[0]",
         "lambda: d",
         "d if v else 1",

@@ -199,7 +199,9 @@ def test_wrong_models_are_refused_in_one_line(client: TestClient, core: Core, ri
     assert client.post("/vehicles/a/model", json={}).status_code == 422
     assert client.post("/vehicles/a/model", json={"version": 0, "system": FILE}).status_code == 422
     assert client.post("/vehicles/nobody/model", json={"system": FOUND}).status_code == 404
-    for text, said in ((FILE.replace("window: 200", "window: 100"), "window"), ("bodies: [", "system file")):
+    many = FOUND.replace("laws: [", "laws: [" + 12 * "{cubic_stiffness: {k3: 1.0e+6}}, ")
+    files = (FILE.replace("window: 200", "window: 100"), "bodies: [", many)
+    for text, said in zip(files, ("window", "system file", "13 laws"), strict=True):
         answer = client.post("/vehicles/a/model", json={"system": text})
         assert answer.status_code == 422 and said in answer.json()["detail"], answer.text
     assert client.post("/vehicles/a/model", json={"system": FOUND}).json()["in_use"] == 1
