@@ -120,7 +120,9 @@ def test_a_short_job_does_not_wait_for_a_long_one_of_another_kind(store: Store) 
 
     jobs = Jobs(store, {"slow": Kind(slow, 60), "quick": Kind(nothing, 60)}, 4)
     jobs.start()
-    long, short = jobs.submit("slow"), jobs.submit("quick")
+    long = jobs.submit("slow")
+    eventually(lambda: stored(store, long.id).state == "running")
+    short = jobs.submit("quick")
     eventually(lambda: stored(store, short.id).state == "done")
     assert stored(store, long.id).state == "running"
     end.set()

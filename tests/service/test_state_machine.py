@@ -101,8 +101,8 @@ class Books(RuleBasedStateMachine):
 
     @rule(vehicle=VEHICLES, level=st.floats(-0.5, 0.5))
     def late(self, vehicle: str, level: float) -> None:
-        """A ride from before everything: it is stored and does not turn the tracker back."""
-        if not self.given[vehicle]:
+        """A ride from before everything that was tracked: it is stored and does not turn the tracker back."""
+        if not self.given[vehicle] or self.pipeline.state(vehicle).time is None:
             return
         windower = windower_of(SYSTEM)
         first = -SYSTEM.window * (2 + 2 * len(self.given[vehicle]))
