@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg
 
-from sprung.model.schema import Body, ElementSensor, ForceInput, SystemFile
+from sprung.model.schema import GROUND, Body, ElementSensor, ForceInput, SystemFile
 from sprung.model.sensor_kinds import KINDS, Shown
 from sprung.model.signals import FloatArray, IntArray
 
@@ -229,7 +229,7 @@ def _deflections(file: SystemFile, freedom: _Freedom) -> tuple[FloatArray, Float
         for end, sign in ((element.upper, 1.0), (element.lower, -1.0)):
             if end in file.bodies:
                 H[e] += sign * freedom.point(end, element.position)
-            elif end != "ground":
+            elif end != GROUND:
                 G[e, supports.index(end)] += sign
     return H, G
 

@@ -48,6 +48,7 @@ class MassValue(Value):
 
 Mass = Annotated[MassValue, BeforeValidator(_as_value, json_schema_input_type=float | MassValue)]
 Point = tuple[float, float]
+GROUND = "ground"  # the fixed support, of every system
 Name = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_-]*$")]
 
 
@@ -273,8 +274,8 @@ class Parts:
 
     def _names(self) -> Iterator[str]:
         for group, members in (("bodies", self.bodies), ("inputs", self.inputs)):
-            if "ground" in members:
-                yield f"{group}.ground: the name ground is reserved for the fixed support"
+            if GROUND in members:
+                yield f"{group}.{GROUND}: the name {GROUND} is reserved for the fixed support"
         for name in self.inputs:
             if name in self.bodies:
                 yield f"inputs.{name}: a body has this name already"
@@ -290,11 +291,11 @@ class Parts:
             for side in ("upper", "lower"):
                 end = getattr(element, side)
                 yield from _missing(
-                    end, {*self.bodies, *supports, "ground"}, f"elements.{name}.{side}", "a body, a support or ground"
+                    end, {*self.bodies, *supports, GROUND}, f"elements.{name}.{side}", "a body, a support or ground"
                 )
             if element.upper == element.lower:
                 yield f"elements.{name}.lower: both ends are {element.upper!r}"
-            elif {element.upper, element.lower} <= {*supports, "ground"} - self.bodies.keys() and name not in tested:
+            elif {element.upper, element.lower} <= {*supports, GROUND} - self.bodies.keys() and name not in tested:
                 yield (
                     f"elements.{name}.upper: neither end is a body, so the element moves nothing; "
                     "with a force sensor on it, it is a component test"

@@ -165,6 +165,9 @@ class PlausibleRules:
     simulated: float = rule(
         1e-3, "of a law's parameter, that simulating kinks leaves; derived: 4 steps per sample", 3e-4, 3e-3
     )
+    spring: float = rule(
+        5.0, "times nominal or its inverse, as no linear part leaves a spring; chosen: it carries the load", 4.0, 10.0
+    )
     close: float = rule(1.0, "bins within which a frequency is a multiple; derived: none is known better", 0.5, 2.0)
 
 

@@ -22,7 +22,7 @@ from sprung.model.laws.channel import SensorResponse, passed, undone
 from sprung.model.mechanics import Mechanics
 from sprung.model.signals import FloatArray
 
-# "bodies": two bodies, or a body and a support; "axle": both supports of one
+# "bodies": two bodies, or a body and a support or the ground; "axle": both supports of one
 # "elements": all springs of a system together
 Where = Literal["element", "elements", "pair", "body", "bodies", "sensor", "support", "axle"]
 Channels = Literal["sensor", "support", "force"]
@@ -278,8 +278,8 @@ class BodyLaw(Parametrised):
 class Foothold(NamedTuple):
     """What a change of the structure takes hold of, by its index in the mechanics."""
 
-    kind: Literal["body", "support", "element"]
-    number: int
+    kind: Literal["body", "support", "element", "ground"]
+    number: int  # 0 of the ground
 
 
 @dataclass(frozen=True)

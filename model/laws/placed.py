@@ -11,7 +11,7 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, StructureLaw, SupportLaw
 from sprung.model.laws.expression import FormulaError
 from sprung.model.laws.formula import EFFECT, formula_law
-from sprung.model.schema import SupportInput, SystemFile
+from sprung.model.schema import GROUND, SupportInput, SystemFile
 
 _BESIDE = ("with", "variant", "formula", "memory")  # keys of a law that are no parameters
 
@@ -159,7 +159,8 @@ def _location(file: SystemFile, law: Law, location: str, setting: LawSetting) ->
         if partner is not None:
             raise ValueError("with: this law acts at one place")
         return location
-    known = {"pair": {*file.elements}, "axle": {*file.inputs}, "bodies": {*file.bodies, *_supports(file)}}[where]
+    ends = {*file.bodies, *_supports(file), GROUND}
+    known = {"pair": {*file.elements}, "axle": {*file.inputs}, "bodies": ends}[where]
     if not isinstance(partner, str) or partner not in known or partner == location:
         raise ValueError(f"with: the name of the other one is expected, not {partner!r}")
     return f"{location}|{partner}"

@@ -13,7 +13,7 @@ import numpy as np
 from sprung.model.laws.base import RARE, Foothold, Observed, ParameterSpec, StructureLaw, Values
 from sprung.model.laws.bodies import columns_of, with_element
 from sprung.model.mechanics import Mechanics
-from sprung.model.schema import SystemFile
+from sprung.model.schema import GROUND, SystemFile
 from sprung.model.signals import FloatArray
 
 AXES = {"x": "pitch", "y": "roll"}  # a place along an axis: the rotation that it is a lever of
@@ -55,7 +55,7 @@ def _connected(mechanics: Mechanics, sites: tuple[Foothold, ...], p: Values, var
     for sign, site in zip((1.0, -1.0), sites, strict=True):
         if site.kind == "body":
             row += sign * point(mechanics, site.number, x, y)
-        else:
+        elif site.kind == "support":
             ground[site.number] += sign
     return with_element(mechanics, row, stiffness, damping, ground)
 
@@ -238,7 +238,7 @@ DAMPING_CHANGE = _held("damping", "N s/m", 1, _more_damped, ("time_varying_dampi
 
 
 def sites_of(file: SystemFile, location: str) -> tuple[Foothold, ...]:
-    """What a location names: bodies, moving supports or elements, "|" between two."""
+    """What a location names: bodies, moving supports, the ground or elements, "|" between two."""
     supports = [name for name, source in file.inputs.items() if source.kind != "force"]
     found = []
     for name in location.split("|"):
@@ -246,6 +246,8 @@ def sites_of(file: SystemFile, location: str) -> tuple[Foothold, ...]:
             found.append(Foothold("body", list(file.bodies).index(name)))
         elif name in supports:
             found.append(Foothold("support", supports.index(name)))
+        elif name == GROUND:
+            found.append(Foothold("ground", 0))
         else:
             found.append(Foothold("element", list(file.elements).index(name)))
     return tuple(found)

@@ -26,7 +26,7 @@ from sprung.model.diagnosis.record.signals import white_noise
 from sprung.model.diagnosis.rules import RULES, ComponentRules, Rules
 from sprung.model.laws import Law, SpringDamper
 from sprung.model.laws.following import Covariate
-from sprung.model.schema import ElementSensor, SupportInput
+from sprung.model.schema import GROUND, ElementSensor, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -82,7 +82,7 @@ def is_component_test(system: System, values: FloatArray, rules: Rules = RULES) 
     held: dict[str, float] = dict.fromkeys(system.bodies, 0.0)
     for name, element in system.file.elements.items():
         ends = {element.upper, element.lower}
-        if name not in weighed and "ground" in ends:
+        if name not in weighed and GROUND in ends:
             for body in ends & held.keys():
                 held[body] += element.stiffness.value
     least = min(held.values())
@@ -194,7 +194,7 @@ def _deflection(
     displacement, velocity, has_velocity, left = np.zeros(count), np.zeros(count), True, _Wandering()
     for end, sign in ((ends.upper, 1.0), (ends.lower, -1.0)):
         if end not in system.file.inputs:
-            if end != "ground":
+            if end != GROUND:
                 notes.append(f"{end} hardly moves under the measured force: taken for ground")
             continue
         moved, rate, more = _motion_of(system, end, values, names, sample_rate, rules, notes)

@@ -52,7 +52,7 @@ from sprung.model.diagnosis.investigation.widened import (
 from sprung.model.diagnosis.record.channels import prepare
 from sprung.model.diagnosis.record.signals import Noise, declared_noise, drifting, transform
 from sprung.model.diagnosis.record.split import cut
-from sprung.model.diagnosis.rules import PlausibleRules, Rules
+from sprung.model.diagnosis.rules import Rules
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.compete import Trial, compete, preferred, runner_up, shortlist
 from sprung.model.diagnosis.selection.holdout import HeldOut
@@ -220,14 +220,16 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
     share = 0.25 + 0.17 * number
     tried = compete(state.problem, state.fit, candidates, lambda text: tell(share, text))
     tried = with_wider_rivals(state, tried)
-    believed = [t for t in tried if doubt(t.fit, t.term, plausible) is None]
+    doubts = [(t, doubt(t.fit, t.term, plausible, before=state.fit)) for t in tried]
+    believed = [t for t, reason in doubts if reason is None]
     there = [t for t in tried if not hardly_there(t.fit, plausible)]
     worthy = [t for t in there if t.finished and t.evidence > 0 and not is_minor(state, t)]
     plain = [t for t in worthy if any(t is one for one in believed)]
     trials = preferred(plain, options.rules.selection)
     trials.sort(key=lambda t: t.candidate.family.rank)  # faults of the inputs first, of forces as of motions
-    implausible = _implausible(worthy, trials, plausible)
-    state = replace(state, notes=(*state.notes, *(_implausible_note(one, plausible) for one in implausible)))
+    best = max((trial.evidence for trial in trials), default=-np.inf)
+    better = [(t, reason) for t, reason in doubts if reason and t.evidence > best and any(t is one for one in worthy)]
+    state = replace(state, notes=(*state.notes, *(_implausible_note(*one) for one in better)))
     if wide is not None and is_better(state, wide, trials):
         return _next_finding(adopt_wider(state, wide), number, tell)
     if not trials:
@@ -259,20 +261,17 @@ def _next_finding(state: Investigation, number: int, tell: Progress) -> Investig
         problem=problem,
         fit=fit,
         held=replace(state.held, noise=problem.noise),
-        found=(*state.found, Found(trial, tuple(t for t in trials if t is not trial), second, p_value, implausible)),
+        found=(
+            *state.found,
+            Found(trial, tuple(t for t in trials if t is not trial), second, p_value, tuple(t for t, _ in better)),
+        ),
         last=screen(problem, fit, problem.system.catalogue, options.project),
         notes=(*state.notes, *note),
     )
 
 
-def _implausible(worthy: list[Trial], believed: list[Trial], rules: PlausibleRules) -> tuple[Trial, ...]:
-    """Trials that fit better than every plausible one, with implausible values."""
-    best = max((trial.evidence for trial in believed), default=-np.inf)
-    return tuple(t for t in worthy if t.evidence > best and doubt(t.fit, t.term, rules) is not None)
-
-
-def _implausible_note(trial: Trial, rules: PlausibleRules) -> str:
-    name, reason = trial.term.law.name.replace("_", " "), doubt(trial.fit, trial.term, rules)
+def _implausible_note(trial: Trial, reason: str) -> str:
+    name = trial.term.law.name.replace("_", " ")
     return f"{name} at {trial.term.location} fits better, but is implausible and not named: {reason}"
 
 

@@ -22,7 +22,7 @@ from sprung.model.diagnosis.investigation.setup_effects import (
 from sprung.model.diagnosis.investigation.setup_scores import SetupScores
 from sprung.model.diagnosis.rules import SetupRules
 from sprung.model.diagnosis.screening.structures import turns
-from sprung.model.schema import ForceInput
+from sprung.model.schema import GROUND, ForceInput
 from sprung.model.system import System
 
 
@@ -54,7 +54,7 @@ def _attached(scores: SetupScores, system: System, name: str, rules: SetupRules)
     supports = [one for one, source in inputs.items() if not isinstance(source, ForceInput)]
     for end in ("upper", "lower"):
         now, other = getattr(element, end), getattr(element, {"upper": "lower", "lower": "upper"}[end])
-        others = [*system.bodies, "ground"] if now in (*system.bodies, "ground") else supports
+        others = [*system.bodies, GROUND] if now in (*system.bodies, GROUND) else supports
         for to in others:
             if to in (now, other):
                 continue

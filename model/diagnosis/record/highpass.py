@@ -16,7 +16,7 @@ from scipy.signal import butter, sosfiltfilt
 from sprung.model.diagnosis.record.signals import Signals
 from sprung.model.diagnosis.rules import RecordRules
 from sprung.model.mechanics import DISPLACEMENT, VELOCITY
-from sprung.model.schema import SupportInput
+from sprung.model.schema import GROUND, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -26,7 +26,7 @@ _ORDER = 4  # of the filter, which runs forwards and backwards
 def carries_everything(system: System, support: str) -> bool:
     """Whether all bodies rest on one support and nothing else: they wander with it, and no sensor sees that they do."""
     others = [n for n, source in system.file.inputs.items() if isinstance(source, SupportInput) and n != support]
-    grounded = any("ground" in (element.upper, element.lower) for element in system.file.elements.values())
+    grounded = any(GROUND in (element.upper, element.lower) for element in system.file.elements.values())
     absolute = np.isin(system.mechanics.sensor_kind, (DISPLACEMENT, VELOCITY)).any()
     return not (others or grounded or absolute)
 

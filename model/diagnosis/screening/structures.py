@@ -13,6 +13,7 @@ from itertools import combinations, combinations_with_replacement
 
 import numpy as np
 
+from sprung.model.diagnosis.record.highpass import carries_everything
 from sprung.model.diagnosis.record.spectra import ComplexArray
 from sprung.model.diagnosis.response.terms import Term, branches_of, supports
 from sprung.model.diagnosis.rules import ScreeningRules
@@ -20,6 +21,7 @@ from sprung.model.diagnosis.screening.families import PART, STRUCTURE
 from sprung.model.diagnosis.screening.score import Candidate, Projector
 from sprung.model.laws import Law, StructureLaw
 from sprung.model.laws.structure import AXES, moved_row, point_rows, sites_of
+from sprung.model.schema import GROUND, SupportInput
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
 
@@ -89,11 +91,22 @@ def _beside(projector: Projector, law: StructureLaw, along: int, name: str) -> C
 
 
 def unconnected(system: System) -> Iterator[tuple[str, str]]:
-    """Pairs of bodies, and of a body and a support that no element joins yet: beside one, that is its own stiffness."""
+    """Pairs of bodies, and of a body and a support or the ground that no element joins yet.
+
+    Beside one, a connection is its own stiffness.
+    """
     yield from combinations(system.bodies, 2)
     joined = {frozenset((element.upper, element.lower)) for element in system.file.elements.values()}
+    fixed = (*supports(system), GROUND) if _knows_ground(system) else supports(system)
     for body in system.bodies:
-        yield from ((body, name) for name in supports(system) if frozenset((body, name)) not in joined)
+        yield from ((body, name) for name in fixed if frozenset((body, name)) not in joined)
+
+
+def _knows_ground(system: System) -> bool:
+    """Whether recordings tell where bodies are above the ground, and not just above a support that carries them all."""
+    source = system.file.inputs[supports(system)[0]] if supports(system) else None
+    accelerated = isinstance(source, SupportInput) and {*source.measured} == {"acceleration"}
+    return not (accelerated and carries_everything(system, supports(system)[0]))
 
 
 def turns(system: System, element: str, axis: str) -> bool:
@@ -127,7 +140,7 @@ def _forms(places: FloatArray, free: tuple[bool, ...]) -> tuple[list[tuple[int, 
 
 
 def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -> tuple[Candidate, int]:
-    """The best place of a spring-damper between two bodies, or a body and a support."""
+    """The best place of a spring-damper between two bodies, or a body and a support or the ground."""
     system, fit, band = projector.problem.system, projector.fit, projector.grid.band
     location = f"{one}|{other}"
     places, free = _places(system, (one, other))
@@ -135,7 +148,7 @@ def _connection(projector: Projector, law: StructureLaw, one: str, other: str) -
     for sign, site in zip((1.0, -1.0), sites_of(system.file, location), strict=True):
         if site.kind == "body":
             rows += sign * point_rows(system.mechanics, site.number)
-        else:
+        elif site.kind == "support":
             below = _support_motion(projector, site.number)
             places = _held_at(system, one, other)
     rows = np.pad(rows, ((0, 0), (0, fit.motions.position.shape[1] - system.mechanics.n)))

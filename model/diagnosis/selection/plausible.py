@@ -1,7 +1,8 @@
 """Values that a law cannot have in earnest: what has them is not named as physics, however well it fits.
 
 A knee that the motion passes within one sample is a jump, and so is friction; a sensor that shows six times the truth
-and a body of 2.7 times its mass stand for something else; a periodic force at a multiple of the excitation's own
+and a body of 2.7 times its mass stand for something else, and so does a part of the structure beside which a spring is
+left with a tenth of its stiffness; a periodic force at a multiple of the excitation's own
 frequency is what anything non-linear answers with.
 """
 
@@ -18,9 +19,12 @@ from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw, SupportLaw, rev
 from sprung.model.signals import FloatArray
 
 
-def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
-    """Why a fitted term is not believed, in words; None: nothing speaks against it."""
-    reason = out_of_range(term)
+def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, before: Fit | None = None) -> str | None:
+    """Why a fitted term is not believed, in words; None: nothing speaks against it.
+
+    before: the model without it, where that is known.
+    """
+    reason = out_of_range(term) or (displaced_spring(before, fit, term, rules) if before is not None else None)
     if reason is not None:
         return reason
     if isinstance(term.law, ElementLaw) and term.law.corner is not None and _saturates(fit, term, rules):
@@ -50,6 +54,22 @@ def out_of_range(term: Term) -> str | None:
         if not low <= value <= high:
             unit = "" if spec.unit == "1" else f" {spec.unit}"
             return f"{spec.name} {value:.3g}{unit} lies outside {low:g} to {high:g}"
+    return None
+
+
+def displaced_spring(before: Fit, fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible) -> str | None:
+    """A spring far from nominal beside a linear part, and not without it: the part imitates what is missing elsewhere.
+
+    What yields or slips may well take a spring's place; what is linear leaves it the static load.
+    """
+    law = term.law
+    linear = isinstance(law, (BodyLaw, StructureLaw)) or (isinstance(law, ElementLaw) and law.memory_decay is not None)
+    if not linear:
+        return None
+    most = np.log(rules.spring)
+    for parameter, was, now in zip(fit.forward.system.parameters, before.point.theta, fit.point.theta, strict=True):
+        if parameter.quantity == "stiffness" and abs(was) < most < abs(now):
+            return f"{parameter.name} would be {np.exp(now):.2g} times nominal beside it"
     return None
 
 

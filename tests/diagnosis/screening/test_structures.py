@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import yaml
@@ -37,6 +39,21 @@ def test_a_part_that_the_file_lacks_is_named_with_its_values(kind: str, seed: in
         assert parameter.value == pytest.approx(part.parameters[parameter.name], abs=5 * parameter.std)
 
 
+def test_a_damper_to_the_ground_is_a_connection() -> None:
+    """A skyhook: nothing between the axles and the body imitates it."""
+    data = copy.deepcopy(FILE)
+    size = 0.8 * data["elements"]["spring_front"]["damping"]
+    place = {"x": 0.0, "y": 0.0}
+    hidden = {"upper": "frame", "lower": "ground", "position": [0, 0], "stiffness": 0.0, "damping": size}
+    data["elements"]["hidden"] = hidden
+    part = ConcealedPart("missing_connection", "frame|ground", {"stiffness": 0.0, "damping": size, **place}, data)
+    record, _ = made(part, FILE, SYSTEM, np.random.default_rng(8), 25.0)
+    report = diagnose(SYSTEM, record, Options())
+    assert [(f.location, f.effect) for f in report.findings] == [(part.location, part.effect)]
+    damping = next(p for p in report.findings[0].parameters if p.name == "damping")
+    assert damping.value == pytest.approx(size, rel=0.02)
+
+
 def test_a_clean_recording_lacks_nothing() -> None:
     _, record = _recording("clean", 6)
     report = diagnose(SYSTEM, record, Options())
@@ -69,3 +86,4 @@ def test_connections_are_sought_where_no_element_is() -> None:
     pairs = set(unconnected(SYSTEM))
     assert ("front", "rear") in pairs and ("frame", "road_front") in pairs
     assert ("front", "road_front") not in pairs
+    assert ("frame", "ground") in pairs and ("road_front", "ground") not in pairs

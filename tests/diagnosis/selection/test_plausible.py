@@ -11,7 +11,14 @@ import pytest
 
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term
-from sprung.model.diagnosis.selection.plausible import doubt, excitation_lines, hardly_there, harmonic, out_of_range
+from sprung.model.diagnosis.selection.plausible import (
+    displaced_spring,
+    doubt,
+    excitation_lines,
+    hardly_there,
+    harmonic,
+    out_of_range,
+)
 from sprung.model.laws import find_law
 
 GRID = Grid(4000, 0.01)
@@ -123,3 +130,24 @@ def test_what_is_damped_as_strongly_as_a_damper_is_no_elastic_mode() -> None:
     law = find_law("flexible_mode")
     for ratio, believed in ((0.05, True), (0.46, False)):
         assert (doubt(fit, Term(law, "floor", (3.0, ratio, 0.3), "z")) is None) == believed
+
+
+@pytest.mark.parametrize(
+    ("law", "was", "now", "doubted"),
+    [
+        ("air_spring", 0.8, 0.12, True),  # takes the place of the spring that it stands beside
+        ("air_spring", 0.8, 0.4, False),
+        ("missing_connection", 1.0, 7.0, True),
+        ("air_spring", 0.1, 0.12, False),  # the file's value was no guide in the first place
+        ("bouc_wen", 0.8, 0.01, False),  # what slips may be all that there is
+    ],
+)
+def test_a_linear_part_leaves_a_spring_its_load(law: str, was: float, now: float, doubted: bool) -> None:
+    spring = SimpleNamespace(name="strut.stiffness", quantity="stiffness")
+    damper = SimpleNamespace(name="strut.damping", quantity="damping")
+    forward = SimpleNamespace(system=SimpleNamespace(parameters=(spring, damper)))
+    before: Any = SimpleNamespace(point=SimpleNamespace(theta=np.log([was, 1.0])))
+    fit: Any = SimpleNamespace(forward=forward, point=SimpleNamespace(theta=np.log([now, 0.01])))
+    found = find_law(law)
+    reason = displaced_spring(before, fit, Term(found, "strut", found.absent))
+    assert (reason is not None) == doubted
