@@ -1,4 +1,4 @@
-"""The account of one input: what became of every message, and what a user must be told about it."""
+"""Account of one input: what became of every message, and the messages to the user."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from sprung.model.signals import ANY_TIME, FloatArray, IntArray, TimeColumn
 from sprung.replay.account import Account
 from sprung.replay.listing import NO_TIME, signals_of
 from sprung.replay.recording import open_recording
-from sprung.replay.sampling import pace
+from sprung.replay.sampling import sampling_clock
 
 MOST_SAMPLES = 40_000_000  # of all channels together that are kept; of longer recordings the first part is looked at
 GAP = 2.5  # periods without a sample
@@ -140,7 +140,7 @@ def look(name: str, address: dict[str, str], unit: str | None, time: IntArray, v
     signal.rising = _rises_evenly(value)
     steps = np.diff(elapsed)
     signal.duplicate_times = int((steps <= 0).sum())
-    found = pace(time)
+    found = sampling_clock(time)
     if found is None:
         return signal
     signal.rate = 1.0 / found.period

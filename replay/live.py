@@ -19,7 +19,7 @@ from sprung.replay.bus import BusAddress, lost_by_kernel, opening_options, widen
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import EXTENDED, FrameBlock
-from sprung.replay.plausible import OUT_OF_TIME, Screen, nanoseconds
+from sprung.replay.plausibility import OUT_OF_TIME, PlausibilityCheck, nanoseconds
 from sprung.replay.recording import CAN_READERS
 
 FIRST_RETRY, LAST_RETRY = 0.5, 10.0  # s, doubled from try to try
@@ -74,7 +74,7 @@ class LiveBus:
         self._behind = False
         self._asked = 0.0
         self._decoder = CanDecoder(channels, dbc)
-        self._screen = Screen(channels, self.account, converter(channels))
+        self._plausibility = PlausibilityCheck(channels, self.account, converter(channels))
         self._ids = frozenset(self._decoder.ids.tolist())
         self._latency = latency
         wanted = opening_options(self.address, sorted(self._ids))
@@ -106,7 +106,7 @@ class LiveBus:
                         wanted = self._current(self._wanted(messages))
                         if not wanted:
                             continue
-                        block = self._screen.check(
+                        block = self._plausibility.check(
                             self._decoder.decode(frame_block(wanted, self.account), self.account)
                         )
                         if len(block.time):

@@ -25,7 +25,7 @@ from sprung.model.signals import FloatArray, IntArray
 from sprung.replay.account import Account
 from sprung.replay.jsonkeys import KeyTwice, load, may_name_twice
 from sprung.replay.mcapfile import Messages
-from sprung.replay.plausible import LATEST
+from sprung.replay.plausibility import LATEST
 
 TimeSource = Literal["auto", "header", "publish", "log"]
 STAMP_PATHS = (("header", "stamp"), ("timestamp",), ("stamp",))

@@ -16,7 +16,7 @@ from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bounds import check_whole, mdf_sizes
 from sprung.replay.frames import BLOCK_FRAMES, EXTENDED, FrameBlock
-from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_TIME
+from sprung.replay.plausibility import EARLIEST, LATEST, OUT_OF_TIME
 
 SIGNATURES = (b"MDF", b"UnFinMF")  # the second of a logger that was not stopped
 

@@ -12,9 +12,9 @@ from cantools.database import Database
 from sprung.model.signals import ANY_TIME, BoolArray, Channel, FloatArray, SampleBlock, TimeColumn
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.grid import REACH, place, resample, taken_at_stamps, uneven
+from sprung.replay.multirate import slower_than
 from sprung.replay.recording import Recording, open_recording
-from sprung.replay.slower import slower_than
-from sprung.replay.stream import ClockJump, Order
+from sprung.replay.stream import ClockJump, Reorderer
 
 MOST_CELLS = 500_000_000  # rows times channels of one record; 4 GB
 CELLS_ALWAYS, CELLS_PER_SAMPLE = 2_000_000, 50  # and at most so many: a record that is nearly all gaps is none
@@ -58,7 +58,7 @@ def load_record(
     the longest stretch is kept and the others are named in `problems`.
     """
     recording = open_recording(path, channels, dbc=dbc, time_source=time_source, time=time, start=start)
-    stretches = _stretches(recording, Order(delay, pause, confirm=max(8, 2 * len(channels))), sample_rate)
+    stretches = _stretches(recording, Reorderer(delay, pause, confirm=max(8, 2 * len(channels))), sample_rate)
     longest = max(stretches, key=lambda block: len(block.time))
     if len(stretches) > 1:
         left_out = sum(len(block.time) for block in stretches) - len(longest.time)
@@ -87,7 +87,7 @@ def _tell_losses(recording: Recording, missing: BoolArray, absent: BoolArray, sa
         )
 
 
-def _stretches(recording: Recording, order: Order, sample_rate: float) -> list[SampleBlock]:
+def _stretches(recording: Recording, order: Reorderer, sample_rate: float) -> list[SampleBlock]:
     """Runs of samples without a clock jump between them."""
     runs: list[list[SampleBlock]] = [[]]
     for block in recording.at_rate(sample_rate):

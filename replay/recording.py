@@ -15,12 +15,12 @@ from cantools.database import Database
 from sprung.model.signals import ANY_TIME, Channel, SampleBlock, Tally, TimeColumn
 from sprung.replay import asc, blf, candump, csvtable, mcaptopics, mf4, parquet, series
 from sprung.replay.account import Account, UnreadableRecording
-from sprung.replay.beside import Beside
+from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.replay.bounds import FOR_ITS_SIZE, most_samples
 from sprung.replay.candecode import CanDecoder
 from sprung.replay.convert import converter
 from sprung.replay.frames import FrameBlock
-from sprung.replay.plausible import Screen
+from sprung.replay.plausibility import PlausibilityCheck
 from sprung.replay.sampling import at_rate
 from sprung.replay.stamps import ABSOLUTE, SECOND
 from sprung.replay.tables import column_blocks
@@ -62,7 +62,7 @@ class Recording:
         self.seen = np.zeros(len(channels), dtype=bool)  # channels of which at least one valid value came
         self._source = source
         self._start = start
-        self._screen = Screen(channels, account, converter(channels))
+        self._plausibility = PlausibilityCheck(channels, account, converter(channels))
 
     @property
     def stamped(self) -> bool:
@@ -79,7 +79,7 @@ class Recording:
         """
         blocks = self.blocks()
         if self.beside:
-            apart = apart or Beside(len(self.channels) - self.beside, self.beside).keep
+            apart = apart or AuxiliaryMeans(len(self.channels) - self.beside, self.beside).keep
             blocks = (left for left in map(apart, blocks) if len(left.time))
         return at_rate(blocks, self.channels[: len(self.channels) - self.beside], sample_rate, self.account, self.path)
 
@@ -92,13 +92,13 @@ class Recording:
             left -= len(raw.time)
             if left < 0:
                 raise UnreadableRecording(f"{self.path}: gives more samples than {FOR_ITS_SIZE}")
-            block = self._screen.check(raw)
+            block = self._plausibility.check(raw)
             if len(block.time):
                 self.seen[block.channel[~np.isnan(block.value)]] = True
                 if shift is None:
                     shift = self._shift(int(block.time.min()))
                 yield SampleBlock(block.time + shift, block.channel, block.value) if shift else block
-        self._screen.tell()
+        self._plausibility.tell()
         if not self.seen[: len(self.seen) - self.beside].any():
             raise UnreadableRecording(self._nothing())
         if not self.seen.all():

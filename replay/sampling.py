@@ -36,15 +36,15 @@ NEVER = np.iinfo(np.int64).min
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class SamplingClock:
     """How a channel samples."""
 
     period: float  # s
     jitter: float  # standard deviation of its stamps about an even clock, periods
 
 
-def pace(time: IntArray) -> Pace | None:
-    """The pace of sorted times (ns), in the longest stretch without gaps; None with too few of them."""
+def sampling_clock(time: IntArray) -> SamplingClock | None:
+    """The sampling clock of sorted times (ns), in the longest stretch without gaps; None with too few of them."""
     steps = np.diff(time).astype(np.float64) / 1e9
     if len(steps) < 3 or not steps.any():
         return None
@@ -55,13 +55,13 @@ def pace(time: IntArray) -> Pace | None:
     longest = int(np.argmax(np.diff(cuts)))
     run = time[cuts[longest] + 1 : cuts[longest + 1] + 1]
     if len(run) < 4:
-        return Pace(float(typical.mean()), np.inf)
+        return SamplingClock(float(typical.mean()), np.inf)
     elapsed = (run - run[0]) / 1e9
     count = np.arange(len(run))
     slope, start = np.polyfit(count, elapsed, 1)
     if not slope > 0:
         return None
-    return Pace(float(slope), float(np.std(elapsed - start - slope * count) / slope))
+    return SamplingClock(float(slope), float(np.std(elapsed - start - slope * count) / slope))
 
 
 def at_rate(
@@ -83,11 +83,11 @@ def at_rate(
             break
     if not held:
         return
-    paces = _paces(held, len(channels))
-    _refuse_slow(paces, channels, sample_rate, account, path)
+    clocks = _clocks(held, len(channels))
+    _refuse_slow(clocks, channels, sample_rate, account, path)
     reducers = {
         index: Reducer(found.period, sample_rate)
-        for index, found in paces.items()
+        for index, found in clocks.items()
         if found.period * sample_rate * FASTER <= 1.0 and found.jitter < JITTER
     }
     if not reducers:
@@ -116,22 +116,22 @@ def _probed(held: list[SampleBlock], channels: int) -> bool:
     return bool((counts[counts > 0] >= PROBE_SAMPLES).all())
 
 
-def _paces(held: list[SampleBlock], channels: int) -> dict[int, Pace]:
+def _clocks(held: list[SampleBlock], channels: int) -> dict[int, SamplingClock]:
     time = np.concatenate([block.time for block in held])
     channel = np.concatenate([block.channel for block in held])
-    found = {index: pace(np.sort(time[channel == index])) for index in range(channels)}
+    found = {index: sampling_clock(np.sort(time[channel == index])) for index in range(channels)}
     return {index: one for index, one in found.items() if one is not None}
 
 
 def _refuse_slow(
-    paces: dict[int, Pace], channels: Sequence[Channel], sample_rate: float, account: Account, path: Path
+    clocks: dict[int, SamplingClock], channels: Sequence[Channel], sample_rate: float, account: Account, path: Path
 ) -> None:
     """Complain about channels that are too slow for the grid; refuse when all are."""
-    slow = {i: one for i, one in paces.items() if one.period * sample_rate > 1.0 / (SLOWEST * 0.98)}
+    slow = {i: one for i, one in clocks.items() if one.period * sample_rate > 1.0 / (SLOWEST * 0.98)}
     if not slow:
         return
     period = min(one.period for one in slow.values())
-    if len(slow) < len(paces):
+    if len(slow) < len(clocks):
         names = ", ".join(channels[i].name for i in list(slow)[:5])
         account.note(f"slower than half of {sample_rate:g} Hz, so left out: {names} ({1 / period:.3g} Hz)")
         return

@@ -18,7 +18,7 @@ class ClockJump:
     at: int  # ns, the first time after it
 
 
-class Order:
+class Reorderer:
     """Splits blocks where the clock jumps and drops what comes too late.
 
     A sample belongs to the stream when it is at most `delay` older than the newest one and at most `pause` newer.

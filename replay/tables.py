@@ -16,7 +16,7 @@ from sprung.model.units import FACTORS, known
 from sprung.replay.account import Account, UnreadableRecording
 from sprung.replay.bounds import check_samples
 from sprung.replay.csvlayout import unit_in
-from sprung.replay.slower import SlowerColumns
+from sprung.replay.multirate import MultirateColumns
 from sprung.replay.stamps import SECOND, Stamps
 
 ROWS = 16_384  # that are handed out together
@@ -180,7 +180,7 @@ class Rows:
         unit = None if self.time is None else seconds_of(units[self.time])
         self._stamps = Stamps(time, unit, account)
         self._rows = 0
-        self._slower = SlowerColumns()
+        self._slower = MultirateColumns()
         if self.time is None:
             account.relative = True
 
@@ -273,7 +273,7 @@ class _Series:
         if isinstance(time, Column):
             unit = seconds_of(time.unit) or seconds_of(unit_in(time.name.rsplit("/", 1)[-1])[1])
         self._stamps = Stamps(key, unit, account)
-        self._slower = SlowerColumns()
+        self._slower = MultirateColumns()
         self._epoch = key.epoch or 0
         self._at = 0
         self._held: list[SampleBlock] = []

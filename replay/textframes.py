@@ -10,7 +10,7 @@ import numpy as np
 
 from sprung.replay.account import Account
 from sprung.replay.frames import EXTENDED, FrameBlock
-from sprung.replay.plausible import EARLIEST, LATEST
+from sprung.replay.plausibility import EARLIEST, LATEST
 
 BATCH_BYTES = 1 << 19
 LONGEST_LINE = 1 << 12  # bytes; an FD frame in decimal digits takes about 400

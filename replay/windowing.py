@@ -11,7 +11,7 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, Channel, FloatArray, IntArray, SampleBlock, Window
 from sprung.replay.grid import REACH, SLOWEST, Placed, Resampled, by_count, fill, place, resample, uneven
-from sprung.replay.stream import ClockJump, Order
+from sprung.replay.stream import ClockJump, Reorderer
 
 FOLLOW = 0.1  # of a period: common phase of the samples beyond which the grid follows them
 MOST_WINDOWS = 64  # that are made together
@@ -59,7 +59,7 @@ class Windower:
         self.is_input = np.array([name in wanted for name in names])
         self.longest_gap = longest_gap
         self.largest_share = largest_share
-        self.order = Order(delay, pause, confirm=max(8, 2 * len(names)))
+        self.order = Reorderer(delay, pause, confirm=max(8, 2 * len(names)))
         self.delay, self.pause = delay, pause
         self.stamped = stamped
         self.reasons: Counter[str] = Counter()  # windows repaired or dropped, and samples dropped, by reason

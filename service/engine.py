@@ -145,14 +145,19 @@ def make_tracker(system: System) -> Tracker:
     elements = system.file.elements.items()
     masses = {body: tuple(n for n, e in elements if body in (e.upper, e.lower)) for body in system.built}
     return Tracker(
-        system.tracked, settings, deviations(system), limits=limits, doubt=_mass_doubt(system), masses=masses
+        system.tracked,
+        settings,
+        deviations(system),
+        limits=limits,
+        model_uncertainty=_model_uncertainty(system),
+        masses=masses,
     )
 
 
-def _mass_doubt(system: System) -> tuple[FloatArray, FloatArray] | None:
-    """Variances of parameters, and covariance of gains, delays and loads, that doubtful masses, places and laws leave
-    open; None: nothing is in doubt."""
-    from sprung.model.identification.doubt import mass_doubt  # brings torch
+def _model_uncertainty(system: System) -> tuple[FloatArray, FloatArray] | None:
+    """Systematic variances of parameters, and covariance of gains, delays and loads, from masses, positions and laws;
+    None: there are none."""
+    from sprung.model.identification.model_uncertainty import model_uncertainty  # brings torch
 
-    doubt = mass_doubt(system, loads=True, tracked=True)
-    return None if doubt.none else (np.diag(doubt.parameters), doubt.deviations)
+    found = model_uncertainty(system, loads=True, tracked=True)
+    return None if found.none else (np.diag(found.parameters), found.deviations)

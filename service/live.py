@@ -19,7 +19,7 @@ from typing import Protocol
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung.model.signals import SampleBlock, Tally, Window
-from sprung.replay.beside import Beside
+from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.service.compute import Priority
 from sprung.service.engine import Engine
 from sprung.service.errors import NO_THREAD, Busy
@@ -174,7 +174,7 @@ class LiveFeed:
         turn, retry = self._turn, FIRST_RETRY
         while not self._stopping.is_set() and turn == self._turn:
             system = self._pipeline.engine.system
-            windower, beside = windower_of(system), Beside(len(system.channels), len(system.auxiliary))
+            windower, beside = windower_of(system), AuxiliaryMeans(len(system.channels), len(system.auxiliary))
             try:
                 for block in self.source.blocks():
                     if self._stopping.is_set() or turn != self._turn:

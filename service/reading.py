@@ -12,9 +12,9 @@ from typing import Any, Protocol, TypeVar
 
 from sprung.model.signals import Tally, Window
 from sprung.model.system import System
-from sprung.replay.beside import Beside
+from sprung.replay.auxiliary import AuxiliaryMeans
+from sprung.replay.clock_messages import pauses, remarks
 from sprung.replay.pacing import paced
-from sprung.replay.remarks import pauses, remarks
 from sprung.replay.windowing import Windower
 from sprung.service.opening import open_stream
 from sprung.service.worker import Emit, ProcessLimits, Worker
@@ -96,7 +96,7 @@ def read(request: ReadRequest, emit: Emit[ReadWindows]) -> Ending:
     system = request.system
     recording = open_stream(request.path, system, request.dbc, request.start)
     windower = windower_of(system, recording.stamped)
-    beside = Beside(len(system.channels), len(system.auxiliary))
+    beside = AuxiliaryMeans(len(system.channels), len(system.auxiliary))
     held: list[Window] = []
     whole = 0
     told = time.monotonic()

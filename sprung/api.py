@@ -19,7 +19,7 @@ from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System, load_system, parse_system
 from sprung.model.tracking.tracker import Alarm, ParameterReport
-from sprung.replay.beside import Beside
+from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.replay.record import Record
 from sprung.replay.recording import Recording
 from sprung.service.can_database import database_of
@@ -219,7 +219,7 @@ def _cut(system: System, recording: Recording) -> Iterator[list[Window]]:
     """Windows in batches, in order of time."""
     windower = windower_of(system, recording.stamped)
     held: list[Window] = []
-    beside = Beside(len(system.channels), len(system.auxiliary))
+    beside = AuxiliaryMeans(len(system.channels), len(system.auxiliary))
     for block in recording.at_rate(system.sample_rate, beside.keep):
         held += map(beside.to, windower.push(block))
         while len(held) >= AT_ONCE:

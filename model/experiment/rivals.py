@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.address import LawSetting, LawValue
-from sprung.model.identification.law_forces import Along
+from sprung.model.identification.law_forces import LawAlongMotion
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.base import observe
 from sprung.model.signals import FloatArray
@@ -52,7 +52,7 @@ def rival(system: System, element: str, effect: str, name: str, inputs: FloatArr
 def _nearest(
     law: ElementLaw, d: FloatArray, v: FloatArray, force: FloatArray, own: SpringDamper, sample_rate: float
 ) -> Sequence[float] | None:
-    along = Along(law, d[None], v[None], sample_rate)
+    along = LawAlongMotion(law, d[None], v[None], sample_rate)
     seen = observe(d, v, sample_rate, own.stiffness, own.damping)
     best, found = np.inf, None
     for trial in law.shapes(seen):

@@ -1,9 +1,9 @@
-"""What a window says about the measurements themselves: gain and delay of every channel.
+"""Evidence of a window on the measurements themselves: gain and delay of every channel.
 
 A channel reads `(1 + g) y(t - tau)` of the true signal y.  At the refined parameters the simulated outputs are known,
-so every sensitivity is nearly free: to a sensor's gain it is the sensor's own output, to its delay minus the derivative
-of it; to an input's gain and delay the same of what that input makes the sensors show (with the opposite sign: a
-reading too large is a motion too small).  Loads are refined with the parameters.
+so sensitivities cost almost nothing: to a sensor's gain it is the sensor's output, to its delay minus the derivative
+of that; to an input's gain and delay the same with the response of the sensors to that input, and the opposite sign (a
+reading that is too large is a motion that is too small).  Loads are refined with the parameters.
 
     r = J_x dx + J_h dh + noise,    free responses eliminated as in the refinement
 
@@ -11,8 +11,8 @@ The likelihood of a window, with the parameters x profiled out, is then quadrati
 
     x^(h) = x^ + D h,   D = -C Jx' Jh,        log L(h) = b' h - h' M h / 2,   M = Jh' Jh - Jh' Jx C Jx' Jh
 
-Redundant sensors enter here with the part that the refinement drops, because it depends on no parameter: it depends on
-the gains and delays, and tells them apart from springs.
+Redundant sensors enter here with the part that the refinement drops because it depends on no parameter: it does depend
+on gains and delays, and distinguishes them from springs.
 """
 
 from __future__ import annotations
@@ -49,8 +49,8 @@ class Evidence:
         return self.cross.numpy(), self.information.numpy(), self.score.numpy()
 
 
-class Products(Protocol):
-    """Gauss-Newton's products at a point of windows, linear or with laws; U unknowns, K residuals."""
+class NormalProducts(Protocol):
+    """Normal equations of windows at an iterate, linear or with laws; U unknowns, K residuals."""
 
     @property
     def whiten(self) -> Tensor:
@@ -77,8 +77,8 @@ class Products(Protocol):
         """Of the unknowns, weak prior included, (B, U, U)."""
 
 
-class Seconded(Protocol):
-    """What a second step with these products was taken from."""
+class MiddleIterate(Protocol):
+    """The iterate between the two steps of an iteration."""
 
     @property
     def residual(self) -> Tensor:
@@ -120,8 +120,8 @@ class DeviationSensitivity:
 
     def smoothed(
         self,
-        at: Products,
-        after: Seconded,
+        at: NormalProducts,
+        after: MiddleIterate,
         data: WindowBatch,
         carried: Tensor,
         compliance: Tensor,
@@ -139,7 +139,9 @@ class DeviationSensitivity:
         noise = self.model.noise_told(at.whiten, carried, as_spectra(left, at.whiten))
         return self.model.smoothed(values, compliance, noise, data, after.outputs)
 
-    def evidence(self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]) -> Evidence:
+    def evidence(
+        self, at: NormalProducts, after: MiddleIterate, data: WindowBatch, by_drive: Sequence[Tensor]
+    ) -> Evidence:
         """At the log-ratios that the chord step `after` of `at` leads to; of gains and delays, and zero of others.
 
         by_drive: what each drive makes the whitened signals show, (B, F, R, W/2), along each of `motions`.
@@ -195,7 +197,7 @@ class DeviationSensitivity:
         return information, score
 
     def columns(
-        self, at: Products, after: Seconded, data: WindowBatch, by_drive: Sequence[Tensor]
+        self, at: NormalProducts, after: MiddleIterate, data: WindowBatch, by_drive: Sequence[Tensor]
     ) -> tuple[Tensor, Tensor | None]:
         """Whitened sensitivities of the compressed signals (B, F, R, 2 C), and of the dropped ones (B, F, X, 2 C)."""
         model = self.model

@@ -58,7 +58,7 @@ class Compression:
         return found
 
     def trends(self, present: BoolArray) -> Tensor:
-        """What the compressed signals may show of the motion that integration leaves open, (T, R, X)."""
+        """Columns by which the free motion of integrated inputs enters the compressed signals, (T, R, X)."""
         key = present.tobytes()
         if key not in self._trends:
             Q = self.matrix(present).numpy()

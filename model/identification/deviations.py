@@ -1,4 +1,4 @@
-"""What a system file states about measurements and loads, and how far it may be otherwise."""
+"""Deviations of measurements and loads from the system file, with their prior standard deviations."""
 
 from __future__ import annotations
 

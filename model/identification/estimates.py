@@ -1,4 +1,4 @@
-"""What refined windows become: estimates that say whether they fit, and whether they tell anything."""
+"""Estimates from refined windows, with their goodness of fit and whether they are informative."""
 
 from __future__ import annotations
 

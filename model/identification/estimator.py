@@ -72,12 +72,12 @@ class EstimatorNet(nn.Module):
         self.register_buffer("noise", torch.zeros(R, P + 1, P + 1))
 
     def noise_taken(self) -> Tensor:
-        """What the noise adds to the weighted normal equations, as far as it is taken out, (P + 1, P + 1)."""
+        """Expected contribution of noise to the weighted normal equations, to be subtracted, (P + 1, P + 1)."""
         weight = torch.exp(2 * self.log_weight)
         return (weight @ self.noise.flatten(1)).reshape(self.noise.shape[1:]) * torch.sigmoid(self.compensation)
 
     def load(self, target: Tensor, regressors: Tensor, by_load: Tensor, prior: Tensor) -> Tensor:
-        """What loads change, (B, X), for rows (B, R), (B, R, P), (B, R, X); `prior`: its standard deviations (X,)."""
+        """Estimates of the loads (B, X) from rows (B, R), (B, R, P), (B, R, X); prior: standard deviations (X,)."""
         weight = torch.exp(self.log_weight)[:, None]
         rows = torch.cat([regressors, by_load, target.unsqueeze(2)], dim=2) * weight
         products = rows.mT @ rows
@@ -122,7 +122,7 @@ class EstimatorNet(nn.Module):
 
 @dataclass(frozen=True)
 class Manifest:
-    """What stands beside the weights, in `manifest.json`."""
+    """Contents of `manifest.json` beside the weights."""
 
     format: int
     system: str

@@ -1,4 +1,4 @@
-"""What a linearisation of windows holds: the windows, their frequency responses, and Gauss-Newton's products."""
+"""Data of Gauss-Newton on windows: the windows, their frequency responses, and the normal equations."""
 
 from __future__ import annotations
 

@@ -11,12 +11,12 @@ import numpy as np
 from sprung.model.ambient.foreseen import foreseen
 from sprung.model.ambient.identify import AmbientIdentifier, OutputOnlyIdentifier
 from sprung.model.identification.deviations import deviations
-from sprung.model.identification.doubt import MassDoubt, mass_doubt
 from sprung.model.identification.estimates import estimates
 from sprung.model.identification.estimator import Estimator, bundled_estimator, load_estimator
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.faults import Explainer
 from sprung.model.identification.linearise import PRIOR_STD, prior_std
+from sprung.model.identification.model_uncertainty import ModelUncertainty, model_uncertainty
 from sprung.model.identification.refine import Refined, Refiner, Refines
 from sprung.model.identification.with_laws import LawRefiner, acting_laws
 from sprung.model.identifier import Identifies, StageTimes, UnusableWindow
@@ -38,7 +38,7 @@ class Identifier:
     times: StageTimes = field(default_factory=StageTimes)
     _refiners: dict[int, Refines] = field(default_factory=dict)
     _explainers: dict[int, Explainer] = field(default_factory=dict)
-    _doubt: MassDoubt | None = None
+    _model_uncertainty: ModelUncertainty | None = None
 
     @property
     def digest(self) -> str:
@@ -74,7 +74,7 @@ class Identifier:
         refined = refiner.refine(windows, start, states=states, loads=loads, built=built, weigh=weigh)
         found = self._estimates(refined, states)
         if not explain:
-            found = [self._doubted(estimate) for estimate in found]
+            found = [self._with_model_uncertainty(estimate) for estimate in found]
             self.times = StageTimes(between - begin, time.perf_counter() - between)
             return found
         still = self._explainer(windows.shape[1]).still
@@ -97,14 +97,18 @@ class Identifier:
         deviating = [_deviating(refined, b, P, channels, spread, point) for b in range(len(refined.log_ratio))]
         return estimates(refined, P, states, deviating)
 
-    def _doubted(self, estimate: Estimate) -> Estimate:
+    def _with_model_uncertainty(self, estimate: Estimate) -> Estimate:
         """With what masses that are not quite those of the file, and laws between samples, leave open."""
-        if self._doubt is None:
-            self._doubt = mass_doubt(self.system, loads=any(load.declared for load in self.system.loads))
-        if self._doubt.none:
+        if self._model_uncertainty is None:
+            self._model_uncertainty = model_uncertainty(
+                self.system, loads=any(load.declared for load in self.system.loads)
+            )
+        if self._model_uncertainty.none:
             return estimate
         told = np.outer(estimate.identifiable, estimate.identifiable)
-        return replace(estimate, covariance=estimate.covariance + np.where(told, self._doubt.parameters, 0.0))
+        return replace(
+            estimate, covariance=estimate.covariance + np.where(told, self._model_uncertainty.parameters, 0.0)
+        )
 
     def examine(self, windows: FloatArray, weigh: BoolArray) -> list[Estimate]:
         """As a tracker wants it: loads are refined along, the windows `weigh` (B,) say what they know of gains and

@@ -1,9 +1,9 @@
-"""Forces of laws along the motion of windows, at the samples, and what they change with.
+"""Forces of laws along the motion of windows, at the samples, and their sensitivities.
 
-Deflections and rates are continued between samples by polynomials through both, on a grid `FINE` times finer; forces
-are brought back to the samples behind a band-limiting filter.  Slopes by the motion are means over the samples'
-surroundings, weighed as a straight line between samples would be.  What the forces themselves do above half the sample
-rate is added to the rates (`shake`).  The one state z of a law with memory is carried from sample to sample by
+Deflections and rates are interpolated by Hermite polynomials on a grid `OVERSAMPLING` times finer; forces pass an
+anti-alias filter and are decimated to the samples.  Slopes by the motion are local means with the weights of linear
+interpolation between samples.  The motion that the forces cause above half the sample rate is added to the rates
+(`add_motion_between_samples`).  The one state z of a law with memory is propagated from sample to sample by
 
     dz_{k+1} = keep_k dz_k + by_d0_k dd_k + by_d1_k dd_{k+1} + by_v0_k dv_k + by_v1_k dv_{k+1}.
 """
@@ -25,29 +25,31 @@ from sprung.model.laws.placed import PlacedLaw
 from sprung.model.laws.trajectory import phi, recall
 from sprung.model.signals import FloatArray
 
-FINE = 16  # steps per sample of laws without memory
-_FINE_MEMORY = 4  # of those with, whose steps are of fourth order; with 2, hysteresis that yields within a step is off
-_NODES = 4  # samples whose deflections and rates tell the motion between two of them
+OVERSAMPLING = 16  # steps per sample of laws without memory
+_OVERSAMPLING_MEMORY = (
+    4  # of those with, whose steps are of fourth order; with 2, hysteresis that yields within a step is off
+)
+_NODES = 4  # samples of each interpolating polynomial
 _REACH = 8  # samples of the filter to each side
-_NEAR = 1e-4  # of the rms motion, for slopes
-_STEP = 1e-3  # of a value's logarithm, for derivatives
+_SLOPE_STEP = 1e-4  # of the rms motion: step of the difference quotients by the motion
+_VALUE_STEP = 1e-3  # of a value's logarithm: step of the difference quotients by values
 _At = tuple[list[FloatArray], SpringDamper]  # values of a law and its element
 
 
 @dataclass(frozen=True, slots=True)
-class Acting:
-    """One law with the elements that it acts on."""
+class ActiveLaw:
+    """One placed law that windows are identified with."""
 
     placed: PlacedLaw
     law: ElementLaw
     weights: FloatArray  # over the elements, (E,)
-    element: int  # whose stiffness and damping it sees
+    element: int  # index of the element whose stiffness and damping enter the law
     free: tuple[int, ...]  # parameters that are estimated
 
 
 @dataclass(frozen=True, slots=True)
 class Slopes:
-    """One law's force by the motion, (B, T), and its memory from sample to sample, (B, T-1); zeros without memory."""
+    """Derivatives of one law's force, (B, T), and of its memory over a sample, (B, T-1); zeros without memory."""
 
     by_deflection: FloatArray
     by_rate: FloatArray
@@ -60,14 +62,14 @@ class Slopes:
     memory_size: FloatArray  # rms of the memory over a window, (B,)
 
 
-class Along:
+class LawAlongMotion:
     """One law along the motion of B windows of T samples."""
 
     def __init__(self, law: ElementLaw, deflection: FloatArray, rate: FloatArray, sample_rate: float) -> None:
         """deflection, rate: (B, T)."""
-        self.law, self.parts = law, _FINE_MEMORY if law.memory else FINE
+        self.law, self.parts = law, _OVERSAMPLING_MEMORY if law.memory else OVERSAMPLING
         self.samples, self.step = deflection.shape[1], 1 / (sample_rate * self.parts)
-        self.d, change = _continued(deflection, rate / sample_rate, self.parts)
+        self.d, change = _hermite(deflection, rate / sample_rate, self.parts)
         self.v = change * sample_rate
         self.time: FloatArray = np.arange(self.d.shape[1], dtype=np.float64) * self.step
         self.size_d = np.sqrt(np.mean(deflection**2, axis=1, keepdims=True)) + 1e-12
@@ -91,33 +93,35 @@ class Along:
         """The force at the samples, (..., B, T)."""
         return band_limited(self.fine(p, element, first), self.parts)
 
-    def ripple(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
-        """The part of the force's impulse that samples do not show, N s, (B, fine)."""
-        return _hidden(np.broadcast_to(self.fine(p, element, first), self.d.shape), self.step, self.parts)
+    def impulse_between_samples(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> FloatArray:
+        """Impulse of the force less its interpolation from the samples, N s, (B, fine)."""
+        return _between_samples(np.broadcast_to(self.fine(p, element, first), self.d.shape), self.step, self.parts)
 
-    def changes(self, p: FloatArray, free: Sequence[int], element: SpringDamper, first: FloatArray) -> FloatArray:
-        """What the force changes per log of the free values, then of stiffness and damping, (X, B, T).
+    def value_sensitivities(
+        self, p: FloatArray, free: Sequence[int], element: SpringDamper, first: FloatArray
+    ) -> FloatArray:
+        """Derivatives of the force by the logarithms of the free values, then of stiffness and damping, (X, B, T).
 
         p: (B, values); stiffness, damping and first: (B,).
         """
         values, whole = list(p.T[:, :, None]), SpringDamper(*(np.asarray(x)[:, None] for x in element))
         memory = self.memory(values, whole, first) if self.law.memory else np.zeros((0, *self.d.shape))
         motion = Motion(self.d, self.v, 0.0, memory)
-        around = [_moved(values, whole, i) for i in (*free, *range(len(values), len(values) + 2))]
+        around = [_perturbed(values, whole, i) for i in (*free, *range(len(values), len(values) + 2))]
         found = np.stack([self._difference(self.law.force, motion, *pair) for pair in around])
         if self.law.memory:
             rates = np.stack([self._difference(self.law.memory_rate, motion, *pair) for pair in around])
             if rates.any():
-                near = _small(memory)
+                near = _memory_step(memory)
                 force, rate = (
                     self._slope(of, "z", near, motion, values, whole) for of in (self.law.force, self.law.memory_rate)
                 )
-                found += force * self._remembered(rates, rate)
+                found += force * self._memory_sensitivity(rates, rate)
         return band_limited(found, self.parts)
 
     def _difference(self, function: Callable[..., Any], motion: Motion, up: _At, down: _At) -> FloatArray:
-        """Half the difference over the step, (B, fine)."""
-        found = np.asarray(function(motion, *up) - function(motion, *down), dtype=np.float64) / (2 * _STEP)
+        """Central difference quotient, (B, fine)."""
+        found = np.asarray(function(motion, *up) - function(motion, *down), dtype=np.float64) / (2 * _VALUE_STEP)
         return np.broadcast_to(found.reshape(found.shape[-2:]) if found.ndim > 2 else found, self.d.shape)
 
     def _slope(
@@ -129,7 +133,7 @@ class Along:
         p: Sequence[FloatArray],
         element: SpringDamper,
     ) -> FloatArray:
-        """Slope of a function of the motion by its deflection "d", rate "v" or memory "z", (B, fine)."""
+        """Derivative of a function of the motion by deflection "d", rate "v" or memory "z", (B, fine)."""
         d, v, time, memory = motion
         up, down = (
             np.asarray(
@@ -149,8 +153,8 @@ class Along:
         found = np.asarray((up - down) / (2 * near), dtype=np.float64)
         return np.broadcast_to(found.reshape(found.shape[-2:]), self.d.shape)
 
-    def _remembered(self, rates: FloatArray, by_z: FloatArray) -> FloatArray:
-        """Change of the memory (X, B, fine) by changes of its rate at an unchanged memory; by_z: (B, fine)."""
+    def _memory_sensitivity(self, rates: FloatArray, by_z: FloatArray) -> FloatArray:
+        """Variation of the memory (X, B, fine) for variations of its rate at constant memory; by_z: (B, fine)."""
         keep, mean, *_ = phi(np.clip(self.step * 0.5 * (by_z[:, 1:] + by_z[:, :-1]), -700.0, 0.0).T)
         added = mean[:, None] * np.moveaxis(self.step * 0.5 * (rates[..., 1:] + rates[..., :-1]), -1, 0)
         found = np.zeros((rates.shape[-1], *rates.shape[:-1]))
@@ -159,27 +163,27 @@ class Along:
         return np.moveaxis(found, 0, -1)
 
     def slopes(self, p: Sequence[FloatArray], element: SpringDamper, first: FloatArray) -> Slopes:
-        """Slopes by the motion; values and element (B, 1)."""
+        """Derivatives by the motion; values and element (B, 1)."""
         law, memory = self.law, self.memory(p, element, first) if self.law.memory else np.zeros((0, *self.d.shape))
-        near = {"d": _NEAR * self.size_d, "v": _NEAR * self.size_v}
+        near = {"d": _SLOPE_STEP * self.size_d, "v": _SLOPE_STEP * self.size_v}
         if law.memory:
-            near["z"] = _small(memory)
+            near["z"] = _memory_step(memory)
 
         motion = Motion(self.d, self.v, 0.0, memory)
 
         def slope(of: str, function: Callable[..., Any]) -> FloatArray:
             return self._slope(function, of, near[of], motion, p, element)
 
-        by_d, by_v = (self._around(slope(of, law.force)) for of in "dv")
+        by_d, by_v = (self._local_mean(slope(of, law.force)) for of in "dv")
         zero = np.zeros((len(self.d), self.samples - 1))
         if not law.memory:
             return Slopes(by_d, by_v, np.zeros_like(by_d), zero, zero, zero, zero, zero, zero[:, 0])
-        by_z = self._around(slope("z", law.force))
-        carried = self._carried(*(slope(of, law.memory_rate) for of in "zdv"))
-        return Slopes(by_d, by_v, by_z, *carried, near["z"][:, 0] / _NEAR)
+        by_z = self._local_mean(slope("z", law.force))
+        carried = self._memory_transition(*(slope(of, law.memory_rate) for of in "zdv"))
+        return Slopes(by_d, by_v, by_z, *carried, near["z"][:, 0] / _SLOPE_STEP)
 
-    def _around(self, fine: FloatArray) -> FloatArray:
-        """Means (B, T) around the samples, weighed by hats that reach to the neighbours."""
+    def _local_mean(self, fine: FloatArray) -> FloatArray:
+        """Local means (B, T) with triangular weights that reach to the neighbouring samples."""
         M = self.parts
         part = (np.arange(M) + 0.5) / M
         middle = 0.5 * (fine[:, 1:] + fine[:, :-1]).reshape(len(fine), self.samples - 1, M)
@@ -191,10 +195,10 @@ class Along:
         weight[1:] += part.sum()
         return found / weight
 
-    def _carried(
+    def _memory_transition(
         self, by_z: FloatArray, by_d: FloatArray, by_v: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """How the memory goes on over a sample, from the slopes of its rate on the fine grid."""
+        """Transition of the memory over one sample, from the derivatives of its rate on the fine grid."""
         M = self.parts
         z, d, v = (0.5 * (x[:, 1:] + x[:, :-1]).reshape(len(x), self.samples - 1, M) for x in (by_z, by_d, by_v))
         keep = np.ones(z.shape[:2])
@@ -208,38 +212,42 @@ class Along:
         return keep, *found
 
 
-def shake(along: Sequence[Along], at: Sequence[tuple[Any, ...]], mobility: FloatArray) -> None:
-    """Add to the motion along which laws act what their own forces do above half the sample rate.
+def add_motion_between_samples(
+    along: Sequence[LawAlongMotion], at: Sequence[tuple[Any, ...]], mobility: FloatArray
+) -> None:
+    """Add to the motion of laws the part that their own forces cause above half the sample rate.
 
-    Samples do not show it, but it is what friction meets while its force changes sign, within less than a sample: the
-    bodies are shaken, which rounds the corner.  Springs and dampers are nothing to a body's inertia there, and what the
-    change of the motion makes of the forces is small beside them.  at: each one's values, element and first memory;
-    mobility: accelerations of the sites by forces at them, 1/kg, (B, L, L).
+    Samples do not resolve it, but friction depends on it while its force changes sign within less than a sample: the
+    reaction of the bodies rounds the corner.  Springs and dampers are negligible beside the inertia at these
+    frequencies, and so is the effect of the added motion on the forces.  at: values, element and first memory of each
+    law; mobility: accelerations of the sites by forces at them, 1/kg, (B, L, L).
     """
-    ripples = np.stack([path.ripple(*given) for path, given in zip(along, at, strict=True)])  # (L, B, fine)
-    for path, moved in zip(along, np.einsum("bml,lbt->mbt", mobility, ripples), strict=True):
-        path.v = path.v - moved
-        path.d = path.d - _hidden(moved, path.step, path.parts)
+    impulses = np.stack(
+        [path.impulse_between_samples(*given) for path, given in zip(along, at, strict=True)]
+    )  # (L, B, fine)
+    for path, added in zip(along, np.einsum("bml,lbt->mbt", mobility, impulses), strict=True):
+        path.v = path.v - added
+        path.d = path.d - _between_samples(added, path.step, path.parts)
 
 
-def _moved(p: Sequence[FloatArray], element: SpringDamper, at: int) -> tuple[_At, _At]:
-    """Values of a law, then stiffness and damping, with the one at `at` a step larger and smaller."""
+def _perturbed(p: Sequence[FloatArray], element: SpringDamper, at: int) -> tuple[_At, _At]:
+    """Values of a law and its element with number `at` (values, stiffness, damping) one step up and down."""
     found = []
-    for factor in (np.exp(_STEP), np.exp(-_STEP)):
+    for factor in (np.exp(_VALUE_STEP), np.exp(-_VALUE_STEP)):
         values = [value * factor if i == at else value for i, value in enumerate((*p, *element))]
         found.append((values[: len(p)], SpringDamper(*values[len(p) :])))
     return found[0], found[1]
 
 
-def _small(memory: FloatArray) -> FloatArray:
-    """A change of a memory (1, B, fine) for slopes, (B, 1)."""
-    found: FloatArray = _NEAR * (np.sqrt(np.mean(memory[0] ** 2, axis=1, keepdims=True)) + 1e-12)
+def _memory_step(memory: FloatArray) -> FloatArray:
+    """Step of the difference quotients by a memory (1, B, fine), (B, 1)."""
+    found: FloatArray = _SLOPE_STEP * (np.sqrt(np.mean(memory[0] ** 2, axis=1, keepdims=True)) + 1e-12)
     return found
 
 
 @lru_cache(maxsize=8)
-def slopes_of(samples: int) -> FloatArray:
-    """Matrix (T, T) from samples to the slopes, per sample, of the cubic spline through them."""
+def spline_slopes(samples: int) -> FloatArray:
+    """Matrix (T, T) from samples to the derivatives, per sample, of the cubic spline through them."""
     time = np.arange(samples)
     matrix = np.asarray(CubicSpline(time, np.eye(samples))(time, 1))
     matrix.setflags(write=False)
@@ -247,12 +255,12 @@ def slopes_of(samples: int) -> FloatArray:
 
 
 @lru_cache(maxsize=8)
-def sharpened(samples: int) -> FloatArray:
-    """Matrix (T, T) that makes good what the cubic spline through samples loses of a force.
+def spline_compensation(samples: int) -> FloatArray:
+    """Matrix (T, T) that compensates the attenuation of a force by cubic spline interpolation.
 
     Of a tone at the share f of the sample rate a spline keeps sinc(f)^4 / sum over k of sinc(f - k)^4, and the images
-    f - k come beside it; what both make of a motion, which answers by 1/f^2, is 0.4 % too small at f = 0.2 and 3 % at
-    0.3.  Fourth and sixth differences, fitted up to 0.35, bring that back; the ends are left as they are.
+    f - k are added; the resulting motion, which falls with 1/f^2, is 0.4 % too small at f = 0.2 and 3 % at 0.3.  Fourth
+    and sixth differences, fitted up to 0.35, compensate that; the three samples at either end are left unchanged.
     """
     f = np.linspace(0.05, 0.35, 31)
     k = np.arange(-6, 7)[:, None]
@@ -272,8 +280,8 @@ def sharpened(samples: int) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def _weights(parts: int, before: int) -> tuple[FloatArray, FloatArray]:
-    """Of `_NODES` values, then slopes per sample, for values and slopes on the fine grid after node `before`:
-    Hermite's polynomial through all of them, each (2 nodes, parts)."""
+    """Weights of Hermite interpolation through `_NODES` values and derivatives per sample, for values and derivatives
+    on the fine grid after node `before`, each (2 nodes, parts)."""
     nodes, power = np.arange(_NODES) - (_NODES - 1) / 2, np.arange(2 * _NODES)
     lower = power * 1.0, np.maximum(power - 1, 0)
     given = np.vstack([nodes[:, None] ** power, lower[0] * nodes[:, None] ** lower[1]])
@@ -282,11 +290,11 @@ def _weights(parts: int, before: int) -> tuple[FloatArray, FloatArray]:
     return (at**power @ inverse).T, (lower[0] * at ** lower[1] @ inverse).T
 
 
-def _continued(value: FloatArray, slope: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
-    """Values and slopes per sample (B, T) on the fine grid, each (B, (T-1) parts + 1).
+def _hermite(value: FloatArray, slope: FloatArray, parts: int) -> tuple[FloatArray, FloatArray]:
+    """Values and derivatives per sample (B, T) interpolated on the fine grid, each (B, (T-1) parts + 1).
 
-    Both are known at the samples, which is as much as twice the rate of one of them: motions of 0.4 of the sample rate
-    are followed to one per cent, while cubics through a rate alone are a third off between samples.
+    Knowing both is worth twice the sample rate: motions at 0.4 of the sample rate are followed to one per cent, where
+    cubics through the rate alone err by a third.
     """
     samples = value.shape[1]
     known = np.concatenate([sliding_window_view(x, _NODES, axis=1) for x in (value, slope)], axis=2)  # (B, T-3, 8)
@@ -301,12 +309,12 @@ def _continued(value: FloatArray, slope: FloatArray, parts: int) -> tuple[FloatA
     return found[0], found[1]
 
 
-def _hidden(rate: FloatArray, step: float, parts: int) -> FloatArray:
-    """The part of the integral over time of `rate` that its samples do not show, (B, fine)."""
+def _between_samples(rate: FloatArray, step: float, parts: int) -> FloatArray:
+    """Integral over time of `rate` less its interpolation from the samples, (B, fine)."""
     whole = np.zeros(rate.shape)
     np.cumsum(0.5 * step * (rate[:, 1:] + rate[:, :-1]), axis=1, out=whole[:, 1:])
     shown, per_sample = (band_limited(x, parts) for x in (whole, rate * step * parts))
-    return whole - _continued(shown, per_sample, parts)[0]
+    return whole - _hermite(shown, per_sample, parts)[0]
 
 
 @lru_cache(maxsize=4)
@@ -317,9 +325,9 @@ def _low_pass(parts: int) -> tuple[FloatArray, float]:
 
 
 def band_limited(fine: FloatArray, parts: int) -> FloatArray:
-    """Signals (..., fine grid) behind a filter at half the sample rate, at the samples (..., T).
+    """Signals (..., fine grid) low-passed at half the sample rate, at the samples (..., T).
 
-    What a sample's stretch of the fine grid gives to each of the samples around it is one product of matrices.
+    The contributions of the fine grid between two samples to all samples around it are one matrix product.
     """
     reach, samples = _REACH * parts, (fine.shape[-1] - 1) // parts + 1
     padded = np.concatenate(

@@ -1,8 +1,9 @@
-"""Gauss-Newton on windows of a system with laws: a linearisation and two steps an iteration.
+"""Gauss-Newton on windows of a system with laws: one linearisation and two steps per iteration.
 
-The model is brought to its own motion again at the new point, and the old products give the second step.  Points are
-compared by what they leave as they are: what the best first state would leave is far too small where a force jumps, as
-long as that state is far.  Gains and delays are weighed where a window has converged.
+After the first step the motion is simulated again at the new iterate, and the same normal equations give the second
+step (a chord step).  Iterates are compared by their own residual, not by the one that the best initial state would
+leave: where a force jumps and that state is still far, the linear prediction is much too optimistic.  The evidence on
+gains and delays is computed where a window has converged.
 """
 
 from __future__ import annotations
@@ -15,10 +16,10 @@ from torch import Tensor
 
 from sprung.model.identification.calibration import DeviationSensitivity
 from sprung.model.identification.gauss_newton import WindowBatch
-from sprung.model.identification.law_flow import Flow
-from sprung.model.identification.law_noise import by_noise
-from sprung.model.identification.law_opening import opened
-from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
+from sprung.model.identification.law_initial import initial_iterate
+from sprung.model.identification.law_input_noise import input_noise_covariance
+from sprung.model.identification.law_iterate import Iterate, LinearStep, NormalEquations, SimulatedMotion
+from sprung.model.identification.law_tangent import TangentModel
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import PRIOR_STD
 from sprung.model.identification.noise_share import mean_share, noise_share
@@ -26,56 +27,58 @@ from sprung.model.identification.refine import IDENTIFIABLE_STD, NOISE_SHARE, WE
 from sprung.model.signals import FloatArray
 
 ITERATIONS = 6
-_CONVERGED = 0.3  # a second step this small, in standard deviations, leaves an error far below it
-_STILL = 0.3  # a first step this small: the window stands at its minimum, whatever the second one says
-_SLACK = 2.0  # of squares of residuals, by which a step may be worse: forces and smoothed inputs settle no closer
+_CONVERGED = 0.3  # standard deviations: a second step this small leaves a far smaller error
+_STATIONARY = 0.3  # standard deviations: after a first step this small the window is at its minimum
+_SLACK = 2.0  # increase of the sum of squares that a step may cause: forces and smoothed inputs converge no closer
 _STEP_LIMIT = 0.7  # largest change of a log-ratio in one step
 
 
 @dataclass(frozen=True, slots=True)
-class Second:
-    """A second step with the products of the first."""
+class SecondStep:
+    """A second step with the normal equations of the first."""
 
-    point: WindowPoint  # before it
-    motion: Moved
+    point: Iterate  # it starts from
+    motion: SimulatedMotion
     residual: Tensor  # whitened, (B, K, 1)
     cost: Tensor  # (B,)
     step: Tensor  # of the unknowns, (B, U)
-    alone: Tensor  # of the first state without that, (B, N)
+    state_alone: Tensor  # of the initial state for unchanged unknowns, (B, N)
 
     @property
-    def there(self) -> Tensor:
-        """Squares of the residual, (B,); the cost is what the best first state would leave, were the model linear."""
+    def squares(self) -> Tensor:
+        """Sum of squares of the residual, (B,); the cost is the one with the initial state profiled out."""
         return self.residual.square().sum(dim=(1, 2))
 
     @property
     def outputs(self) -> Tensor:
-        """Simulated before it, (B, T, S')."""
+        """Simulated at its start, (B, T, S')."""
         return self.motion.outputs
 
     def small(self, std: Tensor) -> Tensor:
         """Whether windows have converged, (B,); std: of the unknowns, (B, U)."""
         return (self.step.abs() / std).amax(dim=1) < _CONVERGED
 
-    def take(self, at: Tensor) -> Second:
+    def take(self, at: Tensor) -> SecondStep:
         """Some of the windows."""
-        motion = Moved(self.motion.states[at], self.motion.outputs[at], self.motion.lost[at])
-        return Second(self.point.take(at), motion, self.residual[at], self.cost[at], self.step[at], self.alone[at])
+        motion = SimulatedMotion(self.motion.states[at], self.motion.outputs[at], self.motion.diverged[at])
+        return SecondStep(
+            self.point.take(at), motion, self.residual[at], self.cost[at], self.step[at], self.state_alone[at]
+        )
 
-    def put(self, at: Tensor, some: Second) -> None:
+    def put(self, at: Tensor, some: SecondStep) -> None:
         """Replace some of the windows."""
         self.point.put(at, some.point)
         self.motion.states[at], self.motion.outputs[at] = some.motion.states, some.motion.outputs
-        self.motion.lost[at] = some.motion.lost
+        self.motion.diverged[at] = some.motion.diverged
         self.residual[at], self.cost[at] = some.residual, some.cost
-        self.step[at], self.alone[at] = some.step, some.alone
+        self.step[at], self.state_alone[at] = some.step, some.state_alone
 
 
 class LawSearch:
-    """Windows with the same sensors present, from log-ratios (B, P + laws' values), loads at zero.
+    """Search over windows with the same sensors present, from log-ratios (B, P + law parameters) and loads of zero.
 
-    wanted: windows (B,) whose evidence on gains and delays is computed; weighs: whether that of any in the whole batch,
-    of which these are a piece, is: all pieces then have room for it.
+    wanted: windows (B,) for which the evidence on gains and delays is computed; weighs: whether it is computed for any
+    window of the whole batch, of which this is a piece: the results of all pieces then have room for it.
     """
 
     def __init__(
@@ -89,14 +92,14 @@ class LawSearch:
     ) -> None:
         self.windows, self.calibration, self.data, self.wanted = windows, calibration, data, wanted
         B, U, T, N = len(start), windows.unknowns, windows.model.samples, windows.model.states_count
-        self.told, H = windows.told, len(calibration.deviations) if weighs else 0
+        self.reported, H = windows.reported, len(calibration.deviations) if weighs else 0
         unknowns = torch.zeros(B, U, dtype=torch.float64)
         unknowns[:, : start.shape[1]] = torch.as_tensor(start)
         zero = torch.zeros(B, N, dtype=torch.float64)
-        self.point = WindowPoint(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
+        self.point = Iterate(unknowns, zero, torch.zeros(B, T, len(windows.acting), dtype=torch.float64))
         self.best = self.point.take(torch.arange(B))
         self.cost = torch.full((B,), torch.inf, dtype=torch.float64)
-        self.there = self.cost.clone()  # squares of the residual, by which points are better or worse
+        self.squares = self.cost.clone()  # sums of squares by which iterates are compared
         self.covariance = torch.eye(U, dtype=torch.float64).repeat(B, 1, 1)
         self.converged = torch.zeros(B, dtype=torch.bool)
         self.iterations = torch.zeros(B, dtype=torch.long)
@@ -105,15 +108,15 @@ class LawSearch:
         self.outputs = torch.full((B, T, len(data.present)), torch.nan, dtype=torch.float64)
         self.smooth = np.zeros((2, B, T, len(windows.system.mechanics.stiffness)))
         self.weighed = torch.zeros(B, dtype=torch.bool)
-        self.cross = torch.zeros(B, self.told, H, dtype=torch.float64)
+        self.cross = torch.zeros(B, self.reported, H, dtype=torch.float64)
         self.information, self.score = torch.zeros(B, H, H, dtype=torch.float64), torch.zeros(B, H, dtype=torch.float64)
 
     def run(self, states: bool, near: bool = False, iterations: int = ITERATIONS) -> Refined:
-        """Iterate until every window has converged, or `iterations` times; near: the start is no guess."""
-        active = self._opened(torch.arange(len(self.cost)), last=iterations == 1)
-        if not near and len(active) and iterations > 1:  # once more, where that has led
+        """Iterate until every window has converged, or `iterations` times; near: the start is known to be good."""
+        active = self._start(torch.arange(len(self.cost)), last=iterations == 1)
+        if not near and len(active) and iterations > 1:  # again, from the median of what that led to
             self.point.unknowns[active] = self.point.unknowns.median(dim=0).values
-            active = self._opened(active, last=False)
+            active = self._start(active, last=False)
         for left in reversed(range(iterations - 1)):
             if len(active) == 0:
                 break
@@ -121,94 +124,109 @@ class LawSearch:
             active = active[~self.converged[active]]
         return self._result(states)
 
-    def _opened(self, rows: Tensor, last: bool) -> Tensor:
-        """Begin with the windows `rows` where they stand, and iterate once; those that have not converged."""
-        self.point.put(rows, opened(self.windows, self.point.take(rows), self.data.take(rows)))
+    def _start(self, rows: Tensor, last: bool) -> Tensor:
+        """Find initial motions of the windows `rows`, iterate once, and return those that have not converged."""
+        self.point.put(rows, initial_iterate(self.windows, self.point.take(rows), self.data.take(rows)))
         self._iterate(rows, last)
         return rows[~self.converged[rows]]
 
     def _iterate(self, rows: Tensor, last: bool) -> None:
-        """A linearisation and two steps of the windows `rows`; a point that is worse is taken back to a third."""
+        """One linearisation and two steps of the windows `rows`; a step to a worse iterate is shortened to a third."""
         w, data, smooth = self.windows, self.data.take(rows), self.smooth[:, rows.numpy()]
         point, before = self.point.take(rows), self.cost[rows]
         steps = w.steps(point, data)
         point, motion, near = w.settle(point, steps, data)
-        columns, flow = w.columns(point, steps, motion, data, smooth)
-        residual = w.residual(motion.outputs, data, columns.whiten)
-        cost, step, alone = columns.solve(residual, point.unknowns)
-        there = residual.square().sum(dim=(1, 2))
-        worse = ~(there <= self.there[rows] * (1 + 1e-6) + _SLACK)
+        normal, tangent = w.normal_equations(point, steps, motion, data, smooth)
+        residual = w.residual(motion.outputs, data, normal.whiten)
+        cost, step, state_alone = normal.solve(residual, point.unknowns)
+        squares = residual.square().sum(dim=(1, 2))
+        worse = ~(squares <= self.squares[rows] * (1 + 1e-6) + _SLACK)
         step = self._limited(step)
-        dx0 = columns.state_step(alone, step)
-        smooth = w.smoothed(columns, residual, step, dx0, steps)
-        std = torch.diagonal(columns.covariance, dim1=1, dim2=2).sqrt()
-        second = self._second(columns, near, point.moved(step, dx0), data)
-        held = second.there <= there * (1 + 1e-6) + _SLACK
-        still = (step.abs() / std).amax(dim=1) < _STILL
-        going = (held & ~still & ~worse & ~second.small(std)).nonzero().squeeze(1)
-        if len(going):  # the old products are good enough for one more
-            self._third(going, second, columns.take(going), near.take(going), data.take(going))
-        done = ((second.small(std) & held) | still) & ~worse & ~motion.lost & ~second.motion.lost
-        _, diverged = torch.linalg.cholesky_ex(columns.covariance)  # where the motion has run away it is none
-        sane = (diverged == 0) & second.there.isfinite()
-        ripe = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
-        if len(ripe):
-            weighed = steps.take(ripe), flow.take(ripe), second.take(ripe), data.take(ripe)
-            self._weigh(rows[ripe], columns.take(ripe), *weighed)
+        dx0 = normal.state_step(state_alone, step)
+        smooth = w.smoothed(normal, residual, step, dx0, steps)
+        std = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
+        second = self._second_step(normal, near, point.stepped(step, dx0), data)
+        improved = second.squares <= squares * (1 + 1e-6) + _SLACK
+        stationary = (step.abs() / std).amax(dim=1) < _STATIONARY
+        going = (improved & ~stationary & ~worse & ~second.small(std)).nonzero().squeeze(1)
+        if len(going):  # the normal equations are good enough for one more
+            self._third_step(going, second, normal.take(going), near.take(going), data.take(going))
+        done = ((second.small(std) & improved) | stationary) & ~worse & ~motion.diverged & ~second.motion.diverged
+        _, diverged = torch.linalg.cholesky_ex(normal.covariance)  # not positive definite where the motion has diverged
+        sane = (diverged == 0) & second.squares.isfinite()
+        due = ((done | last) & sane & self.wanted[rows]).nonzero().squeeze(1)
+        if len(due):
+            weighed = steps.take(due), tangent.take(due), second.take(due), data.take(due)
+            self._weigh(rows[due], normal.take(due), *weighed)
         more, motion = self._limited(second.step), second.motion
-        forward = second.point.moved(more, columns.state_step(second.alone, more))
-        forward = forward.where(held, point.moved(step / 3, dx0 / 3))
+        forward = second.point.stepped(more, normal.state_step(second.state_alone, more))
+        forward = forward.where(improved, point.stepped(step / 3, dx0 / 3))
         best = self.best.take(rows)
-        self.point.put(rows, best.towards(point, 1 / 3).where(worse, forward))
+        self.point.put(rows, best.interpolated(point, 1 / 3).where(worse, forward))
         self.best.put(rows, best.where(worse, point))
-        self.cost[rows] = torch.where(done & held, second.cost, torch.where(worse, before, cost))
-        self.there[rows] = torch.where(worse, self.there[rows], there)
+        self.cost[rows] = torch.where(done & improved, second.cost, torch.where(worse, before, cost))
+        self.squares[rows] = torch.where(worse, self.squares[rows], squares)
         self.smooth[:, rows.numpy()] = smooth
-        covariance, ended = columns.covariance.clone(), ((done | last) & sane).nonzero().squeeze(1)
+        covariance, ended = normal.covariance.clone(), ((done | last) & sane).nonzero().squeeze(1)
         if len(ended):
-            covariance[ended] += by_noise(w, columns.take(ended), steps.take(ended), flow.take(ended), data.present)
+            covariance[ended] += input_noise_covariance(
+                w, normal.take(ended), steps.take(ended), tangent.take(ended), data.present
+            )
         self.converged[rows], self.covariance[rows], self.states[rows] = done, covariance, motion.states
         self.iterations[rows] += 1
         shown = torch.as_tensor(np.flatnonzero(data.present))
         self.outputs[rows[:, None], :, shown] = motion.outputs.mT
         self.error[rows[:, None], shown] = (data.measured - motion.outputs).square().mean(dim=1).sqrt()
 
-    def _second(self, columns: Columns, flow: Flow, there: WindowPoint, data: WindowBatch) -> Second:
-        """The step from `there` with products from nearby."""
+    def _second_step(
+        self, normal: NormalEquations, tangent: TangentModel, point: Iterate, data: WindowBatch
+    ) -> SecondStep:
+        """The step from `point` with normal equations of a nearby iterate."""
         w = self.windows
-        there, motion, _ = w.settle(there, w.steps(there, data), data, flow)
-        residual = w.residual(motion.outputs, data, columns.whiten)
-        return Second(there, motion, residual, *columns.solve(residual, there.unknowns))
+        point, motion, _ = w.settle(point, w.steps(point, data), data, tangent)
+        residual = w.residual(motion.outputs, data, normal.whiten)
+        return SecondStep(point, motion, residual, *normal.solve(residual, point.unknowns))
 
-    def _third(self, at: Tensor, second: Second, columns: Columns, flow: Flow, data: WindowBatch) -> None:
-        """One more step of the windows `at`, whose products are given, where it makes nothing worse."""
+    def _third_step(
+        self, at: Tensor, second: SecondStep, normal: NormalEquations, tangent: TangentModel, data: WindowBatch
+    ) -> None:
+        """One more step of the windows `at`, kept where it makes nothing worse."""
         old = second.take(at)
         step = self._limited(old.step)
-        there = old.point.moved(step, columns.state_step(old.alone, step))
-        new = self._second(columns, flow, there, data)
-        better = (new.there <= old.there * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
+        point = old.point.stepped(step, normal.state_step(old.state_alone, step))
+        new = self._second_step(normal, tangent, point, data)
+        better = (new.squares <= old.squares * (1 + 1e-6) + _SLACK).nonzero().squeeze(1)
         second.put(at[better], new.take(better))
 
     def _weigh(
-        self, rows: Tensor, columns: Columns, steps: Steps, flow: Flow, after: Second, data: WindowBatch
+        self,
+        rows: Tensor,
+        normal: NormalEquations,
+        steps: LinearStep,
+        tangent: TangentModel,
+        after: SecondStep,
+        data: WindowBatch,
     ) -> None:
-        """Evidence on gains and delays of the windows `rows`."""
-        given = columns.carried, columns.compliance, steps.values
-        clean, outputs = self.calibration.smoothed(columns, after, data, *given)
+        """Compute the evidence on gains and delays of the windows `rows`."""
+        given = normal.carried, normal.compliance, steps.values
+        clean, outputs = self.calibration.smoothed(normal, after, data, *given)
         after = replace(after, motion=replace(after.motion, outputs=outputs))
-        shown = self.windows.by_drive(columns, steps, flow, self.calibration.motions(clean), data)
-        found = self.calibration.evidence(columns, after, data, shown)
-        self.cross[rows] = found.cross[:, : self.told]
+        shown = self.windows.by_drive(normal, steps, tangent, self.calibration.motions(clean), data)
+        found = self.calibration.evidence(normal, after, data, shown)
+        self.cross[rows] = found.cross[:, : self.reported]
         self.information[rows], self.score[rows], self.weighed[rows] = found.information, found.score, True
 
     def _limited(self, step: Tensor) -> Tensor:
-        """Steps of log-ratios no larger than `_STEP_LIMIT`; the whole step is shortened."""
-        largest = step[:, : self.told].abs().amax(dim=1, keepdim=True)
+        """LinearStep of log-ratios no larger than `_STEP_LIMIT`; the whole step is shortened."""
+        largest = step[:, : self.reported].abs().amax(dim=1, keepdim=True)
         return step * (_STEP_LIMIT / largest.clamp_min(_STEP_LIMIT))
 
     def _result(self, states: bool) -> Refined:
         w, data = self.windows, self.data
-        found, covariance = self.point.unknowns[:, : self.told], self.covariance[:, : self.told, : self.told]
+        found, covariance = (
+            self.point.unknowns[:, : self.reported],
+            self.covariance[:, : self.reported, : self.reported],
+        )
         std = torch.diagonal(covariance, dim1=1, dim2=2).sqrt()
         identifiable = std < IDENTIFIABLE_STD
         P = len(w.system.parameters)
@@ -224,7 +242,7 @@ class LawSearch:
         chi_square = self.cost / freedom.clamp_min(1)
         covariance = covariance * chi_square.clamp_min(1)[:, None, None]
         both = identifiable[:, :, None] & identifiable[:, None, :]
-        prior = torch.eye(self.told, dtype=torch.float64) * PRIOR_STD**2
+        prior = torch.eye(self.reported, dtype=torch.float64) * PRIOR_STD**2
         prior[w.linear, w.linear] = 1 / w.model.precision[: len(w.linear)]
         B = len(found)
         rms = np.full((B, len(data.present)), np.nan)
@@ -241,7 +259,7 @@ class LawSearch:
             rms=rms,
             states=self.states.numpy() if states else np.zeros((B, 0, self.states.shape[2])),
             outputs=self.outputs.numpy() if states else np.zeros((B, 0, len(data.present))),
-            excitation=np.full(B, np.inf),  # told by the windows
+            excitation=np.full(B, np.inf),  # computed from the windows by the caller
             weighed=self.weighed.numpy(),
             cross=torch.where(identifiable[:, :, None], self.cross, 0.0).numpy(),
             information=(self.information / chi_square.clamp_min(1)[:, None, None]).numpy(),

@@ -1,15 +1,14 @@
 """Windows of a system with laws, linearised along their own non-linear motion.
 
-The laws' forces f load the linear system of the other parts as generalised forces q = -H^T f.  Between samples they are
-cubics like every drive, so that a step is exact for given forces,
+The laws' forces f act on the linear rest of the system as generalised forces q = -H^T f.  Between samples they are
+interpolated by cubics like every drive, so that a step is exact for given forces,
 
     x_{k+1} = Ad x_k + G0 w_k + G1 w_{k+1} + P0 q_k + S0 q'_k + P1 q_{k+1} + S1 q'_{k+1}.
 
-Forces and motion are brought together by Newton's method on the forces at the samples.  Sensitivities follow from the
-same step along that motion: a change of the motion changes the forces by the laws' slopes, these the motion, and the
-memories of the laws are states like the others (forward sensitivity analysis).  Whitened over bins of the DFT they take
-the place of the linear model's columns in Gauss-Newton; the memories at the first sample are unknowns beside the
-parameters.
+Forces and motion are made consistent by Newton's method on the forces at the samples.  Sensitivities follow from the
+tangent-linear model along that motion, in which the memories of the laws are states like the others (forward
+sensitivity analysis).  Whitened over bins of the DFT they replace the linear model's sensitivities in the normal
+equations; the memories at the first sample are unknowns beside the parameters.
 """
 
 from __future__ import annotations
@@ -22,9 +21,15 @@ import torch
 from torch import Tensor
 
 from sprung.model.identification.gauss_newton import WindowBatch
-from sprung.model.identification.law_flow import Flow
-from sprung.model.identification.law_forces import Acting, Along, shake, sharpened, slopes_of
-from sprung.model.identification.law_point import Columns, Moved, Steps, WindowPoint
+from sprung.model.identification.law_forces import (
+    ActiveLaw,
+    LawAlongMotion,
+    add_motion_between_samples,
+    spline_compensation,
+    spline_slopes,
+)
+from sprung.model.identification.law_iterate import Iterate, LinearStep, NormalEquations, SimulatedMotion
+from sprung.model.identification.law_tangent import TangentModel
 from sprung.model.identification.linearise import PRIOR_STD, WindowModel, as_rows, as_spectra, normalised
 from sprung.model.laws import SpringDamper
 from sprung.model.mechanics import ACCELERATION, FORCE
@@ -33,21 +38,20 @@ from sprung.model.simulate.linear import phi_functions
 from sprung.model.simulate.loading import by_inertia
 from sprung.model.system import System
 
-_SWEEPS = 4  # of Newton's method on the forces, at most
-_SETTLED = 0.05  # rms change of the outputs by a sweep, in the sensors' noise
-_WILD = 1e4  # times what was measured: Newton's method has lost the motion
+_NEWTON_STEPS = 4  # at most, for the forces
+_NEWTON_TOLERANCE = 0.05  # rms change of the outputs by a Newton step, in the sensors' noise
+_DIVERGED = 1e4  # times the measured amplitude: Newton's method has diverged
 _RIDGE = 1e-11  # relative, on the normalised free responses
-_AS_MEASURED: FloatArray = np.zeros((2, 1, 1, 1))  # no noise of the drives is taken from the elements' motion
-_MEMORY_STD = 3.0  # of a memory at the first sample, in its rms over the window
+_DRIVES_AS_MEASURED: FloatArray = np.zeros(
+    (2, 1, 1, 1)
+)  # the motion of the elements is not corrected for noise of the drives
+_MEMORY_STD = 3.0  # prior of a memory at the first sample, in its rms over the window
 
 
 class LawWindows:
-    """Windows of one length of a system, `bare` of its laws, with the laws `acting`.
+    """Non-linear window model: the linear system `bare` with the laws `acting`; loads: estimate the loads, too."""
 
-    loads: its loads are unknown, too.
-    """
-
-    def __init__(self, bare: System, acting: Sequence[Acting], model: WindowModel, loads: bool = False) -> None:
+    def __init__(self, bare: System, acting: Sequence[ActiveLaw], model: WindowModel, loads: bool = False) -> None:
         self.system, self.acting, self.model = bare, acting, model
         m = bare.mechanics
         self.rows = np.array([a.weights for a in acting]) @ m.H  # deflections of the sites by the coordinates, (L, n)
@@ -61,16 +65,16 @@ class LawWindows:
         moving = m.sensor_kind == ACCELERATION
         # of a rate over one sample, by the least noise of an accelerometer; where there is none by that of a sensor
         self.rate_noise = float(noise[moving].min() if moving.any() else noise.min()) / bare.sample_rate
-        self.sharpened = torch.tensor(sharpened(model.samples))
-        self.slope = torch.tensor(slopes_of(model.samples)) / model.simulator.dt
+        self.spline_compensation = torch.tensor(spline_compensation(model.samples))
+        self.slope = torch.tensor(spline_slopes(model.samples)) / model.simulator.dt
         self.loads = len(model.simulator.loading) if loads else 0
         P = len(bare.parameters)
         self.first_load = P + len(self.free)
-        self.told = self.first_load + self.loads  # log-ratios and loads; memories follow
-        self.unknowns = self.told + len(self.memories)
-        self.linear = torch.cat([torch.arange(P), torch.arange(self.first_load, self.told)])  # of the linear system
+        self.reported = self.first_load + self.loads  # log-ratios and loads; memories follow
+        self.unknowns = self.reported + len(self.memories)
+        self.linear = torch.cat([torch.arange(P), torch.arange(self.first_load, self.reported)])  # of the linear system
 
-    def values(self, point: WindowPoint, law: int) -> FloatArray:
+    def values(self, point: Iterate, law: int) -> FloatArray:
         """Values of one law, (B, values)."""
         found = np.tile(np.array(self.acting[law].placed.values), (len(point.unknowns), 1))
         for at, (of, i) in enumerate(self.free):
@@ -78,16 +82,16 @@ class LawWindows:
                 found[:, i] *= np.exp(point.unknowns[:, len(self.system.parameters) + at].numpy())
         return found
 
-    def first_memory(self, point: WindowPoint, law: int) -> FloatArray:
+    def first_memory(self, point: Iterate, law: int) -> FloatArray:
         """Memory of one law at the first sample, (B,)."""
         if law not in self.memories:
             return np.zeros(len(point.unknowns))
-        at = self.told + self.memories.index(law)
+        at = self.reported + self.memories.index(law)
         found: FloatArray = point.unknowns[:, at].numpy()
         return found
 
-    def steps(self, point: WindowPoint, data: WindowBatch) -> Steps:
-        """The linear step at a point."""
+    def steps(self, point: Iterate, data: WindowBatch) -> LinearStep:
+        """The linear step at an iterate."""
         s, x = self.model.simulator, point.unknowns[:, self.linear]
         values = s.element_values(x)
         discrete = s.discretise(values)
@@ -99,19 +103,19 @@ class LawWindows:
         load = torch.cat([torch.zeros_like(inverse), inverse], dim=1) / s.scale[:, None]
         psi = (phi.flatten(1, 2) @ load).reshape(len(x), 5, N, n)[:, 1:] * s.dt
         G = (s.hermite @ psi.flatten(2)).reshape(len(x), 2, 2, N, n) * s.scale[:, None]
-        push = (G[:, 0, 0], G[:, 0, 1], G[:, 1, 0], G[:, 1, 1])
+        force_response = (G[:, 0, 0], G[:, 0, 1], G[:, 1, 0], G[:, 1, 1])
         kind = torch.as_tensor(self.system.mechanics.sensor_kind)
         direct = torch.where((kind == ACCELERATION)[:, None], s.S, 0.0)[at] @ inverse
-        shown = torch.where((kind == FORCE)[:, None], s.L, 0.0)[at]
+        force_rows = torch.where((kind == FORCE)[:, None], s.L, 0.0)[at]
         present = replace(discrete, C=discrete.C[:, at], D=discrete.D[:, at])
-        return Steps(values, present, push, inverse, direct, shown)
+        return LinearStep(values, present, force_response, inverse, direct, force_rows)
 
-    def simulate(self, steps: Steps, force: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
+    def simulate(self, steps: LinearStep, force: Tensor, x0: Tensor, data: WindowBatch) -> tuple[Tensor, Tensor]:
         """States (B, T, N) and outputs (B, T, S') under given forces of the laws (B, T, L)."""
         s, q = self.model.simulator, -force @ self.pull
-        sharp = self.sharpened @ q
+        sharp = self.spline_compensation @ q
         slope = self.slope @ sharp
-        P0, S0, P1, S1 = steps.push
+        P0, S0, P1, S1 = steps.force_response
         discrete = replace(
             steps.discrete,
             G0=torch.cat([steps.discrete.G0, P0, S0], dim=2),
@@ -119,12 +123,12 @@ class LawWindows:
         )
         states = s.states(discrete, torch.cat([data.w, sharp, slope], dim=2), x0)
         outputs = states @ steps.discrete.C.mT + data.w @ steps.discrete.D.mT + q @ steps.direct.mT
-        return states, outputs + force @ (self.weights @ steps.shown.T)
+        return states, outputs + force @ (self.weights @ steps.force_rows.T)
 
     def site_motion(self, states: Tensor, data: WindowBatch, smooth: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Deflections and rates of the sites, each (B, T, L).
 
-        smooth: what the noise of the drives adds to those of the elements, (2, B, T, E).
+        smooth: correction of the elements' motion for noise of the drives, (2, B, T, E).
         """
         d, v = self.element_motion(states, data, smooth)
         weights = self.weights.numpy().T
@@ -138,117 +142,117 @@ class LawWindows:
         v = (states[:, :, n:] @ s.H.T + data.w[:, :, s.supports + 1] @ s.G.T).numpy()
         return d + smooth[0], v + smooth[1]
 
-    def _element(self, steps: Steps, law: int) -> SpringDamper:
+    def _element(self, steps: LinearStep, law: int) -> SpringDamper:
         """Stiffness and damping that a law sees, each (B,)."""
         at = self.acting[law].element
         return SpringDamper(steps.values.stiffness[:, at].numpy(), steps.values.damping[:, at].numpy())
 
     def settle(
-        self, point: WindowPoint, steps: Steps, data: WindowBatch, flow: Flow | None = None
-    ) -> tuple[WindowPoint, Moved, Flow]:
-        """Bring forces and motion together; flow: of a motion nearby, by default of the one that they begin with.
+        self, point: Iterate, steps: LinearStep, data: WindowBatch, tangent: TangentModel | None = None
+    ) -> tuple[Iterate, SimulatedMotion, TangentModel]:
+        """Make forces and motion consistent; tangent: of a nearby motion, by default of the initial one.
 
-        Drives are taken as measured: what a residual tells of their noise when laws are left out is wrong by as much as
-        these make it larger, and would come back as motion.
+        Drives are taken as measured: an estimate of their noise from residuals that still contain missing law forces
+        would turn these forces into motion.
         """
         force, moving = point.force.clone(), torch.arange(len(point.force))
         lost = torch.zeros(len(force), dtype=torch.bool)
-        for _ in range(_SWEEPS):
+        for _ in range(_NEWTON_STEPS):
             if not len(moving):
                 break
             everything = len(moving) == len(force)
             some = replace(point if everything else point.take(moving), force=force[moving])
             their_steps, theirs = (steps, data) if everything else (steps.take(moving), data.take(moving))
             states, outputs = self.simulate(their_steps, some.force, some.x0, theirs)
-            if bool((wild := self._wild(outputs, theirs)).any()):
-                force[moving[wild]] = point.force[moving[wild]]
-                lost[moving[wild]] = True
-                moving = moving[~wild]
+            if bool((diverging := self._has_diverged(outputs, theirs)).any()):
+                force[moving[diverging]] = point.force[moving[diverging]]
+                lost[moving[diverging]] = True
+                moving = moving[~diverging]
                 continue
-            along = self.along(states, theirs, _AS_MEASURED, some, their_steps)
-            if flow is None:
-                flow = self.flow(along, some, their_steps).spread(moving, len(force))
-            near = flow if everything else flow.take(moving)
-            change = near.answer(self.forces_along(along, some, their_steps) - some.force)
+            along = self.along(states, theirs, _DRIVES_AS_MEASURED, some, their_steps)
+            if tangent is None:
+                tangent = self.tangent(along, some, their_steps).spread(moving, len(force))
+            near = tangent if everything else tangent.take(moving)
+            change = near.closed_loop(self.forces_along(along, some, their_steps) - some.force)
             force[moving] += change
-            moving = moving[self._shown_at_once(change, their_steps, theirs) >= _SETTLED]
+            moving = moving[self._immediate_effect(change, their_steps, theirs) >= _NEWTON_TOLERANCE]
         states, outputs = self.simulate(steps, force, point.x0, data)
         for usable in (point.force, torch.zeros_like(force)):
-            if not bool((wild := self._wild(outputs, data)).any()):
+            if not bool((diverging := self._has_diverged(outputs, data)).any()):
                 break
-            force[wild], lost[wild] = usable[wild], True
+            force[diverging], lost[diverging] = usable[diverging], True
             states, outputs = self.simulate(steps, force, point.x0, data)
         point = replace(point, force=force)
-        if flow is None:
-            flow = self.flow(self.along(states, data, _AS_MEASURED, point, steps), point, steps)
-        return point, Moved(states, outputs, lost), flow
+        if tangent is None:
+            tangent = self.tangent(self.along(states, data, _DRIVES_AS_MEASURED, point, steps), point, steps)
+        return point, SimulatedMotion(states, outputs, lost), tangent
 
-    def _wild(self, outputs: Tensor, data: WindowBatch) -> Tensor:
-        """Windows whose simulated outputs (B, T, S') have left all bounds, (B,)."""
+    def _has_diverged(self, outputs: Tensor, data: WindowBatch) -> Tensor:
+        """Whether the simulated outputs (B, T, S') of windows have left all bounds, (B,)."""
         usual = (data.measured.abs() + self.noise[torch.as_tensor(data.present)]).amax(dim=(1, 2))
-        return ~(outputs.abs().amax(dim=(1, 2)) <= _WILD * usual)
+        return ~(outputs.abs().amax(dim=(1, 2)) <= _DIVERGED * usual)
 
-    def _shown_at_once(self, change: Tensor, steps: Steps, data: WindowBatch) -> Tensor:
-        """rms of what the sensors show of a change of forces, the motion's answer apart, in their noise, (B,)."""
+    def _immediate_effect(self, change: Tensor, steps: LinearStep, data: WindowBatch) -> Tensor:
+        """rms effect of a change of forces on the sensors, without the response of the motion, in their noise, (B,)."""
         load = change @ self.pull
-        shown = change @ (self.weights @ steps.shown.T) - load @ steps.direct.mT
+        shown = change @ (self.weights @ steps.force_rows.T) - load @ steps.direct.mT
         carried = (load @ steps.compliance.mT * self.model.simulator.dt) / self.rate_noise
         at_once = torch.cat([shown / self.noise[torch.as_tensor(data.present)], carried], dim=2)
         return at_once.square().mean(dim=1).amax(dim=1).sqrt()
 
     def along(
-        self, states: Tensor, data: WindowBatch, smooth: FloatArray, point: WindowPoint, steps: Steps
-    ) -> list[Along]:
-        """The laws along given states, and what their own forces make of the motion between samples."""
+        self, states: Tensor, data: WindowBatch, smooth: FloatArray, point: Iterate, steps: LinearStep
+    ) -> list[LawAlongMotion]:
+        """The laws along given states, with the motion that their own forces cause between samples."""
         d, v = self.site_motion(states, data, smooth)
         rate = self.system.sample_rate
-        along = [Along(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
+        along = [LawAlongMotion(a.law, d[:, :, i], v[:, :, i], rate) for i, a in enumerate(self.acting)]
         if self.quick:
             mobility = (self.pull[self.quick] @ steps.compliance @ self.pull[self.quick].T).numpy()
             shaken = [along[i] for i in self.quick], [self._at(i, point, steps) for i in self.quick]
-            shake(*shaken, mobility)
+            add_motion_between_samples(*shaken, mobility)
         return along
 
-    def forces_along(self, along: list[Along], point: WindowPoint, steps: Steps) -> Tensor:
+    def forces_along(self, along: list[LawAlongMotion], point: Iterate, steps: LinearStep) -> Tensor:
         """The laws' forces, (B, T, L)."""
         shape = point.force.shape[:2]
         found = [path.force(*self._at(i, point, steps)) for i, path in enumerate(along)]
         return torch.as_tensor(np.stack([np.broadcast_to(f, shape) for f in found], axis=2))
 
-    def slopes_along(self, along: list[Along], point: WindowPoint, steps: Steps) -> tuple[Tensor, Tensor]:
+    def slopes_along(self, along: list[LawAlongMotion], point: Iterate, steps: LinearStep) -> tuple[Tensor, Tensor]:
         """Slopes of the laws' forces by deflection and by rate, each (B, T, L)."""
         found = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
         by_d, by_v = ([getattr(s, of) for s in found] for of in ("by_deflection", "by_rate"))
         return torch.as_tensor(np.stack(by_d, axis=2)), torch.as_tensor(np.stack(by_v, axis=2))
 
-    def _at(self, law: int, point: WindowPoint, steps: Steps) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
+    def _at(self, law: int, point: Iterate, steps: LinearStep) -> tuple[list[FloatArray], SpringDamper, FloatArray]:
         """Values of a law and of its element, that broadcast with (B, fine), and its memory at the first sample."""
         k, c = self._element(steps, law)
         values = list(self.values(point, law).T[:, :, None])
         return values, SpringDamper(k[:, None], c[:, None]), self.first_memory(point, law)
 
-    def flow(self, along: list[Along], point: WindowPoint, steps: Steps) -> Flow:
-        """What a motion does with changes."""
+    def tangent(self, along: list[LawAlongMotion], point: Iterate, steps: LinearStep) -> TangentModel:
+        """The tangent-linear model along a motion."""
         slopes = [path.slopes(*self._at(i, point, steps)) for i, path in enumerate(along)]
-        return Flow(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
+        return TangentModel(slopes, self.memories, self.pull, steps, self.model.simulator.dt)
 
     def residual(self, outputs: Tensor, data: WindowBatch, whiten: Tensor) -> Tensor:
         """Whitened residual of simulated outputs (B, T, S'), (B, K, 1)."""
         compressed = (data.measured - outputs) @ self.model.compression.matrix(data.present).mT
         return as_rows(whiten @ self.model.spectra(compressed).unsqueeze(3)).mT
 
-    def columns(
-        self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
-    ) -> tuple[Columns, Flow]:
-        """Everything that Gauss-Newton needs at a settled point, and what its motion does with changes."""
+    def normal_equations(
+        self, point: Iterate, steps: LinearStep, motion: SimulatedMotion, data: WindowBatch, smooth: FloatArray
+    ) -> tuple[NormalEquations, TangentModel]:
+        """Normal equations at a consistent iterate, and its tangent-linear model."""
         along = self.along(motion.states, data, smooth, point, steps)
-        flow = self.flow(along, point, steps)
+        tangent = self.tangent(along, point, steps)
         transfer = self.model.transfer(steps.values, data)
         carried = transfer.drive * self.model.drive_noise[:, None]
         whiten = self.model.whitening(carried)
-        shown = self.shown(point, steps, motion, data, smooth, along, flow)
-        white = as_rows(whiten @ self._by_bin(shown))
-        sound = white.isfinite().all(dim=2).all(dim=1)  # a motion that has run away, and its law's memory, tell nothing
+        shown = self.output_sensitivities(point, steps, motion, data, smooth, along, tangent)
+        white = as_rows(whiten @ self._spectra(shown))
+        sound = white.isfinite().all(dim=2).all(dim=1)  # a diverged motion carries no information
         white = torch.where(sound[:, None, None], white, 0.0)
         N = point.x0.shape[1]
         free, J = white[:, :N], white[:, N:]
@@ -261,33 +265,37 @@ class LawWindows:
         precision = torch.full((len(J), self.unknowns), 1 / PRIOR_STD**2, dtype=torch.float64)
         precision[:, self.linear] = self.model.precision[: len(self.linear)]
         if self.memories:
-            precision[:, self.told :] = (_MEMORY_STD * torch.where(sound[:, None], flow.memory_size, 1.0)) ** -2.0
+            precision[:, self.reported :] = (
+                _MEMORY_STD * torch.where(sound[:, None], tangent.memory_size, 1.0)
+            ) ** -2.0
         covariance = torch.linalg.inv(information + torch.diag_embed(precision))
         told = (information, covariance, precision)
-        return Columns(whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told), flow
+        return NormalEquations(
+            whiten, carried, transfer.compliance, free, free_scale, J, factor, across, *told
+        ), tangent
 
-    def shown(
+    def output_sensitivities(
         self,
-        point: WindowPoint,
-        steps: Steps,
-        motion: Moved,
+        point: Iterate,
+        steps: LinearStep,
+        motion: SimulatedMotion,
         data: WindowBatch,
         smooth: FloatArray,
-        along: list[Along],
-        flow: Flow,
+        along: list[LawAlongMotion],
+        tangent: TangentModel,
     ) -> Tensor:
-        """What the compressed signals show of the first state and of the unknowns, (B, T, R, N + U)."""
+        """Sensitivities of the compressed signals to the initial state and the unknowns, (B, T, R, N + U)."""
         B, T, N = motion.states.shape
         Q = self.model.compression.matrix(data.present)
         columns, memories = self.unknowns, len(self.memories)
         load, slope, which = self._element_loads(steps, motion, data, smooth)  # (B, T, P'), elements of them
-        P0, S0, P1, S1 = (-(push @ self.model.simulator.H[which].T).unsqueeze(1) for push in steps.push)
+        P0, S0, P1, S1 = (-(block @ self.model.simulator.H[which].T).unsqueeze(1) for block in steps.force_response)
         linear = slice(len(which))
-        push = load.new_zeros(B, T - 1, N, columns)
-        push[..., linear] = P0 * load[:, :-1, None]
-        push[..., linear] += S0 * slope[:, :-1, None]
-        push[..., linear] += P1 * load[:, 1:, None]
-        push[..., linear] += S1 * slope[:, 1:, None]
+        excitation = load.new_zeros(B, T - 1, N, columns)
+        excitation[..., linear] = P0 * load[:, :-1, None]
+        excitation[..., linear] += S0 * slope[:, :-1, None]
+        excitation[..., linear] += P1 * load[:, 1:, None]
+        excitation[..., linear] += S1 * slope[:, 1:, None]
         by_mass = self._mass_loads(point, steps, motion, data)  # (B, n, T, M)
         masses = self.linear[len(which) :]
         springs = self._spring_loads(steps, motion, data, smooth) if self.loads else None  # (B, E, T, X)
@@ -297,27 +305,34 @@ class LawWindows:
         if by_mass.shape[3]:
             by_slope = self.slope @ by_mass
             series = (by_mass[:, :, :-1], by_slope[:, :, :-1], by_mass[:, :, 1:], by_slope[:, :, 1:])
-            for gain, values in zip(steps.push, series, strict=True):
-                push[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1).transpose(1, 2)
+            for gain, values in zip(steps.force_response, series, strict=True):
+                excitation[..., masses] += (gain @ values.flatten(2)).view(B, N, T - 1, -1).transpose(1, 2)
         first, memory = load.new_zeros(B, N, N + columns), load.new_zeros(B, memories, N + columns)
         first[:, :, :N] = torch.eye(N, dtype=torch.float64)
-        memory[:, :, N + self.told :] = torch.eye(memories, dtype=torch.float64)
-        path = flow.run(push, self._force_sources(along, point, steps, N), first, memory=memory)  # (B, T, N + L, X)
-        found = self._shown_by(path, steps, Q)
+        memory[:, :, N + self.reported :] = torch.eye(memories, dtype=torch.float64)
+        path = tangent.run(
+            excitation, self._force_sources(along, point, steps, N), first, memory=memory
+        )  # (B, T, N + L, X)
+        found = self._compressed_outputs(path, steps, Q)
         changed = found[..., N:]
-        direct = Q @ (steps.shown[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
+        direct = Q @ (steps.force_rows[:, which] - steps.direct @ self.model.simulator.H[which].T)  # (B, R, P')
         changed[..., linear] += direct.unsqueeze(1) * load.unsqueeze(2)
         if by_mass.shape[3]:
             changed[..., masses] += (Q @ steps.direct @ by_mass.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
         if springs is not None:
-            loads = slice(self.first_load, self.told)
-            changed[..., loads] += (Q @ steps.shown @ springs.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
+            loads = slice(self.first_load, self.reported)
+            changed[..., loads] += (Q @ steps.force_rows @ springs.flatten(2)).view(B, len(Q), T, -1).transpose(1, 2)
         return found
 
     def by_drive(
-        self, columns: Columns, steps: Steps, flow: Flow, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch
+        self,
+        columns: NormalEquations,
+        steps: LinearStep,
+        tangent: TangentModel,
+        motions: Sequence[tuple[Tensor, Tensor]],
+        data: WindowBatch,
     ) -> list[Tensor]:
-        """What each drive alone makes the whitened signals show through the laws, too, each (B, F, R, W/2).
+        """Contribution of each drive to the whitened signals, through the laws, too, each (B, F, R, W/2).
 
         motions: values and rates of the drives, each (B, T, W/2).
         """
@@ -329,32 +344,31 @@ class LawWindows:
         site = torch.zeros(len(self.acting), half, dtype=torch.float64)
         site[:, s.supports // 2] = self.weights @ s.G
         site = site[:, of]  # (L, X)
-        force, remembered = flow.along(value.unsqueeze(2) * site, rate.unsqueeze(2) * site)
+        force, memory_source = tangent.along(value.unsqueeze(2) * site, rate.unsqueeze(2) * site)
         G0, G1 = steps.discrete.G0, steps.discrete.G1
-        push = torch.zeros(B, T - 1, G0.shape[1], X, dtype=torch.float64)
+        excitation = torch.zeros(B, T - 1, G0.shape[1], X, dtype=torch.float64)
         for gain, at in ((G0, slice(0, T - 1)), (G1, slice(1, T))):
-            push += gain[:, :, 2 * of].unsqueeze(1) * value[:, at, None]
-            push += gain[:, :, 2 * of + 1].unsqueeze(1) * rate[:, at, None]
-        path = flow.run(push, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), remembered)
-        shown = self._shown_by(path, steps, Q)
+            excitation += gain[:, :, 2 * of].unsqueeze(1) * value[:, at, None]
+            excitation += gain[:, :, 2 * of + 1].unsqueeze(1) * rate[:, at, None]
+        path = tangent.run(excitation, force, torch.zeros(B, G0.shape[1], X, dtype=torch.float64), memory_source)
+        shown = self._compressed_outputs(path, steps, Q)
         D = Q @ steps.discrete.D
         for gain, given in ((D[:, :, 2 * of], value), (D[:, :, 2 * of + 1], rate)):
             shown += gain.unsqueeze(1) * given.unsqueeze(2)
-        return list((columns.whiten @ self._by_bin(shown)).to(torch.complex64).split(half, dim=3))
+        return list((columns.whiten @ self._spectra(shown)).to(torch.complex64).split(half, dim=3))
 
-    def _shown_by(self, path: Tensor, steps: Steps, Q: Tensor) -> Tensor:
-        """What the compressed signals show of changes of states and of the laws' forces (B, T, N + L, X):
-        (B, T, R, X)."""
-        at_once = (steps.shown @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
+    def _compressed_outputs(self, path: Tensor, steps: LinearStep, Q: Tensor) -> Tensor:
+        """Variations of the compressed signals (B, T, R, X) for those of states and laws' forces (B, T, N + L, X)."""
+        at_once = (steps.force_rows @ self.weights.T) - steps.direct @ self.pull.T  # of laws' forces, (B, S', L)
         return torch.cat([Q @ steps.discrete.C, Q @ at_once], dim=2).unsqueeze(1) @ path
 
-    def _by_bin(self, shown: Tensor) -> Tensor:
+    def _spectra(self, shown: Tensor) -> Tensor:
         """Spectra within the band of signals (B, T, R, X), (B, F, R, X)."""
         found: Tensor = torch.fft.rfft(shown, dim=1)[:, 1 : self.model.bins + 1]
         return found
 
     def _element_loads(
-        self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray
+        self, steps: LinearStep, motion: SimulatedMotion, data: WindowBatch, smooth: FloatArray
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Forces of elements by the logarithms of their parameters: values, slopes (B, T, P'), elements."""
         s = self.model.simulator
@@ -366,7 +380,9 @@ class LawWindows:
         slope = v[:, :, at] * K + (self.slope @ v)[:, :, at] * C
         return load, slope, at
 
-    def _spring_loads(self, steps: Steps, motion: Moved, data: WindowBatch, smooth: FloatArray) -> Tensor | None:
+    def _spring_loads(
+        self, steps: LinearStep, motion: SimulatedMotion, data: WindowBatch, smooth: FloatArray
+    ) -> Tensor | None:
         """Forces of air springs by the loads that their stiffness follows, (B, E, T, X); None: none does."""
         powers = self.model.simulator.loading.stiffness
         if not bool(powers.any()):
@@ -375,7 +391,7 @@ class LawWindows:
         force = torch.as_tensor(deflection) * steps.values.stiffness[:, None]
         return force.mT.unsqueeze(3) * powers.T[None, :, None]
 
-    def _mass_loads(self, point: WindowPoint, steps: Steps, motion: Moved, data: WindowBatch) -> Tensor:
+    def _mass_loads(self, point: Iterate, steps: LinearStep, motion: SimulatedMotion, data: WindowBatch) -> Tensor:
         """Generalised forces by the logarithms of masses, then by the loads, (B, n, T, M)."""
         s = self.model.simulator
         masses = s.m_of[s.m_of.any(dim=1)]
@@ -391,7 +407,7 @@ class LawWindows:
         values = steps.values
         return -by_inertia(moved, values.mass, values.coupling, exponents, pattern).permute(0, 2, 1, 3)
 
-    def _force_sources(self, along: list[Along], point: WindowPoint, steps: Steps, before: int) -> Tensor:
+    def _force_sources(self, along: list[LawAlongMotion], point: Iterate, steps: LinearStep, before: int) -> Tensor:
         """Laws' forces by the unknowns along the given motion, memories apart, (B, T, L, before + U)."""
         names = [(p.element, p.quantity) for p in self.system.parameters]
         B, T = point.force.shape[:2]
@@ -399,7 +415,7 @@ class LawWindows:
         at = before + len(names)
         for i, (acting, path) in enumerate(zip(self.acting, along, strict=True)):
             start = self.first_memory(point, i)
-            changes = path.changes(self.values(point, i), acting.free, self._element(steps, i), start)
+            changes = path.value_sensitivities(self.values(point, i), acting.free, self._element(steps, i), start)
             for change in changes[:-2]:
                 found[:, :, i, at] = torch.as_tensor(change)
                 at += 1
@@ -409,8 +425,10 @@ class LawWindows:
                     found[:, :, i, before + names.index((element, quantity))] = torch.as_tensor(change)
         return found
 
-    def smoothed(self, columns: Columns, residual: Tensor, step: Tensor, dx0: Tensor, steps: Steps) -> FloatArray:
-        """What the residual after a step says of the drives' noise, as motion of the elements: (2, B, T, E)."""
+    def smoothed(
+        self, columns: NormalEquations, residual: Tensor, step: Tensor, dx0: Tensor, steps: LinearStep
+    ) -> FloatArray:
+        """Noise of the drives as estimated from the residual after a step, as motion of the elements: (2, B, T, E)."""
         model, s = self.model, self.model.simulator
         left = residual - columns.free.mT @ (columns.free_scale * dx0).unsqueeze(2)  # (B, K, 1)
         left = left - columns.sensitivities.mT @ step.unsqueeze(2)

@@ -140,12 +140,12 @@ class WindowModel:
         return s.states(s.discretise(s.element_values(x)), data.w, x0)
 
     def noise_told(self, whiten: Tensor, carried: Tensor, left: Tensor) -> Tensor:
-        """What a whitened residual (B, F, R, 1), free responses apart, says of the noise of the drives, (B, F, W/2)."""
+        """Noise of the drives (B, F, W/2) as estimated from a whitened residual (B, F, R, 1) without free responses."""
         found: Tensor = ((whiten @ carried).mH @ left).squeeze(3) / self.weight[:, None] ** 2
         return found * self.drive_noise
 
     def moved_by(self, values: ElementValues, compliance: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """What noise of the drives (B, F, W/2) moves: coordinates (B, F, n), deflections by its supports (B, F, E)."""
+        """Response to noise of the drives (B, F, W/2): coordinates (B, F, n), deflections by the supports (B, F, E)."""
         s, kind = self.simulator, compliance.dtype
         support = noise[:, :, s.supports // 2] @ s.G.T.to(kind)
         load = -(self.frequency.dynamic(values) * support) @ s.H.to(kind)
@@ -181,7 +181,7 @@ class WindowModel:
         return np.asarray((power / self.input_noise**2).max(axis=1))
 
     def by_drive(self, at: Linearisation, motions: Sequence[tuple[Tensor, Tensor]], data: WindowBatch) -> list[Tensor]:
-        """What each drive alone makes the whitened signals show, free responses apart, each (B, F, R, W/2).
+        """Contribution of each drive to the whitened signals, without free responses, each (B, F, R, W/2).
 
         motions: values and rates of the drives, each (B, T, W/2).  Over a finite window the spectrum of the rate is not
         j w times that of the value.  In single precision.

@@ -1,4 +1,4 @@
-"""How much of what looks like information in a window is noise."""
+"""Share of a window's apparent information that is due to noise."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _motions(model: WindowModel, values: ElementValues, transfer: Transfer, data
 
 
 def moved_by_drives(model: WindowModel, values: ElementValues, compliance: Tensor) -> tuple[Tensor, Tensor]:
-    """What a unit of every drive moves: coordinates (B, F, n, W/2), and deflections (E, W/2) by its supports beside."""
+    """Response to unit drives: coordinates (B, F, n, W/2), and deflections (E, W/2) by the supports."""
     s, kind = model.simulator, compliance.dtype
     dynamic = model.frequency.dynamic(values)
     load = torch.zeros(*dynamic.shape[:2], s.H.shape[1], s.W // 2, dtype=kind)

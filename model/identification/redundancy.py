@@ -1,4 +1,4 @@
-"""What two measurements of one support's motion say of each other's gains and delays.
+"""Evidence of two measurements of one support's motion on each other's gains and delays.
 
 Displacement, velocity and acceleration of a support are fused into one motion, the least-squares spline (see
 `model.simulate.fusion`).  What that fit leaves depends on no parameter and on no initial state; it depends on the

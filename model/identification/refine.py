@@ -278,7 +278,7 @@ class Refiner:
 
 @dataclass(frozen=True, slots=True)
 class _Progress:
-    """Where every window of a batch stands; chunks write their own rows."""
+    """Current iterates of all windows of a batch; chunks write their own rows."""
 
     x: Tensor  # log-ratios, shape (B, P)
     best: Tensor  # those of the lowest cost so far, shape (B, P)

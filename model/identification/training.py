@@ -52,13 +52,13 @@ class TrainingSettings:
 
 @dataclass(frozen=True, slots=True)
 class WindowCost:
-    """What a window costs on average."""
+    """Average cost of identifying a window."""
 
     iterations: float
     milliseconds: float  # of a core
 
 
-def what_is_saved(
+def training_benefit(
     system: System, estimator: Estimator, windows: int = 48, seed: int = 1
 ) -> tuple[WindowCost, WindowCost]:
     """Cost of a window without and with the trained start, on simulated windows of vehicles within +-30 %."""
@@ -173,7 +173,7 @@ def _initialise(net: EstimatorNet, features: ForceBalance, settings: TrainingSet
 
 
 class RunSettings(Protocol):
-    """What a run needs to know of its settings."""
+    """Settings that every training run needs."""
 
     @property
     def seed(self) -> int:

@@ -2,8 +2,7 @@
 
 Gauss-Newton as in `model.identification.refine`, with columns from forward sensitivities along the window's own motion
 (`model.identification.law_window`).  Beside the linear parameters the laws' values that are not fixed are estimated, as
-logarithms of ratios to the file, the loads where they are asked for, and the memories at the first sample, which no
-window knows beforehand.
+logarithms of ratios to the file, the loads where they are asked for, and the memories at the first sample.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import torch
 
 from sprung.model.chunks import alike, share
 from sprung.model.identification.calibration import DeviationSensitivity
-from sprung.model.identification.law_forces import Acting
+from sprung.model.identification.law_forces import ActiveLaw
 from sprung.model.identification.law_search import ITERATIONS, LawSearch
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
@@ -26,15 +25,15 @@ from sprung.model.laws.in_place import is_linear
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 from sprung.model.system import System
 
-_CHUNK = 96  # windows at a time, of one law; forces of more laws fill so much more memory
-_PILOTS = 8  # windows of a batch that are identified first, where there are
-_MANY = 24  # windows, for whom these say where to begin
-_FITS = 1.5  # chi-square of a window that stands where it belongs, generously
-_ENOUGH = 3  # such windows tell where others of a batch should begin
+_CHUNK = 96  # windows times laws that are processed together: memory grows with both
+_PILOT_WINDOWS = 8  # windows that are identified first to start the others, in batches of at least
+_MANY = 24  # windows
+_FITS = 1.5  # reduced chi-square of a well fitted window, generously
+_ENOUGH = 3  # well fitted windows are needed to start the others from their median
 
 
-def acting_laws(system: System) -> list[Acting]:
-    """The laws that windows are identified with.  Errors: `UnusableWindow` for one that no window can hold."""
+def acting_laws(system: System) -> list[ActiveLaw]:
+    """The laws that windows are identified with.  Errors: `UnusableWindow` for a law that windows do not support."""
     found = []
     for placed in system.laws:
         law = placed.law
@@ -53,7 +52,7 @@ def acting_laws(system: System) -> list[Acting]:
             if len(group) == 2:
                 weights[group[1]] = -1.0
             free = tuple(i for i, (v, f) in enumerate(zip(placed.values, placed.fixed, strict=True)) if v > 0 and not f)
-            found.append(Acting(placed, law, weights, group[0], free))
+            found.append(ActiveLaw(placed, law, weights, group[0], free))
     return found
 
 
@@ -117,14 +116,14 @@ class LawRefiner:
         everything = np.arange(len(windows))
         if near or len(windows) < _MANY:
             found = over(everything)
-        else:  # a few say where the others begin
-            pilots = np.linspace(0, len(windows) - 1, _PILOTS).astype(int)
+        else:  # pilot windows start the others
+            pilots = np.linspace(0, len(windows) - 1, _PILOT_WINDOWS).astype(int)
             others = np.setdiff1d(everything, pilots)
             first = over(pilots)
-            near = _told(begin, others, first, P)
+            near = _start_from_well_fitted(begin, others, first, P)
             found = in_order([first, over(others)], np.concatenate([pilots, others]))
-        bad = np.flatnonzero(~_good(found))
-        near = _told(begin, bad, found, P)
+        bad = np.flatnonzero(~_well_fitted(found))
+        near = _start_from_well_fitted(begin, bad, found, P)
         if len(bad) and near:
             again = over(bad)
             better = again.chi_square < found.chi_square[bad]
@@ -137,14 +136,14 @@ class LawRefiner:
         return self._windows[loads]
 
 
-def _good(found: Refined) -> BoolArray:
-    """Windows that stand where they belong, (B,)."""
+def _well_fitted(found: Refined) -> BoolArray:
+    """Whether windows have converged to a good fit, (B,)."""
     return np.asarray(found.converged & (found.chi_square < _FITS))
 
 
-def _told(begin: FloatArray, at: IntArray, found: Refined, P: int) -> bool:
-    """Let windows `at` begin where good ones have ended; False: there are too few of those."""
-    good = _good(found)
+def _start_from_well_fitted(begin: FloatArray, at: IntArray, found: Refined, P: int) -> bool:
+    """Start windows `at` from the median of the well fitted ones; False: there are too few of those."""
+    good = _well_fitted(found)
     if good.sum() < _ENOUGH:
         return False
     begin[at] = np.median(found.log_ratio[good, :P], axis=0)

@@ -57,13 +57,14 @@ class Tracker:
         deviations: Sequence[Deviation] = (),
         weather: WeatherModel | None = None,
         limits: Mapping[str, LoadLimit] = MappingProxyType({}),
-        doubt: tuple[FloatArray, FloatArray] | None = None,
+        model_uncertainty: tuple[FloatArray, FloatArray] | None = None,
         masses: Mapping[str, tuple[str, ...]] = MappingProxyType({}),
     ) -> None:
         """weather: effects of conditions on parameters, by default from their names; limits: of loads, by body.
 
-        doubt: variance of the log-ratios (P,), and covariance of the deviations (H, H), of an error that is the same in
-        all windows, as that of the masses in the system file: part of the stated uncertainty, not of that of changes.
+        model_uncertainty: variance of the log-ratios (P,), and covariance of the deviations (H, H), of an error that is
+        the same in all windows, as that of the masses in the system file: part of the stated uncertainty, not of that
+        of changes.
         masses: bodies whose mass scales what is estimated, and the elements at them.
         """
         if not parameters:
@@ -75,7 +76,10 @@ class Tracker:
         self.model = deviation_model(self.deviations)
         nominal = [parameter.nominal for parameter in self.parameters]
         self.weather = weather or weathers.model_of(self.names, nominal)
-        self._doubt = doubt or (np.zeros(len(self.names)), np.zeros((self.model.size, self.model.size)))
+        self._model_uncertainty = model_uncertainty or (
+            np.zeros(len(self.names)),
+            np.zeros((self.model.size, self.model.size)),
+        )
         self._attribution = Attribution(
             self.names, self.settings, self.deviations, self.model, self.weather, dict(limits), dict(masses)
         )
@@ -249,13 +253,13 @@ class Tracker:
 
     def posterior(self, state: TrackerState) -> tuple[FloatArray, FloatArray]:
         """Mean and standard deviation of the log-ratios to nominal, each of shape (P,)."""
-        return state.belief.level.copy(), np.sqrt(state.belief.level_variance + self._doubt[0])
+        return state.belief.level.copy(), np.sqrt(state.belief.level_variance + self._model_uncertainty[0])
 
     def report(self, state: TrackerState) -> tuple[ParameterReport, ...]:
         """Every parameter in physical units, against nominal and against the vehicle's own baseline."""
         base = self._fusion.baseline(state)
         drift = self._fusion.drift(state, base)
-        return reported(self.parameters, state, self.settings, base, drift, self._doubt[0])
+        return reported(self.parameters, state, self.settings, base, drift, self._model_uncertainty[0])
 
     def health(self, state: TrackerState) -> Health:
         """NAMUR NE 107: the worst of what is active, in the recommendation's order F, C, S, M."""
@@ -283,7 +287,7 @@ class Tracker:
         far = np.abs(off) > self.model.report_limit
         if not far.any():
             return tuple(stuck)
-        std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._doubt[1])
+        std = self.model.relative_std(state.belief.covariance[-H:, -H:] + self._model_uncertainty[1])
         linear = np.where(self.model.gains, dev.linearisation_std(off), 0.0)
         std = np.sqrt(std**2 + dev.pending_variance(state.calibration, self.model) + linear**2)
         chosen = far & (np.abs(off) > 3 * std)
@@ -295,7 +299,7 @@ class Tracker:
         found = []
         for h in np.flatnonzero(self.model.constant).tolist():
             value = float(state.belief.mean[-H:][h])
-            std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._doubt[1][h, h]))
+            std = float(np.sqrt(state.belief.covariance[-H:, -H:][h, h] + self._model_uncertainty[1][h, h]))
             if abs(value) > max(dev.BODY_LIMIT, 3 * std):
                 deviation = self.deviations[h]
                 found.append(BuiltOtherwise(deviation.name, OWN[deviation.kind], float(np.expm1(value)), std))
@@ -308,7 +312,10 @@ class Tracker:
         for h in self.model.loads_at:
             value, variance = state.belief.mean[-H:][h], float(state.belief.covariance.diagonal()[-H:][h])
             if np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
-                found[self.deviations[h].name] = (float(value), float(np.sqrt(variance + self._doubt[1][h, h])))
+                found[self.deviations[h].name] = (
+                    float(value),
+                    float(np.sqrt(variance + self._model_uncertainty[1][h, h])),
+                )
         return found
 
     def loads_as_of(self, state: TrackerState) -> int | None:

@@ -33,7 +33,7 @@ TOGETHER = 128  # windows that the reader hands over at once
 
 def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out: Path, changes: dict[str, Any]) -> int:
     """Train, and print what was reached."""
-    from sprung.model.identification.training import TrainingSettings, train, what_is_saved
+    from sprung.model.identification.training import TrainingSettings, train, training_benefit
 
     system = load_system(system_file or MANCHESTER)
     if not system.bodies:
@@ -45,7 +45,7 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     print(OPTIONAL if not system.laws else WITH_LAWS, file=sys.stderr, flush=True)
     with TrainingProgress() as shown:
         estimator = train(system, out, recordings=windows, settings=settings, progress=shown.show)
-    before, after = what_is_saved(system, estimator)
+    before, after = training_benefit(system, estimator)
     of_file = "" if system_file is None else f" --system {system_file}"
     use = f"use them with\n  sprung replay FILE{of_file} --weights {out}\n  sprung serve{of_file} --weights {out}"
     print(

@@ -23,8 +23,8 @@ import numpy as np
 
 from sprung.model.signals import SampleBlock
 from sprung.replay import Recording, UnreadableRecording, open_recording
+from sprung.replay.clock_messages import remarks
 from sprung.replay.record import load_record
-from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
 from tests.fuzz.mutate import INSIDE, mutant
 from tests.fuzz.seeds import CHECKED, GROUPED, SEEDS, START, TABLE, TIMES, UNIVERSAL, VALUES

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sprung.replay import UnreadableRecording, open_recording
-from sprung.replay.remarks import remarks
+from sprung.replay.clock_messages import remarks
 from sprung.replay.windowing import Windower
 from sprung.service.cli import main
 from tests.fuzz.guided import KEPT

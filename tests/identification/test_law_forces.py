@@ -9,7 +9,12 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from sprung.model.identification import law_forces
-from sprung.model.identification.law_forces import Along, band_limited, shake, sharpened
+from sprung.model.identification.law_forces import (
+    LawAlongMotion,
+    add_motion_between_samples,
+    band_limited,
+    spline_compensation,
+)
 from sprung.model.laws import CATALOGUE, ElementLaw, SpringDamper
 from sprung.model.signals import FloatArray
 
@@ -24,7 +29,7 @@ def law(name: str) -> ElementLaw:
 def test_rates_between_samples_are_those_of_motions_near_half_the_sample_rate(frequency: float, error: float) -> None:
     omega, time = 2 * np.pi * frequency, np.arange(100) / RATE
     deflection, rate = np.sin(omega * time)[None], omega * np.cos(omega * time)[None]
-    along = Along(law("coulomb_friction"), deflection, rate, RATE)
+    along = LawAlongMotion(law("coulomb_friction"), deflection, rate, RATE)
     assert along.v.shape == along.d.shape == (1, 99 * along.parts + 1)
     np.testing.assert_allclose(along.v[:, :: along.parts], rate, atol=1e-9 * omega)
     truth = omega * np.cos(omega * along.time)
@@ -61,17 +66,17 @@ def rubbing(parts: int, samples: int, mass: float, element: SpringDamper, fricti
 
 def test_friction_rounds_its_own_corner_by_shaking_the_body_between_samples() -> None:
     samples, mass, element, friction = 201, 480.0, SpringDamper(1.2e6, 4.0e3), (350.0, 0.004)
-    parts = Along(law("coulomb_friction"), np.zeros((1, 9)), np.zeros((1, 9)), RATE).parts
+    parts = LawAlongMotion(law("coulomb_friction"), np.zeros((1, 9)), np.zeros((1, 9)), RATE).parts
     fine = rubbing(parts, samples, mass, element, friction)[:, : (samples - 1) * parts + 1]
     deflection, rate, truth = (band_limited(x[None], parts) for x in fine)
     at = [np.array([[x]]) for x in friction], SpringDamper(*(np.array([[x]]) for x in element)), np.zeros(1)
-    along = Along(law("coulomb_friction"), deflection, rate, RATE)
+    along = LawAlongMotion(law("coulomb_friction"), deflection, rate, RATE)
 
     def error() -> float:
         return float(np.sqrt(np.mean((along.force(*at) - truth)[0, 12:-12] ** 2)))
 
     before = error()
-    shake([along], [at], np.array([[[1 / mass]]]))
+    add_motion_between_samples([along], [at], np.array([[[1 / mass]]]))
     assert before > 0.015 * friction[0]
     assert error() < 0.35 * before
 
@@ -88,8 +93,8 @@ def test_the_motion_that_a_sharpened_spline_makes_of_a_tone_is_right_at_the_samp
         drift = np.polynomial.Polynomial.fit(time, left := (moved + tone / w**2), 1)(time)
         return float(np.abs(left - drift)[20:-20].max() * w**2)
 
-    assert off(sharpened(200) @ tone) < 0.01
-    assert share < 0.2 or off(sharpened(200) @ tone) < 0.35 * off(tone)
+    assert off(spline_compensation(200) @ tone) < 0.01
+    assert share < 0.2 or off(spline_compensation(200) @ tone) < 0.35 * off(tone)
 
 
 def test_hysteresis_that_yields_within_a_sample_is_followed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,9 +107,9 @@ def test_hysteresis_that_yields_within_a_sample_is_followed(monkeypatch: pytest.
     values, element = [np.full((1, 1), x) for x in (4.5e5, 6e6, 2.0)], SpringDamper(1.2e6, 4e3)
 
     def force() -> np.ndarray:
-        return Along(law("bouc_wen"), deflection[None], rate[None], RATE).force(values, element, np.zeros(1))
+        return LawAlongMotion(law("bouc_wen"), deflection[None], rate[None], RATE).force(values, element, np.zeros(1))
 
     ours = force()
-    monkeypatch.setattr(law_forces, "_FINE_MEMORY", 16)
+    monkeypatch.setattr(law_forces, "_OVERSAMPLING_MEMORY", 16)
     fine = force()
     assert np.std(ours - fine) < 0.01 * np.std(fine)

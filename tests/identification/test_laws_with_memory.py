@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sprung.model.identification.identify import load_identifier
-from sprung.model.identification.law_point import WindowPoint
+from sprung.model.identification.law_iterate import Iterate
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
@@ -49,28 +49,29 @@ def test_sensitivities_are_those_of_the_motion_itself(law: str) -> None:
     values = np.zeros((1, 200, 5))
     values[0, :, 0], values[0, :, 1] = u(time), u.derivative()(time)
     data = model.model.batch(model.model.knots(values), values, np.ones(3, dtype=bool))
-    still = np.zeros((2, 1, 200, 2))
+    stationary = np.zeros((2, 1, 200, 2))
     unknowns = torch.zeros(1, model.unknowns, dtype=torch.float64)
-    start = WindowPoint(
+    start = Iterate(
         unknowns, torch.full((1, 4), 1e-3, dtype=torch.float64), torch.zeros(1, 200, 1, dtype=torch.float64)
     )
 
-    def shown(point: WindowPoint) -> torch.Tensor:
+    def shown(point: Iterate) -> torch.Tensor:
         for _ in range(2):  # each call takes a few steps of Newton's method
             point, motion, _ = model.settle(point, model.steps(point, data), data)
         return motion.outputs / torch.as_tensor(bare.sensor_noise)
 
     point, motion, _ = model.settle(start, model.steps(start, data), data)
     steps = model.steps(point, data)
-    along = model.along(motion.states, data, still, point, steps)
-    columns = model.shown(point, steps, motion, data, still, along, model.flow(along, point, steps))
+    along = model.along(motion.states, data, stationary, point, steps)
+    tangent = model.tangent(along, point, steps)
+    columns = model.output_sensitivities(point, steps, motion, data, stationary, along, tangent)
     back = torch.linalg.pinv(model.model.compression.matrix(data.present))
     whitened = torch.as_tensor(np.diag(1 / bare.sensor_noise)) @ back
     for at in range(2, model.unknowns):  # of the strut, its law, its memory
         size = 1e-3 if at < len(vehicle.tracked) else 1e-5
         moved = torch.zeros_like(unknowns)
         moved[:, at] = size
-        up, down = (shown(WindowPoint(unknowns + sign * moved, start.x0, start.force)) for sign in (1, -1))
+        up, down = (shown(Iterate(unknowns + sign * moved, start.x0, start.force)) for sign in (1, -1))
         expected = (up - down) / (2 * size)
         found = columns[..., 4 + at] @ whitened.mT
         assert (found - expected).square().mean().sqrt() < 0.08 * expected.square().mean().sqrt()

@@ -10,9 +10,9 @@ import pytest
 from sprung.model.signals import Channel, FloatArray, SampleBlock
 from sprung.replay import UnreadableRecording
 from sprung.replay.account import Account
+from sprung.replay.multirate import MultirateColumns
 from sprung.replay.record import load_record
-from sprung.replay.sampling import at_rate, low_pass, pace
-from sprung.replay.slower import SlowerColumns
+from sprung.replay.sampling import at_rate, low_pass, sampling_clock
 from sprung.replay.windowing import Windower
 from tests.replay.test_record import CSV_CHANNELS, write_table
 
@@ -114,11 +114,11 @@ def test_values_that_are_missing_stay_missing() -> None:
 
 def test_the_pace_of_a_channel_does_not_mind_gaps() -> None:
     time = np.rint(np.r_[np.arange(500), 5000 + np.arange(800)] * 1e6).astype(np.int64)
-    found = pace(time)
+    found = sampling_clock(time)
     assert found is not None and found.period == pytest.approx(1e-3)
     assert found.jitter < 1e-6
     uneven = np.cumsum(np.random.default_rng(0).exponential(1e6, 3000)).astype(np.int64)
-    found = pace(uneven)
+    found = sampling_clock(uneven)
     assert found is not None and found.jitter > 3
 
 
@@ -221,7 +221,7 @@ def test_a_sensor_that_drops_out_at_random_or_dies_has_no_clock_of_its_own() -> 
     empty = np.zeros((1000, 3), dtype=bool)
     empty[:, 0] = random.uniform(size=1000) < 0.4
     empty[300:, 1] = True
-    kept, missing = SlowerColumns().kept(time, empty)
+    kept, missing = MultirateColumns().kept(time, empty)
     assert kept.all() and missing == empty.sum()
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from sprung.model.signals import FloatArray
 from sprung.replay import open_recording
-from sprung.replay.remarks import pauses, remarks
+from sprung.replay.clock_messages import pauses, remarks
 from sprung.replay.windowing import Windower
 from tests.fuzz.seeds import TABLE
 from tests.replay_files import LEFT, ROWS, START, database, write_can

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from sprung.model.signals import Channel, SampleBlock, Window
 from sprung.replay import UnreadableRecording
-from sprung.replay.plausible import EARLIEST, LATEST
+from sprung.replay.clock_messages import remarks
+from sprung.replay.plausibility import EARLIEST, LATEST
 from sprung.replay.record import load_record
-from sprung.replay.remarks import remarks
 from sprung.replay.windowing import Windower
 
 CHANNELS = [Channel("a", "m/s^2", 0.01, csv="a"), Channel("b", "m/s^2", 0.01, csv="b")]

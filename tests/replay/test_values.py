@@ -17,7 +17,7 @@ from sprung.model.signals import Channel, SampleBlock
 from sprung.replay.account import KEPT_PROBLEMS, Account, UnreadableRecording
 from sprung.replay.blf import frames as blf_frames
 from sprung.replay.convert import converter
-from sprung.replay.plausible import EARLIEST, LATEST, OUT_OF_RANGE, OUT_OF_TIME, Screen, nanoseconds
+from sprung.replay.plausibility import EARLIEST, LATEST, OUT_OF_RANGE, OUT_OF_TIME, PlausibilityCheck, nanoseconds
 from sprung.replay.textframes import decimal_ns, frame_id
 from tests.replay_files import LEFT, RIGHT, ROWS, TIMES, VALUES, database, frame, read, write_can
 
@@ -198,7 +198,7 @@ def screened(
     channels: Sequence[Channel], time: ArrayLike, channel: ArrayLike, value: ArrayLike
 ) -> tuple[SampleBlock, Account]:
     account = Account()
-    screen = Screen(channels, account, converter(channels))
+    screen = PlausibilityCheck(channels, account, converter(channels))
     block = screen.check(SampleBlock(np.array(time), np.array(channel, dtype=np.int32), np.array(value)))
     screen.tell()
     return block, account

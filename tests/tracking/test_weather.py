@@ -10,7 +10,7 @@ from sprung.model.signals import Conditions, FloatArray, SampleBlock, Window
 from sprung.model.system import parse_system
 from sprung.model.tracking import weather
 from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState
-from sprung.replay.beside import Beside
+from sprung.replay.auxiliary import AuxiliaryMeans
 from tests.tracker_windows import EPOCH, correlated, estimate
 
 NAMES = [f"{e}.{q}" for q in ("stiffness", "damping") for e in (
@@ -194,7 +194,7 @@ def test_a_repaired_damper_keeps_its_slope_and_learns_its_level() -> None:
 
 
 def test_slow_signals_are_taken_beside_the_windows() -> None:
-    beside = Beside(2, 1)
+    beside = AuxiliaryMeans(2, 1)
     second = 1_000_000_000
     block = SampleBlock(
         np.array([0, 1, 2, 3, 4]) * second,

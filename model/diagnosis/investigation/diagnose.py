@@ -15,7 +15,6 @@ from sprung.model.diagnosis.investigation.calibration import (
     within_data_sheet,
     without_calibrations,
 )
-from sprung.model.diagnosis.investigation.doubt import misfit_covariance
 from sprung.model.diagnosis.investigation.excess_noise import noise_faults
 from sprung.model.diagnosis.investigation.formula_trial import with_formula
 from sprung.model.diagnosis.investigation.inputs import best_input_fault, compensate, nominal
@@ -25,6 +24,7 @@ from sprung.model.diagnosis.investigation.judgement import (
     unmeasured_share,
 )
 from sprung.model.diagnosis.investigation.minor import is_minor, untried
+from sprung.model.diagnosis.investigation.misfit_covariance import misfit_covariance
 from sprung.model.diagnosis.investigation.named_laws import with_named_laws
 from sprung.model.diagnosis.investigation.redundant import without_redundant
 from sprung.model.diagnosis.investigation.setup import fitted_samples, misfit, without_setup_faults

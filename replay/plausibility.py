@@ -1,8 +1,8 @@
-"""What a measured value and its time stamp can be at all: one bad value costs itself, never a recording.
+"""Plausibility of measured values and time stamps: one bad value costs itself, never a recording.
 
-Readers hand on what is written in the file.  Here, for all of them: numbers that are not finite, numbers by which
-loggers mark a missing value, and values outside a channel's range become missing (NaN); samples with a time stamp
-that no clock can show are left out.  Everything is counted per channel and told.
+Readers pass on what is in the file.  For all of them, numbers that are not finite, numbers by which loggers mark a
+missing value, and values outside a channel's range become missing (NaN) here; samples with an impossible time stamp are
+left out.  Everything is counted and reported per channel.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def nanoseconds(seconds: FloatArray) -> tuple[IntArray, BoolArray]:
     return np.where(good, scaled, 0.0).astype(np.int64), good
 
 
-class Screen:
+class PlausibilityCheck:
     """Checks blocks on their way from a reader, counts what it finds; `tell` says so at the end."""
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Columns of a table that have a slower clock of their own: their rows are blank between their samples."""
+"""Columns of a table that are sampled at a lower rate, and blank between their samples."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from sprung.model.signals import BoolArray, FloatArray, IntArray
 
-ROWS = 40  # at least, from which a column's clock is told
+ROWS = 40  # at least, to determine the sampling rate of a column
 SLOWER = 1.2  # times the interval of the rows
-EVEN, MOST = 0.05, 0.9  # of an interval, within which most intervals are alike; how many those are
+EVEN, MOST = 0.05, 0.9  # tolerance of an interval, relative; share of intervals within it
 
 
-class SlowerColumns:
-    """Which columns of a table are slower, told from its first rows."""
+class MultirateColumns:
+    """Finds the columns of a lower rate from the first rows of a table."""
 
     def __init__(self) -> None:
         self._which: BoolArray | None = None
@@ -20,8 +20,7 @@ class SlowerColumns:
     def kept(self, time: IntArray, empty: BoolArray) -> tuple[BoolArray, int]:
         """Which values (n, columns) are samples, the missing ones among them, and how many of these are missing.
 
-        time: ns, shape (n,); empty: shape (n, columns).  A blank of a column that is slower is no sample: nothing was
-        measured then.
+        time: ns, shape (n,); empty: shape (n, columns).  A blank in a column of a lower rate is not a missing sample.
         """
         if self._which is None and len(time) >= ROWS:
             self._which = np.array([_is_slower(time, ~column) for column in empty.T], dtype=bool)

@@ -1,4 +1,4 @@
-"""What a user must be told about the times of a recording, once it is cut into windows."""
+"""Messages to the user about the clock of a recording, once it is cut into windows."""
 
 from __future__ import annotations
 

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from sprung.model.identification.identify import Identifier, load_identifier
-from sprung.model.identification.law_opening import opened
-from sprung.model.identification.law_point import WindowPoint
+from sprung.model.identification.law_initial import initial_iterate
+from sprung.model.identification.law_iterate import Iterate
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
@@ -68,13 +68,13 @@ def test_the_opening_has_the_stop_where_it_is_met() -> None:
     w = LawWindows(without_laws(system), acting_laws(system), WindowModel(without_laws(system), 100))
     data = w.model.batch(w.model.knots(windows), windows, np.ones(2, dtype=bool))
     B = len(windows)
-    start = WindowPoint(torch.zeros(B, w.unknowns), torch.zeros(B, 4), torch.zeros(B, 100, 1))
-    start = WindowPoint(*(part.double() for part in (start.unknowns, start.x0, start.force)))
-    point = opened(w, start, data)
-    still = np.zeros((2, B, 100, 2))
+    start = Iterate(torch.zeros(B, w.unknowns), torch.zeros(B, 4), torch.zeros(B, 100, 1))
+    start = Iterate(*(part.double() for part in (start.unknowns, start.x0, start.force)))
+    point = initial_iterate(w, start, data)
+    stationary = np.zeros((2, B, 100, 2))
     steps = w.steps(point, data)
     states, _ = w.simulate(steps, point.force, point.x0, data)
-    law = w.forces_along(w.along(states, data, still, point, steps), point, steps)
+    law = w.forces_along(w.along(states, data, stationary, point, steps), point, steps)
     assert law.square().mean() > 100.0**2  # N: the stop is met at all
     assert (law - point.force).square().mean().sqrt() < 0.2 * law.square().mean().sqrt()
 

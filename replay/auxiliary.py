@@ -1,6 +1,6 @@
-"""Slow signals beside the windows: speed, temperature, pressures, at whatever rate they come.
+"""Auxiliary signals beside the windows: speed, temperature, pressures, at any rate.
 
-They need no grid: a window is told the mean of what came while it lasted, or else what came last.
+They are not resampled: a window gets the mean of the samples within it, or else the latest one before it.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ import numpy as np
 
 from sprung.model.signals import FloatArray, IntArray, SampleBlock, Window
 
-VALID = 60.0  # s for which a value is taken to hold
-KEPT = 1_000_000  # samples of one signal at the most, should no window ever come
+VALID = 60.0  # s for which the latest value is used
+KEPT = 1_000_000  # samples of one signal at most, in case no window ever comes
 
 
-class Beside:
-    """Takes the samples of auxiliary channels out of a stream and gives their means to its windows."""
+class AuxiliaryMeans:
+    """Separates the samples of auxiliary channels from a stream and adds their means to its windows."""
 
     def __init__(self, channels: int, auxiliary: int) -> None:
         """Auxiliary channels follow the `channels` of the windows."""

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sprung.model.identification.doubt import bounce_doubt, mass_doubt
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
+from sprung.model.identification.model_uncertainty import model_uncertainty, sampling_uncertainty
 from sprung.model.system import System, load_system, parse_system
 from sprung.service.engine import make_tracker
 from tests.strut import TEXT
@@ -35,9 +35,9 @@ def quarter_car(mass: float | str) -> System:
 def test_with_an_unknown_load_all_forces_scale_with_the_axle() -> None:
     system = quarter_car(40.0)
     assert system.doubtful_masses == {"unsprung": 0.03}
-    doubt = mass_doubt(system, loads=True)
-    assert np.sqrt(np.diag(doubt.parameters)) == pytest.approx(0.03, rel=0.02)
-    assert np.sqrt(doubt.deviations[-1, -1]) == pytest.approx(0.03, rel=0.05)
+    found = model_uncertainty(system, loads=True)
+    assert np.sqrt(np.diag(found.parameters)) == pytest.approx(0.03, rel=0.02)
+    assert np.sqrt(found.deviations[-1, -1]) == pytest.approx(0.03, rel=0.05)
 
 
 def test_windows_of_a_heavier_axle_are_within_what_is_stated() -> None:
@@ -142,7 +142,7 @@ def test_bodies_that_are_not_quite_those_of_the_file_blind_no_tracker(off: dict[
 
 def test_what_is_fixed_or_stated_is_not_doubted_beside() -> None:
     certain = parse_system(QUARTER_CAR.format(mass="{value: 40.0, fixed: true}"))
-    assert mass_doubt(certain, loads=True, tracked=True).none
+    assert model_uncertainty(certain, loads=True, tracked=True).none
 
 
 def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it() -> None:
@@ -150,7 +150,7 @@ def test_a_stiff_stop_is_known_no_better_than_sampling_follows_it() -> None:
         law = f"damping: 1500.0, laws: [{{bump_stop: {{gap: 0.01, stiffness: {stiffness}}}}}]"
         text = QUARTER_CAR.format(mass=40.0).replace("damping: 1500.0", law)
         system = parse_system(text.replace("sample_rate: 100", f"sample_rate: {rate}"))
-        names, std = [p.name for p in system.tracked], np.sqrt(bounce_doubt(system))
+        names, std = [p.name for p in system.tracked], np.sqrt(sampling_uncertainty(system))
         (at,) = np.flatnonzero(std)
         assert names[at] == "strut.bump_stop.stiffness"
         tracker = make_tracker(system)

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from sprung.model.identification.identify import load_identifier
-from sprung.model.identification.law_flow import Flow
-from sprung.model.identification.law_point import WindowPoint
+from sprung.model.identification.law_iterate import Iterate
+from sprung.model.identification.law_tangent import TangentModel
 from sprung.model.identification.law_window import LawWindows
 from sprung.model.identification.linearise import WindowModel
 from sprung.model.identification.with_laws import acting_laws, without_laws
@@ -44,29 +44,29 @@ sensors:
 )
 def test_forces_followed_backwards_are_the_transpose_of_those_followed_forwards(law: str) -> None:
     random = torch.Generator().manual_seed(4)
-    flow = _flow(law)
-    Z, (B, T, L) = len(flow.memories), flow.slopes[0].shape
+    tangent = _flow(law)
+    Z, (B, T, L) = len(tangent.memories), tangent.slopes[0].shape
 
     def drawn(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, dtype=torch.float64, generator=random)
 
     deflection, rate = drawn(B, T, L, 1), drawn(B, T, L, 1)
-    path = flow.run(
+    path = tangent.run(
         torch.zeros(B, T - 1, 4, 1, dtype=torch.float64),
-        flow.along(deflection, rate)[0],
+        tangent.along(deflection, rate)[0],
         torch.zeros(B, 4, 1, dtype=torch.float64),
-        flow.along(deflection, rate)[1],
+        tangent.along(deflection, rate)[1],
     )
     by_state, by_force = drawn(B, T, 4, 1), drawn(B, T, L, 1)
     forwards = (path[:, :, :4] * by_state).sum() + (path[:, :, 4:] * by_force).sum()
-    added, remembered = flow.back(by_state, by_force)
+    added, remembered = tangent.adjoint(by_state, by_force)
     assert remembered.shape == (B, T - 1, Z, 1)
-    by_deflection, by_rate = flow.along_back(added, remembered)
+    by_deflection, by_rate = tangent.along_adjoint(added, remembered)
     backwards = (by_deflection * deflection).sum() + (by_rate * rate).sum()
     assert float(backwards) == pytest.approx(float(forwards), rel=1e-9)
 
 
-def _flow(law: str) -> Flow:
+def _flow(law: str) -> TangentModel:
     vehicle = strut(law)
     bare = without_laws(vehicle)
     model = LawWindows(bare, acting_laws(vehicle), WindowModel(bare, 200))
@@ -76,13 +76,11 @@ def _flow(law: str) -> Flow:
     values[0, :, 0], values[0, :, 1] = u(time), u.derivative()(time)
     data = model.model.batch(model.model.knots(values), values, np.ones(3, dtype=bool))
     zero = torch.zeros(1, model.unknowns, dtype=torch.float64)
-    start = WindowPoint(
-        zero, torch.full((1, 4), 1e-3, dtype=torch.float64), torch.zeros(1, 200, 1, dtype=torch.float64)
-    )
-    still = np.zeros((2, 1, 200, 2))
+    start = Iterate(zero, torch.full((1, 4), 1e-3, dtype=torch.float64), torch.zeros(1, 200, 1, dtype=torch.float64))
+    stationary = np.zeros((2, 1, 200, 2))
     point, motion, _ = model.settle(start, model.steps(start, data), data)
     steps = model.steps(point, data)
-    return model.flow(model.along(motion.states, data, still, point, steps), point, steps)
+    return model.tangent(model.along(motion.states, data, stationary, point, steps), point, steps)
 
 
 def test_deviations_contain_the_noise_of_inputs_that_a_stop_makes_larger() -> None:
