@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from sprung.model.address import Address, Laws, Strict, TimeKey
 from sprung.model.sensor_kinds import KINDS, ElementKind, MotionKind
@@ -178,7 +178,7 @@ class FollowedSignal(Address):
 class SystemFile(Strict):
     """Everything a system file says, with references between its parts checked."""
 
-    name: str = Field(min_length=1)
+    name: Annotated[str, Field(min_length=1, max_length=200), StringConstraints(strip_whitespace=True)]
     sample_rate: float = Field(gt=0)  # Hz
     window: int = Field(ge=8)  # samples, the paper's tau
     hop: int | None = Field(default=None, ge=1)  # samples between window starts; default half a window

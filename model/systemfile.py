@@ -14,6 +14,7 @@ from pydantic_core import ErrorDetails
 from sprung.model.address import TimeKey
 from sprung.model.laws.placed import did_you_mean
 from sprung.model.schema import Body, Element, Input, Parts, Sensor, Speed, SystemFile, SystemFileError
+from sprung.model.text import hidden_character
 
 _ENTRIES: dict[str, TypeAdapter[Any]] = {
     "bodies": TypeAdapter(Body),
@@ -127,7 +128,7 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
         raise SystemFileError(f"{source}: not YAML: {problem[:200]}") from None
     if not isinstance(raw, Mapping):
         raise SystemFileError(f"{source}: a mapping with name, bodies, elements, sensors is expected")
-    problems, file = loader.problems, None
+    problems, file = loader.problems + _hidden(node), None
     try:
         file = SystemFile.model_validate(raw)
     except ValidationError as error:
@@ -136,6 +137,24 @@ def parse_system_file(text: str, source: str = "system file") -> SystemFile:
     if problems or file is None:
         raise _error(source, problems)
     return file
+
+
+def _hidden(document: yaml.Node | None) -> list[tuple[int, str]]:
+    """Names and texts with characters that nobody sees; they end up on terminals, in logs and on pages."""
+    found: list[tuple[int, str]] = []
+    seen: set[int] = set()
+    left = [document] if document is not None else []
+    while left:
+        node = left.pop()
+        if id(node) in seen:
+            continue
+        seen.add(id(node))
+        if isinstance(node, yaml.CollectionNode):
+            left += [part for item in node.value for part in (item if isinstance(item, tuple) else (item,))]
+        elif character := hidden_character(node.value.removesuffix("\n")):  # what a block of text ends with
+            line, text = node.start_mark.line + 1, node.value[:40]
+            found.append((line, f"{text!a}: holds a character that nobody sees ({character})"))
+    return found
 
 
 def _error(source: str, problems: list[tuple[int, str]]) -> SystemFileError:

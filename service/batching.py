@@ -25,6 +25,7 @@ from sprung.service.compute import Compute, Priority
 from sprung.service.engines import ServedModel
 from sprung.service.errors import Busy
 from sprung.service.pipeline import Pipeline
+from sprung.service.store.vehicle_models import SERVICE_FILE
 from sprung.service.store.windows import WindowRecord
 from sprung.service.together import FoundWindow, track_together
 
@@ -91,13 +92,20 @@ class Batcher:
     """Takes single windows, hands batches to the numerics and to the store.  For any event loop."""
 
     def __init__(
-        self, pipeline: Pipeline, compute: Compute, limit: int, observe: Callable[[dict[str, float]], None]
+        self,
+        pipeline: Pipeline,
+        compute: Compute,
+        limit: int,
+        observe: Callable[[dict[str, float]], None],
+        beside: Batcher | None = None,
     ) -> None:
-        """limit: windows that may wait; observe: told the seconds of each stage, both queues among them."""
+        """limit: windows that may wait; observe: told the seconds of each stage, both queues among them; beside: takes
+        the windows of vehicles with a model of their own, for which others do not wait."""
         self._pipeline = pipeline
         self._compute = compute
         self._limit = limit
         self._observe = observe
+        self._beside = beside
         self._reading = 0
         self._waiting: deque[_Request] = deque()
         self._to_track: deque[_Request] = deque()
@@ -110,7 +118,7 @@ class Batcher:
     @property
     def waiting(self) -> int:
         """Windows that no batch has taken yet."""
-        return len(self._waiting)
+        return len(self._waiting) + (0 if self._beside is None else self._beside.waiting)
 
     async def ask(self, read: Callable[[], AskedWindow]) -> AnsweredWindow:
         """The answer to a window, stored where that was asked for.
@@ -130,6 +138,8 @@ class Batcher:
         """Let the threads end."""
         self._readers.shutdown()
         self._tracker.shutdown()
+        if self._beside is not None:
+            self._beside.close()
 
     def _read(self, request: _Request, read: Callable[[], AskedWindow]) -> None:
         """In one of the readers' threads."""
@@ -137,12 +147,26 @@ class Batcher:
             request.asked = read()
         except BaseException as error:
             request.answer = error
+        own = request.asked is not None and request.asked.served.version != SERVICE_FILE
+        beside = self._beside if own else None
         with self._lock:
             self._reading -= 1
-            if request.asked is not None:
+            if request.asked is not None and beside is None:
                 self._waiting.append(request)
             refused = self._call_in_time()
         _deliver([request, *refused] if request.asked is None else refused)
+        if beside is not None:
+            beside.take(request)
+
+    def take(self, request: _Request) -> None:
+        """A window that another batcher has read."""
+        with self._lock:
+            if len(self._waiting) >= self._limit:
+                request.answer, refused = _busy(), [request]
+            else:
+                self._waiting.append(request)
+                refused = self._call_in_time()
+        _deliver(refused)
 
     def _call_in_time(self) -> list[_Request]:
         """As `_call`, unless that is done or better done later; whoever ends the wait calls this again."""

@@ -59,6 +59,7 @@ class Core:
     engine: Engine
     store: Store
     compute: Compute
+    beside: Compute  # of vehicles with a model of their own
     pipeline: Pipeline
     board: Board
     rides: Rides
@@ -108,6 +109,7 @@ class Core:
             stack.callback(self.store.close)
             stack.callback(self.batcher.close)
             stack.callback(self.compute.close)
+            stack.callback(self.beside.close)
             stack.callback(self.jobs.close)
             stack.callback(self.housekeeping.close)
             stack.callback(self.notices.close)
@@ -126,6 +128,7 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     waits = Waits(metrics.registry)
     store.on_wait = waits.of("store")
     compute = Compute(settings.compute_queue, waits.of("numerics"))
+    beside = Compute(settings.compute_queue, waits.of("own models"))
     rides = Rides(settings.parameter_series_vehicles)
     metrics.registry.register(RideCollector(rides))
 
@@ -139,19 +142,28 @@ def build_core(settings: Settings, engine: Engine, following: Following = follow
     feeds: list[LiveFeed] = []
     notices = Notices(settings, store, lambda: [feed.status() for feed in feeds])
     pipeline = Pipeline(
-        engine, store, compute, listeners, settings.vehicles_in_memory, on_alarms=notices.alarms, follow=following
+        engine,
+        store,
+        compute,
+        listeners,
+        settings.vehicles_in_memory,
+        on_alarms=notices.alarms,
+        follow=following,
+        beside=beside,
     )
     diagnosis_jobs = DiagnosisJobs(settings, pipeline, on_report=notices.report)
     jobs = _jobs(settings, pipeline, metrics, diagnosis_jobs, waits)
     diagnoses = Diagnoses(settings, store, rings, jobs)
     alarm_signals = AlarmSignals(settings, store, rings)
     listeners += [rides.on_batch, diagnoses.on_batch, alarm_signals.on_batch, hub.on_batch]
-    batcher = Batcher(pipeline, compute, settings.compute_queue, metrics.observe)
+    of_own_models = Batcher(pipeline, beside, settings.compute_queue, metrics.observe)
+    batcher = Batcher(pipeline, compute, settings.compute_queue, metrics.observe, of_own_models)
     core = Core(
         settings,
         engine,
         store,
         compute,
+        beside,
         pipeline,
         board,
         rides,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -133,8 +134,21 @@ def engine_like(engine: Engine, system: System) -> Engine:
     """
     from sprung.model.identification.identify import load_identifier  # brings torch
 
-    identifier = load_identifier(system, workers=os.cpu_count() or 1)
+    identifier = load_identifier(system)  # one worker: the other processors are for vehicles without such a file
     return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
+
+
+def seconds_of_a_window(engine: Engine) -> float:
+    """Processor time that one simulated window takes to be identified; 0 for systems without measured inputs."""
+    from sprung.model.identification.excitation import simulate_runs  # brings torch
+
+    system = engine.system.whole_system
+    if system.on_track or not system.file.inputs:
+        return 0.0
+    runs = simulate_runs(system, np.zeros((1, len(system.parameters))), system.window, np.random.default_rng(0))
+    begin = time.thread_time()
+    engine.identify(runs.values, starts=[0])
+    return time.thread_time() - begin
 
 
 def make_tracker(system: System) -> Tracker:

@@ -11,8 +11,10 @@ from dataclasses import dataclass
 
 from sqlalchemy import Connection
 
+from sprung.model.schema import SystemFile
 from sprung.model.system import System, parse_system
-from sprung.service.engine import Engine, engine_like
+from sprung.model.systemfile import parse_system_file
+from sprung.service.engine import Engine, engine_like, seconds_of_a_window
 from sprung.service.errors import UserError
 from sprung.service.store import Store, vehicle_models
 from sprung.service.store.vehicle_models import SERVICE_FILE
@@ -20,7 +22,9 @@ from sprung.service.store.vehicle_models import SERVICE_FILE
 log = logging.getLogger("sprung.engine")
 LATELY_SECONDS = 10.0  # for which it is taken for granted that nobody gave a vehicle another model
 MOST_LATELY = 10_000  # vehicles
-MOST_LAWS = 12  # in a vehicle's own file: a window with twice as many takes ten seconds, and others wait for it
+MOST_LAWS = 12  # in a vehicle's own file: a window with twice as many takes ten seconds
+MOST_BODIES = 20  # and four times as many elements, where the service's file has no more itself
+MOST_SECONDS = 10.0  # of processor time for one window
 KEPT = 16  # engines of single vehicles in memory; one that is asked for again is loaded in a second
 
 
@@ -130,6 +134,7 @@ class Engines:
         """The engine of a system file's text.  Raises UserError where it is not one of the same measurements."""
         shared = self.shared.engine.system
         try:
+            self._not_too_large(parse_system_file(text, what), what)
             system = parse_system(text, what, shared.catalogue)
         except ValueError as error:
             raise UserError(str(error)) from error
@@ -142,6 +147,27 @@ class Engines:
             return self._make(self.shared.engine, system)
         except ValueError as error:  # a law that windows cannot hold
             raise UserError(f"{what}: {error}") from error
+
+    def tried(self, text: str, what: str) -> Engine:
+        """As `made`, for a file that is new: one simulated window is identified.
+
+        Raises UserError also where that takes too long.
+        """
+        engine = self.made(text, what)
+        seconds = seconds_of_a_window(engine)
+        if seconds > MOST_SECONDS:
+            raise UserError(
+                f"{what}: a window takes {seconds:.0f} s of processor time, {MOST_SECONDS:g} s are allowed; "
+                "leave laws or bodies out"
+            )
+        return engine
+
+    def _not_too_large(self, file: SystemFile, what: str) -> None:
+        """Before anything is calculated, which takes the cube of a system's size."""
+        shared = self.shared.engine.system.file
+        bodies = max(MOST_BODIES, len(shared.bodies))
+        if len(file.bodies) > bodies or len(file.elements) > 4 * bodies:
+            raise UserError(f"{what}: more than {bodies} bodies, or {4 * bodies} elements")
 
     def models_in_use(self, connection: Connection) -> Sequence[int]:
         """Rows of `models` under which windows of this service are stored, the shared one first."""

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import sys
 from contextvars import ContextVar
 from datetime import UTC, datetime
 from typing import Any
 
+from sprung.model.text import escaped
+
 request_id: ContextVar[str] = ContextVar("request_id", default="")
-CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 PLAIN = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime"}
 
 
@@ -40,7 +40,7 @@ class PlainLines(logging.Formatter):
     def formatMessage(self, record: logging.LogRecord) -> str:
         """Level and message."""
         line = " ".join(f"sprung: {record.levelname}: {record.message}".splitlines())
-        return CONTROL.sub(lambda found: f"\\x{ord(found[0]):02x}", line)  # a terminal would obey them
+        return escaped(line)  # a terminal would obey them
 
 
 def set_up(form: str, level: str) -> None:

@@ -97,7 +97,7 @@ class Operations:
         not of the same measurements or that windows cannot be identified with.
         """
         engines, now = self._pipeline.engines, now_ns()
-        engine = engines.made(text, f"the system file for vehicle {vehicle}")  # takes a second: before the store waits
+        engine = engines.tried(text, f"the system file for vehicle {vehicle}")  # takes seconds: before the store waits
         with self._store.write() as connection:
             self._known(fleet.vehicle_exists(connection, vehicle), vehicle)
             fleet.hold_vehicle(connection, vehicle)

@@ -22,6 +22,7 @@ from sprung.service.following import FollowedWindows, Following, follow
 from sprung.service.processed import Batch, Folded, HeldVehicle, Identified, ModelChanged, Newcomer, ToFold
 from sprung.service.store import Store, fleet, status
 from sprung.service.store.partitions import prepare
+from sprung.service.store.vehicle_models import SERVICE_FILE
 from sprung.service.store.windows import WindowRecord, known_windows, latest_window
 from sprung.service.times import NANOSECONDS, now_ns
 from sprung.service.views import VehicleView, vehicle_view
@@ -48,15 +49,17 @@ class Pipeline:
         on_alarms: OnAlarms = lambda connection, vehicle, changes: None,
         staging: str | None = None,
         follow: Following = follow,
+        beside: Compute | None = None,
     ) -> None:
         """on_alarms: told of alarms that open, change or close, inside the transaction that stores them.
 
         staging: digest under which everything is kept unseen (`service.store.staging`); follow: feeds windows to
-        trackers.
+        trackers; beside: for windows of vehicles with a model of their own, so that others never wait for a slow one.
         """
         self.engine = engine
         self.store = store
         self._compute = compute
+        self._beside = beside or compute
         self._listeners = listeners
         self._limit = vehicles_in_memory
         self._clock = clock
@@ -71,6 +74,10 @@ class Pipeline:
                 connection, staging or engine.digest, engine.system.name, engine.description(), clock()
             )
         self.engines = Engines(engine, self.model_id, own=staging is None)
+
+    def compute_of(self, served: ServedModel) -> Compute:
+        """Where the numerics of a vehicle's model are done."""
+        return self._compute if served.version == SERVICE_FILE else self._beside
 
     def process(
         self,
@@ -91,7 +98,7 @@ class Pipeline:
             served = self.engines.of(connection, vehicle)
             known = known_windows(connection, vehicle, served.model_id, [w.start for w in windows])
         fresh = [w for w in windows if w.start not in known]
-        estimates, seconds = self._identify(served.engine, fresh, priority)
+        estimates, seconds = self._identify(served, fresh, priority)
         return Identified(vehicle, served, windows, known, fresh, estimates, seconds)
 
     def keep(self, found: Identified, recording_id: str | None = None) -> Batch:
@@ -116,7 +123,7 @@ class Pipeline:
             return self._current(connection, [vehicle])[vehicle].state
 
     def _identify(
-        self, engine: Engine, windows: list[Window], priority: Priority
+        self, served: ServedModel, windows: list[Window], priority: Priority
     ) -> tuple[list[Estimate | None], dict[str, float]]:
         """Estimates, None for dropped windows; and seconds by stage."""
         whole = [w.values for w in windows if w.outcome != "dropped"]
@@ -124,7 +131,8 @@ class Pipeline:
             return [None] * len(windows), {}
         values = np.stack(whole)  # shape (B, T, C)
         starts = [w.start for w in windows if w.outcome != "dropped"]
-        estimates, seconds = self._compute.run(lambda: engine.identify(values, starts=starts), priority)
+        compute = self.compute_of(served)
+        estimates, seconds = compute.run(lambda: served.engine.identify(values, starts=starts), priority)
         found = iter(estimates)
         return [None if w.outcome == "dropped" else next(found) for w in windows], seconds
 

@@ -15,6 +15,10 @@ from sprung.model.laws.expression import MOTION, Expression, FormulaError, parse
 
 EFFECT = "formula"
 _ANY = 1e18
+_SIZES = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)  # m, of motions; a law that is finite in the smallest only may be of that size
+_PER_SECOND = 10.0  # rate over deflection of such a motion
+_TIMES = (0.0, 10.0, 100.0)  # s
+_MOST_FORCE = 1e15  # N; far more than anything that holds together
 
 
 def formula_law(
@@ -51,6 +55,36 @@ def formula_law(
         formula=formula,
         memory_formula=memory,
     )
+
+
+def without_force(law: ElementLaw, values: Values, element: SpringDamper) -> str:
+    """Where a formula says no force, in words, if there is no motion of any size in which it always does; else empty.
+
+    A division by zero, the root of a negative number and an overflow have no force, and no window holds such a law.
+    """
+    found = ""
+    for size in _SIZES:
+        found = _undefined(law, values, element, size)
+        if not found:
+            return ""
+    return found
+
+
+def _undefined(law: ElementLaw, values: Values, element: SpringDamper, size: float) -> str:
+    """The first point without a force among deflections up to `size`."""
+    at = np.array([0.0, -1.0, 1.0, -0.5, 0.5])
+    states = (size * at,) if law.memory else ()
+    points = np.meshgrid(size * at, _PER_SECOND * size * at, np.array(_TIMES), *states, indexing="ij")
+    d, v, t, *z = (point.ravel() for point in points)
+    motion = Motion(d, v, t, tuple(z))
+    with np.errstate(all="ignore"):
+        force = np.asarray(law.force(motion, values, element), dtype=float)
+        rate = np.asarray(law.memory_rate(motion, values, element), dtype=float) if law.memory else np.zeros((1, 1))
+    for what, number in (("force", force), ("rate of z", rate[0])):
+        bad = np.flatnonzero(~(np.abs(np.broadcast_to(number, d.shape)) < _MOST_FORCE))
+        if len(bad):
+            return f"no finite {what} at d = {d[bad[0]]:g} m, v = {v[bad[0]]:g} m/s"
+    return ""
 
 
 def _spec(name: str, unit: str) -> ParameterSpec:

@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 from sprung.model.address import LawSetting, LawValue
 from sprung.model.laws import CATALOGUE
-from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, StructureLaw, SupportLaw
+from sprung.model.laws.base import BodyLaw, ElementLaw, Law, SensorLaw, SpringDamper, StructureLaw, SupportLaw
 from sprung.model.laws.expression import FormulaError
-from sprung.model.laws.formula import EFFECT, formula_law
+from sprung.model.laws.formula import EFFECT, formula_law, without_force
 from sprung.model.schema import GROUND, SupportInput, SystemFile
 
 _BESIDE = ("with", "variant", "formula", "memory")  # keys of a law that are no parameters
@@ -103,10 +103,16 @@ def _placed(
             raise ValueError(
                 f"{spec.name} must lie between {spec.low:g} and {spec.high:g} {spec.unit}, not {value.value:g}"
             )
+    given_values = tuple(value.value for value in known)
+    if isinstance(law, ElementLaw) and law.name == EFFECT:
+        element = file.elements[location]
+        missing = without_force(law, given_values, SpringDamper(element.stiffness.value, element.damping.value))
+        if missing:
+            raise ValueError(f"formula {law.formula!r}: {missing}")
     return PlacedLaw(
         law,
         _location(file, law, location, setting),
-        tuple(value.value for value in known),
+        given_values,
         tuple(value.std for value in known),
         tuple(value.fixed for value in known),
         str(setting.get("variant", "")),

@@ -12,6 +12,7 @@ from pydantic_core import from_json
 
 from sprung.model.signals import FloatArray
 from sprung.model.system import System
+from sprung.model.text import CONTROL, UNSEEN
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.api.twice import keys_twice
 from sprung.service.engine import Engine
@@ -19,9 +20,8 @@ from sprung.service.fleet.message import SentWindows
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]
-# neither control characters nor such as turn the direction of what follows: both deceive who reads it somewhere else
-LINE_PATTERN = r"^[^\x00-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]*$"
-TEXT_PATTERN = r"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]*$"  # with lines and tabs
+LINE_PATTERN = f"^[^{CONTROL}{UNSEEN}]*$"
+TEXT_PATTERN = rf"^[^\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f{UNSEEN}]*$"  # with lines and tabs
 Number = Annotated[float, Field(allow_inf_nan=False, ge=-1e12, le=1e12)]
 LARGEST = 1e12  # of a sample, in SI units
 MOST_CHANNELS = 1000

@@ -44,7 +44,7 @@ async def window(core: CoreOf, id_: Id) -> Response:
     """Every sensor of the newest window that is held in memory, with what the identified model makes of it."""
     served = await read(core, lambda connection: _served(core, connection, id_))
     start, values = newest_window(served.engine, core.diagnoses.excerpt(id_), id_)
-    work = core.compute.submit(lambda: compare(served.engine, start, values), Priority.REQUEST)
+    work = core.pipeline.compute_of(served).submit(lambda: compare(served.engine, start, values), Priority.REQUEST)
     return json_response(window_dict(served.engine.system, id_, await asyncio.wrap_future(work)))
 
 
@@ -94,7 +94,7 @@ async def vehicle_bundle(
     compared: list[Compared] = []
     for first in range(0, len(windows), AT_ONCE):  # in parts: windows that come live have their turn between them
         part = windows[first : first + AT_ONCE]
-        some = core.compute.submit(partial(compare_all, served.engine, part), Priority.REQUEST)
+        some = core.pipeline.compute_of(served).submit(partial(compare_all, served.engine, part), Priority.REQUEST)
         simulated = await asyncio.wrap_future(some)
         compared += simulated
     body = await run_in_threadpool(bundle, served.engine, found, excerpt, compared)

@@ -18,8 +18,9 @@ from pydantic import TypeAdapter, ValidationError
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
+from sprung.model.text import CONTROL, UNSEEN
 from sprung.replay.recording import EXTENSIONS
-from sprung.service.api.bodies import LINE_PATTERN, VehicleId
+from sprung.service.api.bodies import VehicleId
 from sprung.service.api.problems import ApiProblem, from_validation
 from sprung.service.api.scopes import FORM
 from sprung.service.core import Core
@@ -31,7 +32,7 @@ from sprung.service.times import now_ns
 from sprung.service.upload_room import Share
 
 CHUNK = 1 << 20
-DECEIVING = re.compile(LINE_PATTERN[1:-2].replace("[^", "["))  # characters that a name should not have
+DECEIVING = re.compile(f"[{CONTROL}{UNSEEN}]")  # characters that a name should not have
 MOST_PARTS = 8
 MOST_FIELD_BYTES = 4096
 LONGEST_BOUNDARY = 70  # RFC 2046

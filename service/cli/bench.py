@@ -9,9 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from sprung.benchmarks import BENCHMARKS, load
+from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.errors import UserError
 
 CONVERT: dict[str, Callable[[str], Any]] = {"int": int, "float": float, "Path": Path, "str": str}
+WRITTEN: dict[str, Callable[[Path], None]] = {  # what benchmarks write, by the name of their argument
+    "out": check_folder,
+    "folder": check_folder,
+    "write": check_file,
+    "document": check_file,
+}
 
 
 def run(name: str | None, arguments: list[str]) -> int:
@@ -24,9 +31,19 @@ def run(name: str | None, arguments: list[str]) -> int:
         raise UserError(f"no benchmark {name!r}; known are {', '.join(BENCHMARKS)}")
     function = load(name)
     positional, named = parse(name, function, arguments)
+    _check_targets(function, positional, named)
     for figure in function(*positional, **named):
         print(json.dumps({"bench": name} | figure), flush=True)
     return 0
+
+
+def _check_targets(function: Callable[..., Any], positional: list[Any], named: dict[str, Any]) -> None:
+    """Refuse what could not be written when the benchmark has ended; raises UserError."""
+    given = inspect.signature(function).bind_partial(*positional, **named)
+    given.apply_defaults()
+    for name, check in WRITTEN.items():
+        if given.arguments.get(name):
+            check(Path(given.arguments[name]))
 
 
 def parse(name: str, function: Callable[..., Any], arguments: list[str]) -> tuple[list[Any], dict[str, Any]]:

@@ -27,10 +27,10 @@ def width_of_output() -> int:
 
 
 def print_table(table: Table) -> None:
-    """On stdout; in a pipe as wide as it needs to be, without colours."""
-    console = Console(highlight=False)
+    """On stdout; in a pipe as wide as it needs to be, without colours.  Names in brackets are no markup."""
+    console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=width_of_output(), no_color=True)
+        console = Console(highlight=False, markup=False, width=width_of_output(), no_color=True)
     console.print(table)
 
 
@@ -48,7 +48,7 @@ def stages(console: Console) -> Iterator[Callable[[float, str], None]]:
 
         yield plain
         return
-    with Progress(TextColumn("{task.description}"), BarColumn(), console=console, transient=True) as bar:
+    with Progress(TextColumn("{task.description}", markup=False), BarColumn(), console=console, transient=True) as bar:
         task = bar.add_task("starting", total=1.0)
         yield lambda share, stage: bar.update(task, completed=share, description=stage)
 

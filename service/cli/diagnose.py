@@ -19,8 +19,8 @@ from sprung.service.cli import apart
 from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
+from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.diagnosing import load_excerpt
-from sprung.service.errors import UserError
 from sprung.service.improved import left_out, write_improved
 from sprung.service.loading import RecordRequest
 from sprung.service.own_laws import write_laws
@@ -81,12 +81,9 @@ def run(file: Path, system_file: Path | None, dbc: Path | None, asked: Asked, js
 
 def _check_targets(asked: Asked) -> None:
     """Files that cannot be written are told before the work, not after it."""
-    for path in (asked.write_system, asked.write_laws):
-        if path is not None and (path.is_dir() or not path.parent.is_dir()):
-            what = "is a folder; a file is to be written" if path.is_dir() else f"there is no folder {path.parent}"
-            raise UserError(f"{path}: {what}")
-    if asked.out is not None and asked.out.exists() and not asked.out.is_dir():
-        raise UserError(f"{asked.out}: is a file; the page and the pictures need a folder")
+    check_file(asked.write_system)
+    check_file(asked.write_laws)
+    check_folder(asked.out)
 
 
 def load(file: Path, system: System, dbc: Path | None, start: int | None = None) -> Record:

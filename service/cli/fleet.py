@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sprung.service.cli.options import time_of
+from sprung.service.cli.targets import check_folder
 from sprung.service.compute import Compute
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
@@ -89,6 +90,7 @@ def run_backfill(
 def run_diagnose(options: dict[str, Any], place: str, out: Path, on: str, workers: int | None, json_lines: bool) -> int:
     """Diagnose many; 1 when one is not consistent, or cannot be diagnosed."""
     settings, started = settings_with(options), time.perf_counter()
+    check_folder(out)
     list_recordings(_place(place))  # told before anything is started
     tasks = tasks_for(_on(on), workers)
     verdicts: Counter[str] = Counter()

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from sprung.service.cli.options import time_of
+from sprung.service.cli.targets import check_file
 from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
@@ -35,6 +36,7 @@ def run(
     kind = kind or ("csv" if out is None else out.suffix.removeprefix("."))
     if kind not in MEDIA_TYPES:
         raise UserError(f"--format {kind}: known are {', '.join(MEDIA_TYPES)}")
+    check_file(out)
     settings = settings_with({"system": system, "store": store, "weights": weights})
     engine = load_engine(settings)
     known = [p.name for p in engine.system.parameters]

@@ -11,11 +11,13 @@ from rich.table import Table
 
 from sprung.model.signals import TimeColumn
 from sprung.model.system import load_system
+from sprung.model.text import escaped
 from sprung.model.units import FACTORS, known
 from sprung.replay.inspection import Inspection, Signal
 from sprung.replay.skeleton import skeleton
 from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
+from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
 from sprung.service.loading import InspectionRequest
 from sprung.service.times import to_iso
@@ -33,6 +35,7 @@ def run(
     json_lines: bool,
 ) -> int:
     """Print what is in a recording; 1 when some of it could not be read."""
+    check_file(write_system)
     time, said = _time(system_file, column, unit, rate)
     found = apart.look(InspectionRequest(file, dbc, time))
     if write_system is not None:
@@ -82,7 +85,7 @@ def as_dict(found: Inspection) -> dict[str, object]:
 def heading(found: Inspection) -> str:
     """Which recording, how long, since when."""
     began = "times count from 0" if found.relative or found.start is None else f"begins {to_iso(found.start)}"
-    return f"{found.file}: {found.seconds:.6g} s, {began}"
+    return f"{escaped(found.file)}: {found.seconds:.6g} s, {began}"
 
 
 def table(found: Inspection) -> Table:
@@ -97,13 +100,14 @@ def table(found: Inspection) -> Table:
         numbers = [f"{v:.4g}" if v is not None else "–" for v in (s.mean, s.deviation, s.noise)]
         low_high = "–" if s.minimum is None else f"{s.minimum:.4g} to {s.maximum:.4g}"
         rate = "–" if s.rate is None else f"{s.rate:.5g}"
-        out.add_row(s.name, s.unit or "–", rate, low_high, *numbers, band, "–" if s.peak is None else f"{s.peak:.3g}")
+        peak = "–" if s.peak is None else f"{s.peak:.3g}"
+        out.add_row(escaped(s.name), escaped(s.unit or "–"), rate, low_high, *numbers, band, peak)
     return out
 
 
 def remarks(found: Inspection) -> list[str]:
     """One line for everything that deserves a second look."""
-    return [f"{signal.name}: {remark}" for signal in found.signals for remark in _of(signal)]
+    return [escaped(f"{signal.name}: {remark}") for signal in found.signals for remark in _of(signal)]
 
 
 def _of(s: Signal) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.table import Table
+from rich.text import Text
 
 from sprung.service.pages.render import percent, quantity
 from sprung.service.views import VehicleView
@@ -23,7 +24,7 @@ def parameter_table(view: VehicleView, width: int = 120) -> Table:
     """Every tracked parameter, the ones with alarms marked; on narrow terminals fewer columns, whole names."""
     style = HEALTH_STYLE.get(view.health, "red")
     table = Table(
-        title=f"{view.vehicle}: [{style}]{view.health.replace('_', ' ')}[/{style}]",
+        title=Text.assemble(f"{view.vehicle}: ", (view.health.replace("_", " "), style)),
         title_justify="left",
         title_style="bold",
     )

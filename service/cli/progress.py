@@ -41,7 +41,7 @@ def progress(name: str, hop_seconds: float, quiet: bool = False) -> Iterator[OnB
         yield _silent if quiet else plain_progress(name, hop_seconds)
         return
     shown = RecordingProgress(name, hop_seconds)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(f"{name}: reading", total=None)
         yield lambda batch: bar.update(task, description=shown.on_batch(batch))

@@ -15,6 +15,7 @@ from sprung.replay.record import Record
 from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
+from sprung.service.cli.targets import check_file, check_folder
 from sprung.service.comparison import SYSTEM_FILES, Comparison, compare
 from sprung.service.errors import UserError
 from sprung.service.loading import RecordRequest
@@ -35,6 +36,7 @@ def simulate(
         raise UnwritableRecording(f"{out}: cannot write files of this kind; known are {' '.join(sorted(WRITERS))}")
     if out.exists() and out.resolve() == inputs.resolve():
         raise UserError(f"{out}: is the file that the inputs come from")
+    check_file(out)
     system = load_system(system_file, catalogue)
     database = database_of(system, dbc)
     record = apart.load(RecordRequest(inputs, system.channels, system.sample_rate, database, system.time, None))
@@ -69,6 +71,7 @@ def show(
     catalogue: tuple[Law, ...] = CATALOGUE,
 ) -> int:
     """Print the errors of every sensor; with a folder, draw them.  A system file alone reads the recording, too."""
+    check_folder(out)
     simulated = other if other.suffix.lower() in SYSTEM_FILES else MANCHESTER
     system = load_system(system_file or simulated, catalogue)
     database = database_of(system, dbc)

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from sprung.model.exchange.matrices import read_matrices
 from sprung.model.identification.identify import identifiability
 from sprung.model.identification.linearise import PRIOR_STD
-from sprung.model.schema import SystemFileError
 from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
 from sprung.service.cli.export import export, left_out
+from sprung.service.cli.targets import check_file
 from sprung.service.pages.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
@@ -25,6 +26,7 @@ KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window t
 
 def import_matrices(file: Path, out: Path, rate: float | None, name: str | None) -> int:
     """Write the system file of a model that comes as matrices, and say what became of it."""
+    check_file(out)
     text = read_matrices(file, name, rate)
     system = parse_system(text, str(out))
     out.write_text(text, encoding="utf-8")
@@ -37,16 +39,14 @@ def import_matrices(file: Path, out: Path, rate: float | None, name: str | None)
 
 
 def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = None) -> int:
-    """Check the file and print what it says, or one line for each problem; or print the JSON Schema of the format."""
+    """Check the file and print what it says, or print the JSON Schema of the format.
+
+    Errors: `SystemFileError` with all problems of a file.
+    """
     if schema:
         print(json.dumps(json_schema(), indent=2))
         return 0
-    try:
-        system = load_system(file or MANCHESTER)
-    except SystemFileError as error:
-        for line in error.problems:
-            print(f"sprung: {' '.join(line.split())}", file=sys.stderr)
-        return 2
+    system = load_system(file or MANCHESTER)
     if out is not None:
         for path in export(system, out):
             print(path)
@@ -58,13 +58,15 @@ def run(file: Path | None, json_lines: bool, schema: bool, out: Path | None = No
     if json_lines:
         print(json.dumps(_as_dict(system, told), indent=None))
         return 0
-    console = Console(highlight=False)
+    console = Console(highlight=False, markup=False)
     if not console.is_terminal:
-        console = Console(highlight=False, width=110, no_color=True)
+        console = Console(highlight=False, markup=False, width=110, no_color=True)
     console.print(
-        f"[bold]{system.name}[/bold]: {len(system.bodies)} bodies, {len(system.mechanics.dofs)} degrees of freedom, "
+        Text(system.name, style="bold"),
+        f": {len(system.bodies)} bodies, {len(system.mechanics.dofs)} degrees of freedom, "
         f"{len(system.inputs)} input signals, {len(system.elements)} elements, {len(system.sensors)} sensors; "
-        f"{system.window} samples at {system.sample_rate:g} Hz; digest {system.digest}"
+        f"{system.window} samples at {system.sample_rate:g} Hz; digest {system.digest}",
+        sep="",
     )
     if not system.bodies:
         console.print(_elements(system))

@@ -17,6 +17,7 @@ from sprung.model.system import MANCHESTER, System, load_system
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.console import errors
+from sprung.service.cli.targets import check_folder
 from sprung.service.errors import UserError
 from sprung.service.reading import ReadRequest
 
@@ -35,6 +36,7 @@ def run(system_file: Path | None, recordings: list[Path], dbc: Path | None, out:
     """Train, and print what was reached."""
     from sprung.model.identification.training import TrainingSettings, train, training_benefit
 
+    check_folder(out)
     system = load_system(system_file or MANCHESTER)
     if not system.bodies:
         raise UserError(f"{system_file}: a component test has no bodies, so no estimator to train; use sprung diagnose")
@@ -77,7 +79,7 @@ class TrainingProgress:
         console = errors()
         self._bars: Progress | None = None
         if console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+            columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeRemainingColumn())
             self._bars = Progress(*columns, console=console)
         self._tasks: dict[str, TaskID] = {}
         self._tenth: tuple[str, int] = ("", -1)

@@ -76,3 +76,21 @@ def test_laws_count_in_the_digest_and_their_deviations_do_not() -> None:
     assert system().digest != system(law % "10").digest
     assert system(law % "{value: 10}").digest == system(law % "{value: 10, std: 3}").digest
     assert bundled_estimator(load_system()) is not None  # files without laws keep the digest of their weights
+
+
+@pytest.mark.parametrize("formula", ["a * d / 0", "a * sqrt(d)", "a * exp(1e9 * abs(d))", "a * 1e300 * d", "a * 0 / d"])
+def test_a_formula_that_never_has_a_force_is_refused(formula: str) -> None:
+    with pytest.raises(SystemFileError, match=r"laws.0.formula: formula .* no finite force at d = "):
+        system(f', laws: [{{formula: {{formula: "{formula}", a: 1.0e+5}}}}]')
+
+
+@pytest.mark.parametrize(
+    "formula", ["a * d**3", "a * (exp(d / 1e-4) - 1)", "a * sign(d) * sqrt(abs(d))", "a * v / 0.1"]
+)
+def test_a_formula_that_is_finite_in_small_motions_is_taken(formula: str) -> None:
+    assert len(system(f', laws: [{{formula: {{formula: "{formula}", a: 1.0e+5}}}}]').laws) == 1
+
+
+def test_a_memory_without_a_rate_is_refused() -> None:
+    with pytest.raises(SystemFileError, match="no finite rate of z"):
+        system(', laws: [{formula: {formula: "a * z", memory: "v / 0", a: 1}}]')

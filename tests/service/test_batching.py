@@ -6,6 +6,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -97,6 +98,25 @@ def test_a_window_that_comes_twice_at_once_or_again_is_stored_once_and_answered_
     assert [record.start for record in records if record is not None] == [START + s * NANOSECONDS for s in (7, 7, 7, 8)]
     assert stored(running, "v", range(10)) == {7, 8}
     assert running.pipeline.state("v").used == 2
+
+
+def test_windows_of_a_vehicle_with_a_model_of_its_own_hold_up_nobody(running: Core, system: System) -> None:
+    shared = running.pipeline.engines.shared
+    own = replace(asked(running, system, "slow", 0), served=replace(shared, version=1))
+    release = threading.Event()
+    running.beside.submit(release.wait)
+
+    async def both() -> tuple[AnsweredWindow, bool, AnsweredWindow]:
+        slow = asyncio.ensure_future(running.batcher.ask(ready(replace(own, start=None))))
+        while not running.batcher.waiting:
+            await asyncio.sleep(0.005)
+        quick = await running.batcher.ask(ready(asked(running, system, "quick", 0)))
+        waited = not slow.done()
+        release.set()
+        return quick, waited, await slow
+
+    quick, waited, slow = asyncio.run(both())
+    assert waited and quick.record is not None and slow.asked.vehicle == "slow"
 
 
 def test_windows_gather_while_the_tracker_is_busy_and_those_for_no_tracker_do_not_wait(

@@ -17,7 +17,7 @@ from tests.served import served
 from tests.service.test_server import settings
 from tests.service_fakes import make_window
 
-DECEIVING = ["a\0b", "\x1b[31mred", "a\rb", "\x85", "\u202egnp.exe", "\u2066x"]
+DECEIVING = ["a\0b", "\x1b[31mred", "a\rb", "\x85", "\u202egnp.exe", "\u2066x", "a\u200bb", "a\u2028b"]
 
 
 @pytest.mark.parametrize("text", [*DECEIVING, "two\nlines"])

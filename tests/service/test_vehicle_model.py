@@ -200,13 +200,29 @@ def test_wrong_models_are_refused_in_one_line(client: TestClient, core: Core, ri
     assert client.post("/vehicles/a/model", json={"version": 0, "system": FILE}).status_code == 422
     assert client.post("/vehicles/nobody/model", json={"system": FOUND}).status_code == 404
     many = FOUND.replace("laws: [", "laws: [" + 12 * "{cubic_stiffness: {k3: 1.0e+6}}, ")
-    files = (FILE.replace("window: 200", "window: 100"), "bodies: [", many)
-    for text, said in zip(files, ("window", "system file", "13 laws"), strict=True):
+    nothing = FOUND.replace(LAW, 'laws: [{formula: {formula: "a * d / 0", a: 1}}]')
+    files = (FILE.replace("window: 200", "window: 100"), "bodies: [", many, nothing)
+    for text, said in zip(files, ("window", "system file", "13 laws", "no finite force"), strict=True):
         answer = client.post("/vehicles/a/model", json={"system": text})
         assert answer.status_code == 422 and said in answer.json()["detail"], answer.text
     assert client.post("/vehicles/a/model", json={"system": FOUND}).json()["in_use"] == 1
     assert client.request("DELETE", "/vehicles/a?confirm=a").status_code == 204
     assert client.get("/vehicles/a/models").status_code == 404
+
+
+def test_a_model_whose_windows_take_too_long_is_refused(
+    client: TestClient, core: Core, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    core.pipeline.process("a", [])
+    monkeypatch.setattr("sprung.service.engines.MOST_SECONDS", 1e-4)
+    answer = client.post("/vehicles/a/model", json={"system": FOUND})
+    assert answer.status_code == 422 and "of processor time" in answer.json()["detail"]
+    hung = [f"hung{i}: {{mass: 1}}" for i in range(61)]
+    held = [f"e{i}: {{upper: hung{i}, lower: car, stiffness: 1000, damping: 1}}" for i in range(61)]
+    large = FILE.replace("  car: {mass: 400}", "\n  ".join(["  car: {mass: 400}", *hung]))
+    large = large.replace("sensors:", "  " + "\n  ".join(held) + "\nsensors:")
+    answer = client.post("/vehicles/a/model", json={"system": large})
+    assert answer.status_code == 422 and "bodies" in answer.json()["detail"], answer.text
 
 
 def test_a_version_of_another_service_file_gives_way_to_it(settings: Settings, ride: Path) -> None:

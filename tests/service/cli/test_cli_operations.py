@@ -18,6 +18,7 @@ import pytest
 from can import BusState
 from mcap.reader import make_reader
 
+from sprung.model.system import MANCHESTER
 from sprung.service.cli import describe, main
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
@@ -50,6 +51,41 @@ def test_help_is_in_full_words(command: str, capsys: pytest.CaptureFixture[str])
         began = re.match(r"  (\S+(?: [A-Z]+)?)  +(?=\S)", line)
         if began and re.match(r"   +\S", lines[i + 1]):
             assert len(lines[i + 1]) - len(lines[i + 1].lstrip()) == began.end(), lines[i : i + 2]
+
+
+LONG = {
+    "diagnose": ["--out", "--write-system", "--write-laws"],
+    "train": ["--out"],
+    "simulate": ["--out"],
+    "compare": ["--out"],
+    "inspect": ["--write-system"],
+    "export": ["--out"],
+    "bench": ["--out", "--folder"],
+}
+
+
+@pytest.mark.parametrize(("command", "option"), [(c, option) for c, options in LONG.items() for option in options])
+def test_what_cannot_be_written_is_told_before_the_work(
+    command: str, option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    target = "/proc/nowhere/x.csv" if option == "--folder" else "/proc/x.csv"
+    given = {"bench": ["sensors" if option == "--folder" else "concealed"], "train": [], "export": ["a"]}
+    given |= {"simulate": [str(MANCHESTER), "--inputs", str(RIDE)], "compare": [str(RIDE), str(RIDE)]}
+    begun = time.monotonic()
+    assert main([command, *given.get(command, [str(RIDE)]), option, target]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and len(told.err.splitlines()) == 1 and "cannot be written" in told.err
+    assert time.monotonic() - begun < 10
+
+
+def test_names_in_a_recording_are_no_markup_and_tell_a_terminal_nothing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    path = tmp_path / "signals.csv"
+    path.write_text("time,a [/b],\x1b[31mc\u202e\n" + "".join(f"{i / 100},{i},{i % 7}\n" for i in range(100)))
+    assert main(["inspect", str(path)]) == 0
+    told = capsys.readouterr().out
+    assert "a [/b]" in told and r"\x1b[31mc\u202e" in told and "\x1b" not in told
 
 
 @pytest.mark.parametrize("command", ["", "token"])

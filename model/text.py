@@ -1,0 +1,29 @@
+"""Characters that nobody sees, and that deceive who reads a name somewhere else: on a terminal, in a log, on a page."""
+
+from __future__ import annotations
+
+import re
+
+# zero-width ones, marks and changes of direction, separators of lines and paragraphs, the soft hyphen
+UNSEEN = r"\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff9-\ufffb"
+CONTROL = r"\x00-\x1f\x7f-\x9f"
+_HIDDEN = re.compile(f"[{CONTROL}{UNSEEN}\U000e0000-\U000e007f]")  # tags, too
+
+
+def hidden_character(text: str) -> str:
+    """The first control character, or one that nobody sees, as `U+202E`; empty where there is none.
+
+    >>> hidden_character("tram\\u202e 7")
+    'U+202E'
+    """
+    found = _HIDDEN.search(text)
+    return f"U+{ord(found[0]):04X}" if found else ""
+
+
+def escaped(text: str) -> str:
+    """With such characters as they would be written in a program, for terminals and logs.
+
+    >>> escaped("tram\u202e 7")
+    'tram\\\\u202e 7'
+    """
+    return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], text)
