@@ -245,6 +245,8 @@ class Guard:
         sent = "transfer-encoding" in headers or (length is not None and length != "0")
         if sent and kind not in need.body:
             raise ApiProblem(415, f"send {' or '.join(need.body)}", headers={"Accept-Post": ", ".join(need.body)})
+        if headers.get("content-encoding", "identity").strip().lower() != "identity":
+            raise ApiProblem(415, "send the body as it is, not compressed", headers={"Accept-Encoding": "identity"})
 
     def _check_scope(self, actor: Actor, need: Need, path: str) -> None:
         if need.scope and not actor.may(need.scope):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Annotated, TypeVar
+from typing import Annotated, TypeVar, get_args, get_origin
 
 from fastapi import Path, Query, Request
 from fastapi.routing import APIRoute
@@ -25,7 +25,7 @@ Until = Annotated[str | None, Query(max_length=40, description="RFC 3339, or sec
 
 
 async def only_known_parameters(request: Request) -> None:
-    """422 for a query parameter that the route does not have: misspelt ones would be ignored in silence."""
+    """422 for a query parameter that the route does not have, or takes once: others would be ignored in silence."""
     route = request.scope.get("route")
     if not isinstance(route, APIRoute) or not request.query_params:
         return
@@ -38,6 +38,10 @@ async def only_known_parameters(request: Request) -> None:
         told = f"the route has {', '.join(sorted(known))}" if known else "the route has none"
         errors = [{"field": name[:100], "detail": f"is no query parameter here; {told}"} for name in wrong[:20]]
         raise ApiProblem(422, f"{errors[0]['field']} {errors[0]['detail']}", errors)
+    for field in route.dependant.query_params:
+        takes_several = any(get_origin(part) is list for part in get_args(field.field_info.annotation))
+        if not takes_several and len(request.query_params.getlist(field.alias)) > 1:
+            raise wrong_query(field.alias, "is there more than once")
 
 
 def time_of(name: str, text: str | None, default: int) -> int:

@@ -40,6 +40,11 @@ REFUSED_BODY = (
 )
 
 
+NO_HTTP_BODY = (
+    b'{"type": "about:blank", "title": "Bad Request", "status": 400, "detail": "what came is no request in HTTP/1.1"}'
+)
+
+
 class GuardedProtocol(H11Protocol):
     """uvicorn's HTTP/1.1, admitted by a doorkeeper."""
 
@@ -89,6 +94,18 @@ class GuardedProtocol(H11Protocol):
         self._lingers = self.loop.call_later(LINGER_SECONDS, self.transport.abort)
         if self.transport.can_write_eof():
             self.transport.write_eof()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP as every error is answered, and close."""
+        headers = [
+            (b"content-type", b"application/problem+json"),
+            (b"content-length", b"%d" % len(NO_HTTP_BODY)),
+            (b"x-content-type-options", b"nosniff"),
+            (b"connection", b"close"),
+        ]
+        for event in (h11.Response(status_code=400, headers=headers), h11.Data(NO_HTTP_BODY), h11.EndOfMessage()):
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
 
     def pause_writing(self) -> None:
         """More waits to be sent than is sensible."""

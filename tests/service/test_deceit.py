@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import json
 import logging
 import socket
 from pathlib import Path
@@ -62,3 +64,36 @@ def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engi
             answer += piece
         assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1") == 1
         assert b"give Content-Length or Transfer-Encoding" in answer
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [b"\x16\x03\x01\x02\x00", b"GET /\r\n\r\n", b"POST /identify HTTP/1.1\r\nHost: x\r\nContent-Length: +2\r\n\r\n{}"],
+)
+def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Path, request_: bytes) -> None:
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        line.sendall(request_ + b"\r\n\r\n")
+        answer = b""
+        while piece := line.recv(65536):
+            answer += piece
+    head, body = answer.split(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 400 ") and b"application/problem+json" in head
+    assert json.loads(body)["status"] == 400
+
+
+def test_a_compressed_body_is_not_guessed_at(client: TestClient) -> None:
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    answer = client.post("/identify", content=gzip.compress(b"0" * 1_000_000), headers=headers)
+    assert answer.status_code == 415 and answer.headers["accept-encoding"] == "identity"
+    assert (
+        client.post("/identify", content=b"{}", headers=headers | {"Content-Encoding": "Identity"}).status_code == 422
+    )
+
+
+def test_a_query_that_says_two_things_is_refused(client: TestClient) -> None:
+    assert client.get("/vehicles?limit=5&limit=7").json()["detail"] == "limit: is there more than once"
+    several = "/vehicles/a/history?parameter=primary_11l.stiffness&parameter=primary_11r.stiffness"
+    assert client.get(several).status_code == 404  # of the vehicle
