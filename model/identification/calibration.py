@@ -170,14 +170,14 @@ class DeviationSensitivity:
             information = information + over @ over.mT
             score = score + (over @ as_rows(spectra.unsqueeze(3)).mT)[..., 0].double()
         information = information.double()
-        of_inputs = self.redundancy.evidence(data.inputs, self.slope, self._bins)
+        of_inputs = self.redundancy.evidence(data.inputs, self.slope, self.bins)
         if of_inputs is not None:
             information, score = information + of_inputs[0], score + of_inputs[1]
         information, score = self._relative(information, score)
         pad, more = torch.nn.functional.pad, len(self.deviations) - self.measured
         return Evidence(pad(-with_x.double(), (0, more)), pad(information, (0, more, 0, more)), pad(score, (0, more)))
 
-    def _bins(self, signals: Tensor) -> Tensor:
+    def bins(self, signals: Tensor) -> Tensor:
         """Weighed bins of signals (B, T, X), (B, F, X)."""
         return self.model.weight[:, None] * self.model.spectra(signals)
 

@@ -1,22 +1,25 @@
 """Windows that do not fit: is it a measurement?
 
-A gain, a delay or a load leaves a trace of its own in the residual (`calibration`): the one with the most evidence is
-taken back from the samples, and the window is refined again, until it fits or nothing helps.  What is too large for a
-linear step, a reversed sign or two exchanged channels, is tried at the nominal values, where what the sensors should
-show depends on the inputs alone; a frozen or saturated sensor shows itself in its samples, and the window is refined
-without it.  A window explained this way tells as much about the springs as any other.
+Redundant channels that contradict each other are looked at first (`contradictions`): springs cannot make them do so,
+and an exchange or a reversed sign that ends the contradiction is undone.  A gain, a delay or a load leaves a trace of
+its own in the residual (`calibration`): the one with the most evidence is taken back from the samples, and the window
+is refined again, until it fits or nothing helps.  What is too large for a linear step, or an exchange that contradicts
+nothing, is tried at the nominal values, where what the sensors should show depends on the inputs alone; a frozen or
+saturated sensor shows itself in its samples, and the window is refined without it.  A window explained this way tells
+as much about the springs as any other.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 import torch
 from scipy.interpolate import make_interp_spline
 
+from sprung.model.identification.contradictions import Contradictions, Rearrangement
 from sprung.model.identification.deviations import clock_groups, named
 from sprung.model.identification.gauss_newton import WindowBatch
 from sprung.model.identification.linearise import as_rows
@@ -48,6 +51,7 @@ class Explained:
     refined: Refined  # of the corrected window
     point: FloatArray  # deviations that were taken back, shape (H,)
     faults: tuple[MeasurementFault, ...]
+    corrected: bool = True  # False: what is wrong is named, but still in the window
 
 
 def fit_limit(freedom: FloatArray) -> FloatArray:
@@ -75,7 +79,11 @@ class Explainer:
         deviations = refiner(samples).calibration.deviations
         self.deviations = deviations
         self.channels = len(system.channels)
+        self.names = [channel.name for channel in system.channels]
         self.groups = clock_groups(system)
+        alike = [(int(group), c.unit) for group, c in zip(self.groups, system.channels, strict=True)]
+        numbers = np.array([alike.index(one) for one in alike], dtype=np.int64)
+        self.contradictions = Contradictions(refiner(samples).calibration, numbers)
         self.directions = self._directions()
         self._std = np.array([d.std for d in deviations])
         self._measured = np.arange(len(deviations)) < 2 * self.channels
@@ -97,6 +105,48 @@ class Explainer:
 
     def explain(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
         """Explanations of the windows `bad` of a batch (B, T, C), by index; those without one are left out."""
+        agreeing = self._agreeing(windows, bad)
+        bad = np.array([b for b in bad if b not in agreeing], dtype=np.int64)
+        return agreeing | self._plainly(windows, bad)
+
+    def _agreeing(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
+        """Explanations of those of the windows `bad` whose redundant channels contradict each other until an exchange,
+        or a reversed sign, is undone."""
+        ends = {int(b): self.contradictions.ended_by(windows[b]) for b in bad if not self._stuck(windows[b])}
+        left = [b for b, candidates in ends.items() if candidates]
+        found: dict[int, Explained] = {}
+        while left:
+            ((most, _),) = Counter(c for b in left for c in ends[b]).most_common(1)
+            alike = [b for b in left if most in ends[b]]
+            candidates = [c for c in ends[alike[0]] if all(c in ends[b] for b in alike)]
+            explained = self._rearranged(windows[alike], candidates)
+            found |= dict(zip(alike, explained, strict=True))
+            left = [b for b in left if b not in alike]
+        return found
+
+    def _rearranged(self, windows: FloatArray, candidates: Sequence[Rearrangement]) -> list[Explained]:
+        """Windows (B, T, C) with the candidate undone with which they fit best.
+
+        Where several fit equally well, one fault of all their channels, and the windows are refined without these.
+        """
+        costs = np.array([self._cost(c.undone(windows[:TRIED])) for c in candidates])
+        likely = [c for c, cost in zip(candidates, costs, strict=True) if cost < costs.min() + 2 * _EVIDENT]
+        faults = [c.fault(self.names) for c in likely]
+        if len(likely) > 1:
+            channels = dict.fromkeys(channel for fault in faults for channel in fault.channel.split("|"))
+            together = MeasurementFault("|".join(channels), faults[0].kind, faults[0].value)
+            return [self._without(window, (together,)) for window in windows]
+        restored, known = likely[0].undone(windows), [tuple(faults)] * len(windows)
+        explained = self._by_steps(restored, known)
+        return [explained.get(i) or self._as_it_is(restored[i], known[i]) for i in range(len(windows))]
+
+    def _cost(self, windows: FloatArray) -> float:
+        """Chi-square of refined windows (B, T, C), together."""
+        loads = np.full(len(windows), bool(self.system.loads or self.system.built))
+        refined = self._refined(windows, np.zeros((len(windows), len(self.deviations))), loads)
+        return float(sum(one.chi_square[0] * one.freedom[0] for one in refined))
+
+    def _plainly(self, windows: FloatArray, bad: IntArray) -> dict[int, Explained]:
         found = self._explain(windows[bad[:TRIED]], bad[:TRIED])
         common = self._common(found)
         if common is not None:  # what most of them have is tried first with the others
@@ -267,8 +317,7 @@ class Explainer:
 
     def _without(self, window: FloatArray, stuck: tuple[MeasurementFault, ...]) -> Explained:
         """One window (T, C) without its frozen or saturated sensors; a stuck input is named, though not corrected."""
-        names = [channel.name for channel in self.system.channels]
-        columns = np.array([names.index(fault.channel) for fault in stuck])
+        columns = np.array([self.names.index(name) for fault in stuck for name in fault.channel.split("|")])
         sensors = columns[columns >= len(self.system.inputs)]
         if len(sensors) == len(columns):
             without = window.copy()
@@ -276,8 +325,11 @@ class Explainer:
             explained = self._by_steps(without[None], [stuck])
             if 0 in explained:
                 return explained[0]
+        return self._as_it_is(window, stuck)
+
+    def _as_it_is(self, window: FloatArray, faults: tuple[MeasurementFault, ...]) -> Explained:
         point = np.zeros((1, len(self.deviations)))
-        return Explained(self._refined(window[None], point, np.zeros(1, dtype=bool))[0], point[0], stuck)
+        return Explained(self._refined(window[None], point, np.zeros(1, dtype=bool))[0], point[0], faults, False)
 
     def _turned(self, window: FloatArray) -> Explained | None:
         """One window (T, C) with a reversed or two exchanged channels put right."""
@@ -339,18 +391,7 @@ class Explainer:
 
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
         """Windows with one sign turned or two channels exchanged that fit much better at nominal values."""
-        tries: list[tuple[FloatArray, MeasurementFault]] = []
-        names = [c.name for c in self.system.channels]
-        units = [c.unit for c in self.system.channels]
-        for c in range(self.channels):
-            turned = window.copy()
-            turned[:, c] *= -1
-            tries.append((turned, MeasurementFault(names[c], "inverted", -1.0)))
-        for a, b in combinations(range(self.channels), 2):
-            if self.groups[a] == self.groups[b] and units[a] == units[b]:
-                exchanged = window.copy()
-                exchanged[:, [a, b]] = window[:, [b, a]]
-                tries.append((exchanged, MeasurementFault(f"{names[a]}|{names[b]}", "swapped", 0.0)))
+        tries = [(one.undone(window), one.fault(self.names)) for one in self.contradictions.candidates]
         costs = self._nominal_cost(np.array([window, *(restored for restored, _ in tries)]))
         order = np.argsort(costs[1:])
         return [tries[i] for i in order[:3] if costs[1 + i] < _REVERSED * costs[0]]

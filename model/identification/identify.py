@@ -77,15 +77,22 @@ class Identifier:
             found = [self._with_model_uncertainty(estimate) for estimate in found]
             self.times = StageTimes(between - begin, time.perf_counter() - between)
             return found
-        still = self._explainer(windows.shape[1]).still
+        explainer = self._explainer(windows.shape[1])
         found = [
-            e if e.informative else replace(e, faults=still(window)) for e, window in zip(found, windows, strict=True)
+            e if e.informative else replace(e, faults=explainer.still(window))
+            for e, window in zip(found, windows, strict=True)
         ]
-        bad = np.array([b for b, e in enumerate(found) if self._asks(e, windows.shape[1])], dtype=np.int64)
+        contradicted = explainer.contradictions.contradicted(windows)
+        asks = [
+            (e.informative and self._asks(e, explainer)) or (contradicted[b] and (e.informative or e.running))
+            for b, e in enumerate(found)
+        ]
+        bad = np.flatnonzero(asks)
         if len(bad):
-            for b, cause in self._explainer(windows.shape[1]).explain(windows, bad).items():
+            for b, cause in explainer.explain(windows, bad).items():
                 (restored,) = self._estimates(cause.refined, False, cause.point)
-                found[b] = replace(self._averaged(restored), faults=cause.faults)
+                told = restored.adequate and cause.corrected
+                found[b] = replace(self._averaged(restored), faults=cause.faults, adequate=told)
         self.times = StageTimes(between - begin, time.perf_counter() - between)
         return found
 
@@ -115,13 +122,11 @@ class Identifier:
         delays, and a wrong measurement is looked for where windows do not fit."""
         return self.identify(windows, weigh=weigh, explain=True)
 
-    def _asks(self, estimate: Estimate, samples: int) -> bool:
+    def _asks(self, estimate: Estimate, explainer: Explainer) -> bool:
         """Whether a window should be explained: it does not fit, or fits better elsewhere by far."""
-        if not estimate.informative:
-            return False
         found = estimate.deviating
         if estimate.adequate and found is not None and found.whole:
-            return self._explainer(samples).apart(found.score, found.information)
+            return explainer.apart(found.score, found.information)
         return not estimate.adequate
 
     def _averaged(self, estimate: Estimate) -> Estimate:

@@ -32,6 +32,7 @@ class Redundancy:
     def __init__(self, system: System, samples: int, deviations: int) -> None:
         self.samples, self.dt, self.deviations = samples, 1 / system.sample_rate, deviations
         self.channels = len(system.channels)
+        self._maps: dict[tuple[tuple[int, float], ...], FloatArray] = {}
         self.alike: dict[tuple[tuple[int, float], ...], list[list[int]]] = {}  # columns of supports, by their noises
         for drive in drives_of(system):
             if drive.support and drive.noise and len(used(drive.noise)) > 1 and min(drive.noise.values()) > 0:
@@ -59,6 +60,38 @@ class Redundancy:
                 information[:, at[:, None], at] += M[i :: len(supports)]
                 score[:, at] += b[i :: len(supports)]
         return information, score
+
+    def relations(self, inputs: int) -> FloatArray:
+        """One row over the I input channels per support that is measured twice, 1 at its channels, (X, I)."""
+        supports = [columns for same in self.alike.values() for columns in same]
+        rows = np.zeros((len(supports), inputs))
+        for row, columns in zip(rows, supports, strict=True):
+            row[columns] = 1.0
+        return rows
+
+    def parts(self, inputs: FloatArray, spectra: Callable[[Tensor], Tensor]) -> FloatArray:
+        """What each channel of windows (B, T, I) adds to what the motion of its support leaves, (B, I, K).
+
+        The parts of one support's channels add up to what is left; K is that of the support with most channels.
+        """
+        maps = {key: self._map(key, spectra) for key in self.alike}
+        found = np.zeros((len(inputs), inputs.shape[2], max((of_key.shape[2] for of_key in maps.values()), default=0)))
+        for key, supports in self.alike.items():
+            for columns, of_channel in zip(np.transpose(supports), maps[key], strict=True):
+                found[:, columns, : of_channel.shape[1]] = inputs[:, :, columns].transpose(0, 2, 1) @ of_channel
+        return found
+
+    def _map(self, key: tuple[tuple[int, float], ...], spectra: Callable[[Tensor], Tensor]) -> FloatArray:
+        """From samples of each of Q channels of a support to the spectra of what their motion leaves, (Q, T, K)."""
+        if key not in self._maps:
+            Q, T = len(key), self.samples
+            alone = np.zeros((Q, T, T, Q))
+            for q, (_, noise) in enumerate(key):
+                alone[q, :, :, q] = np.eye(T) / noise
+            left = left_by_motion(alone.reshape(Q * T, T, Q), self.dt, key)
+            rows = as_rows(spectra(torch.as_tensor(left)).unsqueeze(3))
+            self._maps[key] = rows.reshape(Q, T, -1).numpy()
+        return self._maps[key]
 
     def _of_one(
         self, z: FloatArray, key: tuple[tuple[int, float], ...], slope: Tensor, spectra: Callable[[Tensor], Tensor]
