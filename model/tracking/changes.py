@@ -128,11 +128,14 @@ def _page(statistic: FloatArray, increment: FloatArray, most: FloatArray, thresh
     return np.minimum(np.maximum(statistic + bounded, 0.0), 2.0 * threshold)
 
 
-def restarted(changes: Changes, since: int) -> Changes:
-    """Statistics from zero: what they had gathered was a measurement's doing, but for alarms whose onset lies before
-    `since`, ns."""
+def restarted(changes: Changes, since: int, reported: BoolArray) -> Changes:
+    """Statistics from zero, after a measurement jumped at `since`, ns: what they had gathered was its doing.
+
+    Only changes that are `reported` (..., P), and whose onset lies before the jump, are kept: one that still waits for
+    evidence would have to be dated, and a jump is dated too late rather than too early.
+    """
     onset = np.where(changes.active > 0, changes.up_since, changes.down_since)
-    own = (changes.active != 0) & (onset < since)
+    own = (changes.active != 0) & (onset < since) & reported
     kept = {name: np.where(own, getattr(changes, name), 0.0) for name in ("up", "down", "recovery")}
     return replace(changes, active=np.where(own, changes.active, 0).astype(np.int8), **kept)
 

@@ -92,7 +92,7 @@ class Fusion:
             return replace(undecided, belief=belief, calibration=calibration), None
         if jump is not None and self.armed(state):
             calibration = replace(calibration, moved=np.maximum(calibration.moved, jump.direction != 0))
-            state = replace(state, changes=change_test.restarted(state.changes, jump.since))
+            state = replace(state, changes=change_test.restarted(state.changes, jump.since, state.accused))
         own_cross = found is not None and found.whole
         values = self.effects.corrected(estimate, found, calibration, belief, mask)
         window = TrackedWindow(mask, time_ns, centre, share, weight, *values, own_cross)

@@ -6,12 +6,13 @@ import base64
 from binascii import b2a_base64
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from fnmatch import fnmatchcase
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
 
-from sprung.model.signals import FaultKind, IntArray
+from sprung.model.signals import BoolArray, FaultKind, IntArray
 from sprung.model.tracking import deviations
 from sprung.model.tracking.cargo import Cargo
 from sprung.model.tracking.changes import Changes
@@ -96,6 +97,12 @@ class TrackerState:
     @property
     def active(self) -> tuple[Alarm, ...]:
         return tuple(alarm for alarm in self.alarms if alarm.closed is None)
+
+    @property
+    def accused(self) -> BoolArray:
+        """Parameters that an active alarm says have changed, alone or with others of their kind, shape (P,)."""
+        names = [alarm.parameter or "" for alarm in self.active if alarm.kind == "change"]
+        return np.array([any(fnmatchcase(name, pattern) for pattern in names) for name in self.names], dtype=bool)
 
     @property
     def misfit_since(self) -> int | None:

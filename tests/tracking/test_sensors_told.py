@@ -202,6 +202,20 @@ def test_a_jump_of_two_deviations_of_a_window_is_named() -> None:
     assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "c3.gain")]
 
 
+def test_a_jump_that_is_found_late_takes_back_the_alarm_that_waited_for_it() -> None:
+    """The gain jumps between two weighed windows: the parameter seems to change before the first that says why."""
+    tracker, state, rng = copy.deepcopy(learned(60))
+    waited = False
+    for k in range(60, 110):
+        window = gained(rng, np.array([0.06 * (k >= 61), 0, 0, 0, 0, 0]), information=0.012**-2)
+        window = window if k % 3 == 0 else replace(window, deviating=None)
+        state = tracker.update(state, window, EPOCH + k * SECOND)
+        waited |= bool(state.changes.active[0]) and not state.alarms
+    assert waited
+    assert [(a.kind, a.parameter) for a in state.alarms] == [("sensor", "c0.gain")]
+    assert not state.changes.active.any()
+
+
 def test_one_window_that_shows_the_other_way_does_not_end_the_evidence_for_a_jump() -> None:
     rng, tracker = np.random.default_rng(11), make(GAINS)
     state = tracker.initial_state()

@@ -179,13 +179,13 @@ def test_one_bad_window_is_no_misfit() -> None:
 
 
 def test_a_jump_of_a_sensor_ends_what_it_may_have_done_and_no_older_alarm() -> None:
-    changes = change_test.start((3,))
+    changes = change_test.start((4,))
     changed = replace(
         changes,
-        up=np.array([30.0, 30.0, 8.0]),
-        up_since=np.array([10, 70, 60]),
-        active=np.array([1, 1, 0], dtype=np.int8),
+        up=np.array([30.0, 30.0, 8.0, 30.0]),
+        up_since=np.array([10, 70, 60, 10]),
+        active=np.array([1, 1, 0, 1], dtype=np.int8),
     )
-    after = change_test.restarted(changed, 50)
-    assert list(after.active) == [1, 0, 0]
-    assert list(after.up) == [30.0, 0.0, 0.0]
+    after = change_test.restarted(changed, 50, np.array([True, True, False, False]))
+    assert list(after.active) == [1, 0, 0, 0]
+    assert list(after.up) == [30.0, 0.0, 0.0, 0.0]
