@@ -17,9 +17,9 @@ from sprung.service.forked import ForkedFunctions, ProcessEnded
 from sprung.service.processed import HeldVehicle, ToFold, outcome_of
 from sprung.service.store.circumstances import Ran
 from sprung.service.store.standing import counted
-from sprung.service.store.windows import Posterior, Solved, WindowRecord
+from sprung.service.store.windows import Posterior, Solved, WindowLoads, WindowRecord
 from sprung.service.times import AHEAD
-from sprung.service.views import body_loads, running
+from sprung.service.views import in_kg, running
 
 _NO_SAMPLES = np.zeros((0, 0))
 
@@ -96,12 +96,14 @@ def _pass(
             posterior = Posterior(*tracker.posterior(followed.state))
         # At a stop the load is that of the ride before, and any other is possible.
         known = fed and tracker.loads_as_of(followed.state) is None
-        loads = body_loads(engine, followed.state) if known else {}
+        loads = in_kg(engine, tracker.loads(followed.state)) if known else {}
+        alone = {} if estimate is None else in_kg(engine, tracker.loads_of_window(estimate))
         outcome, reason = outcome_of(window, estimate)
         stood = counted(outcome, model_id) if posterior is not None else {}
         ran.append(Ran(window.start, running(system, window, loads) | stood))
         solved = None if estimate is None else Solved.of(estimate)
-        records.append(WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior))
+        record = WindowRecord(window.start, outcome, reason, window.repaired_samples, fed, solved, posterior)
+        records.append(replace(record, loads=WindowLoads(alone, loads)))
     return FollowedWindows(followed, records, ran)
 
 

@@ -188,7 +188,7 @@ def vehicle_view(engine: Engine, vehicle: str, state: TrackerState, last: Window
         state.time,
         _of_sensors(engine, last),
         engine.tracker.sensors(state),
-        body_loads(engine, state),
+        in_kg(engine, engine.tracker.loads(state)),
         engine.tracker.body_constants(state),
         engine.tracker.loads_as_of(state),
     )
@@ -231,11 +231,10 @@ def _of_kind(alarmed: Mapping[str | None, str], name: str) -> str | None:
     )
 
 
-def body_loads(engine: Engine, state: TrackerState) -> dict[str, tuple[float, float]]:
-    """(kg, standard deviation) of what every loaded body carries, by body."""
+def in_kg(engine: Engine, loads: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """(kg, standard deviation) of what every loaded body carries, from the log-ratios of its mass to the empty one."""
     empty = {load.body: load.empty for load in engine.system.loads}
-    known = engine.tracker.loads(state)
-    return {b: (empty[b] * math.expm1(x), empty[b] * math.exp(x) * s) for b, (x, s) in known.items()}
+    return {b: (empty[b] * math.expm1(x), empty[b] * math.exp(x) * s) for b, (x, s) in loads.items()}
 
 
 UNITS = {"load": "kg", "temperature": "degC", "speed": "m/s", "pressure": "Pa", "lateral_acceleration": "m/s^2"}
@@ -339,6 +338,10 @@ def window_dict(engine: Engine, record: WindowRecord) -> dict[str, Any]:
     if posterior is not None:
         pairs = physical(engine, posterior.log_ratio, posterior.std)
         line["posterior"] = {n: list(p) for n, p in zip(names, pairs, strict=True)}
+    declared = [load for load in engine.system.loads if load.declared]
+    for part, loads in (("estimate", record.loads.estimated), ("posterior", record.loads.believed)):
+        if line[part] is not None:
+            line[part] |= {load.name: list(loads[load.body]) for load in declared if load.body in loads}
     return line
 
 

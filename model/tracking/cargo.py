@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sprung.model.signals import FloatArray
+from sprung.model.signals import BoolArray, FloatArray, IntArray
 
 GAUGE = 0.015  # of a pressure: hysteresis of levelling valves and the gauge
 UNKNOWN = 1e6  # variance of a constant before the first ride
@@ -25,7 +25,7 @@ SCATTER_MEMORY = 0.3  # weight of the newest ride in the additional variance of 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cargo:
-    """Constants of the pressures, and the current ride."""
+    """Constants of the pressures, the current ride, and the last load of an earlier one."""
 
     constant: FloatArray  # a, shape (L,)
     variance: FloatArray  # of it, shape (L,)
@@ -33,12 +33,26 @@ class Cargo:
     prior: FloatArray  # of the load's logarithm at departure, shape (L,)
     prior_variance: FloatArray  # shape (L,)
     scatter: FloatArray  # variance of a pressure beyond GAUGE, estimated from rides, shape (L,)
+    past: FloatArray  # the load's logarithm before it was reopened, where it was known then, shape (L,)
+    past_variance: FloatArray  # shape (L,)
+    past_at: IntArray  # ns, start of the last window that told of it, shape (L,); 0: never
 
 
 def start(prior_variance: FloatArray) -> Cargo:
     """Nothing seen yet; variances (L,) of the loads' logarithms before any window."""
     zero = np.zeros(len(prior_variance))
-    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero)
+    never = np.zeros(len(zero), dtype=np.int64)
+    return Cargo(zero, zero + UNKNOWN, zero + np.nan, zero, prior_variance, zero, zero, zero, never)
+
+
+def remembered(cargo: Cargo, load: FloatArray, variance: FloatArray, known: BoolArray, at: int) -> Cargo:
+    """With the loads (L,) that are `known` before they are reopened; at: ns, the last window that told of them."""
+    return replace(
+        cargo,
+        past=np.where(known, load, cargo.past),
+        past_variance=np.where(known, variance, cargo.past_variance),
+        past_at=np.where(known, at, cargo.past_at),
+    )
 
 
 def after_ride(cargo: Cargo, load: FloatArray, variance: FloatArray) -> Cargo:

@@ -237,6 +237,10 @@ class Fusion:
         contradicted = not (departs or changed) and cargos.contradicted(cargo, *believed, prior)
         if not (departs or changed or contradicted):
             return belief, cargos.during_ride(cargo, pressure)
+        if state.last is not None and not contradicted:
+            past = state.belief.mean[rows], np.diag(state.belief.covariance)[rows]
+            known = past[1] < (KNOWN * self.limit[model.loads_at]) ** 2
+            cargo = cargos.remembered(cargo, *past, known, state.last)
         if state.last is not None and departs:
             cargo = cargos.after_ride(cargo, *believed)
         cargo = cargos.before_ride(cargo, pressure * np.nan if contradicted else pressure, prior)

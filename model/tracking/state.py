@@ -190,7 +190,9 @@ def _cargo(data: Mapping[str, Any]) -> Cargo | None:
     if data.get("cargo") is None:
         return None
     arrays = _unpack_all(data["cargo"])
-    return Cargo(**{"scatter": np.zeros(len(arrays["constant"]))} | arrays)
+    zeros = np.zeros(len(arrays["constant"]))
+    later = {"scatter": zeros, "past": zeros, "past_variance": zeros, "past_at": zeros.astype(np.int64)}
+    return Cargo(**later | arrays)
 
 
 def _belief(data: Mapping[str, Any]) -> Belief:

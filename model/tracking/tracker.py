@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from sprung.model.identification.deviations import OWN, Deviation, named
-from sprung.model.signals import BuiltOtherwise, Conditions, Estimate, FloatArray, MeasurementFault
+from sprung.model.signals import BuiltOtherwise, Conditions, Estimate, FloatArray, IntArray, MeasurementFault
 from sprung.model.tracking import cargo as cargos
 from sprung.model.tracking import changes as change_test
 from sprung.model.tracking import coverage, inflation, innovation, misfit
@@ -306,20 +306,47 @@ class Tracker:
         return tuple(found)
 
     def loads(self, state: TrackerState) -> dict[str, tuple[float, float]]:
-        """Log-ratio of every known loaded mass to the empty one, with its standard deviation, by body."""
-        H = self.model.size
+        """Log-ratio of every loaded mass to the empty one, with its standard deviation, by body.
+
+        Where the present run does not tell yet, as the last one did; see `loads_as_of`.
+        """
+        H, earlier = self.model.size, self._loads_of_earlier(state)
         found = {}
-        for h in self.model.loads_at:
+        for i, h in enumerate(self.model.loads_at):
             value, variance = state.belief.mean[-H:][h], float(state.belief.covariance.diagonal()[-H:][h])
-            if np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
+            if earlier[i] and state.cargo is not None:
+                value, variance = state.cargo.past[i], float(state.cargo.past_variance[i])
+            if earlier[i] or np.sqrt(variance) < KNOWN * self._fusion.limit[h]:
                 found[self.deviations[h].name] = (
                     float(value),
                     float(np.sqrt(variance + self._model_uncertainty[1][h, h])),
                 )
         return found
 
+    def loads_of_window(self, estimate: Estimate) -> dict[str, tuple[float, float]]:
+        """The same of one window alone, where it determines them."""
+        found, at = estimate.deviating, self.model.cargo_at
+        if found is None or not len(self.model.loads_at) or not estimate.adequate:
+            return {}
+        covariance = np.linalg.inv(found.information[at][:, at] + np.linalg.inv(self.model.prior[at][:, at]))
+        std = np.sqrt(covariance.diagonal() + self._model_uncertainty[1].diagonal()[at])
+        told = {h: (float(found.point[h]), float(s)) for h, s in zip(at.tolist(), std, strict=True)}
+        known = [h for h in self.model.loads_at.tolist() if told[h][1] < KNOWN * self._fusion.limit[h]]
+        return {self.deviations[h].name: told[h] for h in known}
+
+    def _loads_of_earlier(self, state: TrackerState) -> IntArray:
+        """Of each load, the last window of an earlier run that told of it, ns, where this run does not yet; else 0."""
+        at = self.model.loads_at
+        if state.cargo is None or not len(at):
+            return np.zeros(len(at), dtype=np.int64)
+        known = np.sqrt(state.belief.covariance.diagonal()[-self.model.size :][at]) < KNOWN * self._fusion.limit[at]
+        return np.where(known, 0, state.cargo.past_at)
+
     def loads_as_of(self, state: TrackerState) -> int | None:
-        """Start of the last used window, ns, if loads may have changed since, during a stop; None: `loads` holds."""
+        """Start of the last window that told of the loads, ns, if they may have changed since; None: `loads` holds."""
+        earlier = self._loads_of_earlier(state)
+        if earlier.any():
+            return int(earlier[earlier > 0].min())
         if state.last is None or state.time is None:
             return None
         idle = (state.time - state.last) * 1e-9 - self.settings.window

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -56,6 +56,14 @@ class Posterior:
 
 
 @dataclass(frozen=True, slots=True)
+class WindowLoads:
+    """What bodies carry, kg, with standard deviations, by body."""
+
+    estimated: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by the window alone
+    believed: Mapping[str, tuple[float, float]] = field(default_factory=dict)  # by the tracker after it
+
+
+@dataclass(frozen=True, slots=True)
 class WindowRecord:
     """One window as the store keeps it."""
 
@@ -66,6 +74,7 @@ class WindowRecord:
     tracked: bool  # False: dropped, or older than what the tracker had seen
     solved: Solved | None  # None where dropped
     posterior: Posterior | None  # None where not tracked
+    loads: WindowLoads = WindowLoads()  # not kept by the store, but for means of minutes
 
 
 @dataclass(frozen=True, slots=True)

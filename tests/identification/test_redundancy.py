@@ -57,7 +57,7 @@ def inputs(rng: np.random.Generator, count: int) -> tuple[FloatArray, FloatArray
 
 
 def of_inputs(calibration: DeviationSensitivity, values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    found = calibration.redundancy.evidence(torch.as_tensor(values), calibration.slope, calibration._bins)
+    found = calibration.redundancy.evidence(torch.as_tensor(values), calibration.slope, calibration.bins)
     assert found is not None
     return found[0].numpy(), found[1].numpy()
 
@@ -92,4 +92,4 @@ def test_a_support_that_is_measured_once_says_nothing() -> None:
     system = load_system(BUNDLED / "axleboxes.yaml")
     calibration = DeviationSensitivity(WindowModel(system, 100))
     values = torch.zeros(2, 100, len(system.inputs), dtype=torch.float64)
-    assert calibration.redundancy.evidence(values, calibration.slope, calibration._bins) is None
+    assert calibration.redundancy.evidence(values, calibration.slope, calibration.bins) is None

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.service.api.app import create_app
 from sprung.service.core import build_core
 from sprung.service.engine import Engine, make_tracker
@@ -19,7 +19,8 @@ from sprung.service.store import Store, fleet
 from sprung.service.store.circumstances import Ran, add_circumstances, circumstances_between
 from sprung.service.store.marks import remove
 from sprung.service.store.schema import circumstances
-from sprung.service.views import running
+from sprung.service.store.windows import Posterior, Solved, WindowLoads, WindowRecord
+from sprung.service.views import running, window_dict
 from tests.service_fakes import FakeIdentifier, make_window
 
 SECOND = 10**9
@@ -91,3 +92,18 @@ def test_what_a_body_carries_stands_beside_what_was_measured(warm: System) -> No
     window = replace(make_window(warm, 0), auxiliary=np.array([21.5]))
     assert running(warm, window, {"car": (3100.0, 40.0)}) == {"temperature": 21.5, "car.load": 3100.0}
     assert running(warm, replace(window, auxiliary=None), {}) == {}
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_windows_tell_the_load_as_a_parameter_where_the_system_file_names_it(declared: bool) -> None:
+    text = MANCHESTER.read_text()
+    empty = "position: [0.0, 0.0]}"
+    system = parse_system(text.replace(empty, "position: [0.0, 0.0], load: true}", 1) if declared else text)
+    engine = Engine(system, FakeIdentifier(system), make_tracker(system))
+    P, S = len(system.tracked), len(system.sensors)
+    solved = Solved(np.zeros(P), np.full(P, 0.01), np.ones(P, dtype=bool), 0.03, np.full(S, 0.03), 1.0, True, True, 2)
+    loads = WindowLoads({"car": (3100.0, 400.0)}, {"car": (2950.0, 60.0)})
+    record = WindowRecord(START, "used", None, 0, True, solved, Posterior(solved.log_ratio, solved.std), loads)
+    line = window_dict(engine, record)
+    told = {part: line[part].get("car.load") for part in ("estimate", "posterior")}
+    assert told == ({"estimate": [3100.0, 400.0], "posterior": [2950.0, 60.0]} if declared else dict.fromkeys(told))

@@ -216,3 +216,19 @@ def test_after_a_stop_the_load_is_that_of_the_ride_before_until_a_window_tells_o
     rides = ride(rng, tracker, stood, 2, constant(0.3), first=90)
     assert tracker.loads_as_of(rides) is None
     assert abs(tracker.loads(rides)["car"][0] - 0.3) < 0.05
+
+
+def test_a_run_that_does_not_tell_the_load_yet_leaves_that_of_the_run_before_with_its_time() -> None:
+    rng, tracker = np.random.default_rng(14), follow()
+    state = ride(rng, tracker, tracker.initial_state(), 60, constant(np.log1p(0.2)))
+    assert tracker.loads_as_of(state) is None
+    before, covariance = tracker.loads(state)["car"], correlated(rng, 100 * STD)
+    vague = Deviating(np.zeros(1), covariance, TAKES[:, None], np.array([[0.3**-2]]), np.zeros(1), 300.0, False)
+    state = tracker.update(state, estimate(np.zeros(24), covariance, deviating=vague), EPOCH + 100 * SECOND)
+    assert tracker.loads(state)["car"] == pytest.approx(before)
+    assert tracker.loads_as_of(state) == EPOCH + 59 * SECOND
+    again = TrackerState.from_dict(state.to_dict())
+    assert (tracker.loads(again), tracker.loads_as_of(again)) == (tracker.loads(state), tracker.loads_as_of(state))
+    state = ride(rng, tracker, state, 20, constant(0.0), 101)
+    assert abs(tracker.loads(state)["car"][0]) < 0.02
+    assert tracker.loads_as_of(state) is None
