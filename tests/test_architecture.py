@@ -23,6 +23,7 @@ MAY_IMPORT = {
 ORDER = [
     "signals",
     "chunks",
+    "text",
     "units",
     "parameters",
     "address",
