@@ -304,6 +304,19 @@ def test_axe_finds_nothing_serious(address: str, browser: Any, name: str, width:
     context.close()
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing_serious_in_the_description_of_the_api(address: str, browser: Any, scheme: str) -> None:
+    context = browser.new_context(viewport={"width": 1400, "height": 900}, color_scheme=scheme)
+    page = context.new_page()
+    page.goto(address + "/docs")
+    page.locator(".opblock").first.wait_for()
+    page.locator(".opblock-summary-control").first.click()
+    page.locator(".opblock-body").first.wait_for()
+    page.wait_for_timeout(500)
+    assert serious(page) == []
+    context.close()
+
+
 def serious(page: Any) -> list[tuple[str, str]]:
     """What axe-core calls serious or worse: the rule, and where."""
     axe = pytest.importorskip("axe_playwright_python.sync_playwright")

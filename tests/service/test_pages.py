@@ -5,14 +5,18 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.tracking.state import Alarm
+from sprung.service.api.fleet import load_view
 from sprung.service.core import Core
 from sprung.service.live import FeedStatus
-from sprung.service.store import fleet
+from sprung.service.store import fleet, work
+from sprung.service.store.work import JobRow
+from sprung.service.views import VehicleView
 
 BROWSER = {"accept": "text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"}
 FIRST = Alarm("change", "primary_11l.damping", 0, 1, "warning", -0.1, 0.02)
@@ -89,3 +93,29 @@ def test_the_page_of_work_shows_live_buses_and_what_is_wrong_with_them(client: T
     shown = client.get("/pages/work").text
     for text in ("Live buses", "socketcan:can0", "no such device", "3 waiting, 3 lost", "5 frames lost"):
         assert text in shown
+
+
+RECORDED = {"recording": "r", "vehicle": "tram", "windows": {"used": 7, "repaired": 0, "dropped": 2}}
+REPORTED = {"report": "one", "verdict": "missing_physics"}
+
+
+def test_the_page_of_work_says_what_came_of_recordings_and_diagnoses(client: TestClient, core: Core) -> None:
+    ended = [("recording", "done", RECORDED, None), ("diagnosis", "done", REPORTED, None), ("recording", "failed")]
+    ended[2] += (None, "the file is empty")
+    with core.store.write() as connection:
+        for number, (kind, state, result, error) in enumerate(ended):
+            work.add_job(connection, JobRow(str(number), kind, state, None, None, 1.0, result, error, number, number))
+    page = client.get("/pages/work")
+    assert page.status_code == 200, page.text
+    assert "7 windows used, 2 dropped" in page.text and "report: missing physics" in page.text
+    assert "the file is empty" in page.text
+
+
+def test_the_page_of_a_vehicle_says_its_load_with_its_deviation(
+    client: TestClient, broken: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def loaded(*given: Any) -> VehicleView:
+        return replace(load_view(*given), load={"car": (-1230.4, 410.0)})
+
+    monkeypatch.setattr("sprung.service.pages.vehicle.load_view", loaded)
+    assert "Load of car: <strong>-1230 kg</strong> ± 410 kg" in client.get(f"/pages/vehicles/{broken}").text
