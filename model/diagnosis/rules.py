@@ -161,6 +161,12 @@ class PlausibleRules:
     alone: float = rule(
         3.0, "times the next largest, that one gain or zero is off alone; derived: of 8, one rig in 90", 2.0, 5.0
     )
+    weighed: float = rule(
+        0.015, "of a body's mass, its deviation where the file states none; chosen: as a gain's", 0.01, 0.03
+    )
+    slow_mode: float = rule(
+        0.5, "times the slowest mode on springs, below which no body bends; chosen: it is lighter", 0.3, 0.8
+    )
     by_chance: float = rule(0.02, "chance that it is as far off its kind; derived: of few, one rig in 50", 0.01, 0.05)
     simulated: float = rule(
         1e-3, "of a law's parameter, that simulating kinks leaves; derived: 4 steps per sample", 3e-4, 3e-3

@@ -25,6 +25,7 @@ from sprung.model.diagnosis.report.report import (
     CandidateRow,
     Finding,
     IdentifiedLaw,
+    LawParameter,
     RecordingFacts,
     Report,
     ReportedParameter,
@@ -86,9 +87,11 @@ def _findings(one: Judged) -> list[Finding]:
     for index, step in enumerate(one.found.steps if one.named else (), len(one.record.given.pieces)):
         sigma = spread(one.final, index, full, names)
         others = [other.effect for other in one.alike if other.index == index]
-        if isinstance(one.final.model.pieces[index], Lag):
-            late, std = one.final.model.late, float(sigma[0][0])
-            findings.append(late_finding(one.record.sensor, one.record.element, late, std, step, others))
+        piece = one.final.model.pieces[index]
+        if isinstance(piece, Lag):
+            late = LawParameter("time", one.final.model.shapes[index][0], float(sigma[0][0]), "s")
+            where = one.record.sensor, one.record.element
+            findings.append(late_finding(*where, late, step, others, filters=piece.filters))
         else:
             findings.append(finding_of(one.record.element, one.final, one.base, index, step, sigma, others))
     if one.unnamed is not None:

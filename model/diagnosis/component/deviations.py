@@ -9,7 +9,8 @@ own frequency with its full size; never less than what white noise of the residu
 same sum over stretches of time, of which the loud ones alone have told the numbers and made the errors.
 
 What chance does not tell (`left_open`) is found by moving the numbers: noise and sampling of the motion, the part of
-the record that was not fitted, a force of no law as large as what is left, and laws that look alike.
+the record that was not fitted, a force of no law as large as what is left, a delay of the force's channel, and laws
+that look alike.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from dataclasses import replace
 import numpy as np
 
 from sprung.model.diagnosis.component.fit import ComponentFit, ComponentModel, refined
-from sprung.model.diagnosis.component.piece import SURFACE, Lag
+from sprung.model.diagnosis.component.piece import LAGS, SURFACE, Lag
 from sprung.model.laws import SpringDamper
 from sprung.model.signals import FloatArray
 
@@ -68,16 +69,16 @@ def _normal(jacobian: FloatArray) -> tuple[FloatArray, FloatArray]:
 def _jacobian(fit: ComponentFit) -> tuple[FloatArray, list[str]]:
     """Derivatives of the modelled force by everything that is fitted, (T, P), and the names of the first of it."""
     task, model = fit.task, fit.model
-    base, free, _ = task.delayed(model.late).linear
-    motion, moved = task.motion.delayed(model.late), []
+    shown, moved = task.through(model.channel), []
+    base, free, _ = shown.linear
     for i, (piece, shape) in enumerate(zip(model.pieces, model.shapes, strict=True)):
         for j in range(len(shape)):
             step = _RELATIVE * max(abs(shape[j]), 1e-12) * 10
             if isinstance(piece, Lag):
-                moved.append(_per_lag(fit))
+                moved.append(_per_lag(fit, piece, shape))
                 continue
             other = tuple(s + step * (k == j) for k, s in enumerate(shape))
-            change = (piece.columns(motion, other) - piece.columns(motion, shape)) @ fit.strengths_of(i)
+            change = (shown.columns_of(piece, other) - shown.columns_of(piece, shape)) @ fit.strengths_of(i)
             moved.append(change / step)
     names = [name for name, is_free in zip(("preload", "stiffness", "damping"), free, strict=True) if is_free]
     return np.column_stack([base, model.columns(task), *moved]), names
@@ -94,7 +95,7 @@ def left_open(fit: ComponentFit, alike: Sequence[FloatArray] = ()) -> FloatArray
         (np.outer(change, change) for change in moved if np.all(np.isfinite(change))),
         np.zeros((jacobian.shape[1],) * 2),
     )
-    return found + _by_what_is_left(fit, jacobian)
+    return found + _by_what_is_left(fit, jacobian) + _by_delay(fit, jacobian)
 
 
 def _by_motion(fit: ComponentFit) -> Iterator[FloatArray]:
@@ -123,8 +124,7 @@ def _by_what_is_left(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
     A force over deflection, rate and memory has a part that the laws have taken up, and one that is seen: its columns'
     sizes are drawn at random with the variance that explains the part that is seen.
     """
-    motion = fit.task.motion.delayed(fit.model.late)
-    columns = SURFACE.columns(motion, ())
+    columns = fit.task.through(fit.model.channel).columns_of(SURFACE, ())
     columns = columns / np.maximum(np.sqrt(np.mean(columns**2, axis=0)), 1e-300)
     scale, inverse = _normal(jacobian)
     taken = inverse @ ((jacobian / scale).T @ columns)
@@ -136,6 +136,24 @@ def _by_what_is_left(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
     power = max(inside - chance, 0.0) / max(float(np.sum(sizes**2)), 1e-300)
     moved = taken / scale[:, None]
     return np.asarray(power * moved @ moved.T)
+
+
+def _by_delay(fit: ComponentFit, jacobian: FloatArray) -> FloatArray:
+    """By a delay of the force's channel that the model does not have, a covariance (P, P).
+
+    As large as instruments leave it, as far as it would not leave more than what passes for noise: at one frequency a
+    spring and a damper take all of it up.
+    """
+    task = fit.task
+    if task.delay_std == 0.0 or any(isinstance(piece, Lag) for piece in fit.model.pieces):
+        return np.zeros((jacobian.shape[1],) * 2)
+    per_second = _per_lag(fit, LAGS[0], (0.0,))
+    scale, inverse = _normal(jacobian)
+    taken = inverse @ ((jacobian / scale).T @ per_second)
+    seen = per_second - jacobian / scale @ taken
+    passes = (task.rules.at_noise - 1) * float(np.mean(fit.residual**2))
+    moved = taken / scale / np.sqrt(task.delay_std**-2 + float(np.mean(seen**2)) / max(passes, 1e-300))
+    return np.outer(moved, moved)
 
 
 def moved_in_common(other: ComponentFit, found: ComponentFit) -> FloatArray:
@@ -167,18 +185,19 @@ def _numbers(fit: ComponentFit) -> FloatArray:
     return np.concatenate([_linear(fit), fit.strengths, *(np.array(shape, dtype=float) for shape in fit.model.shapes)])
 
 
-def _per_lag(fit: ComponentFit) -> FloatArray:
-    """Derivative of the modelled force by the lag, N/s, (T,)."""
-    late, step = fit.model.late, _RELATIVE * fit.task.motion.step
+def _per_lag(fit: ComponentFit, lag: Lag, shape: Sequence[float]) -> FloatArray:
+    """Derivative of the modelled force by the lag's time, N/s, (T,)."""
+    step = _RELATIVE * fit.task.motion.step
 
-    def force(delay: float) -> FloatArray:
-        task = fit.task.delayed(delay)
-        linear = task.motion.deflection * fit.element.stiffness + task.motion.rate * fit.element.damping
+    def force(late: float) -> FloatArray:
+        task = fit.task.through(lag.response((late,)))
+        base, _, rest = task.linear
         pieces = zip(fit.model.pieces, fit.model.shapes, strict=True)
-        found = [piece.columns(task.motion, shape) for piece, shape in pieces]
-        return np.asarray(linear + np.column_stack([*found, np.zeros((len(linear), 0))]) @ fit.strengths)
+        found = [task.columns_of(piece, own) for piece, own in pieces]
+        columns = np.column_stack([base, *found, np.zeros((len(rest), 0))])
+        return np.asarray(columns @ np.concatenate([_linear(fit), fit.strengths]) - rest)
 
-    return (force(late + step) - force(late)) / step
+    return (force(shape[0] + step) - force(shape[0])) / step
 
 
 def spread(fit: ComponentFit, index: int, full: FloatArray, names: list[str]) -> tuple[FloatArray, FloatArray]:

@@ -13,12 +13,15 @@ from sprung.model.diagnosis.component.piece import Lag, Part, Seen, Values
 from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import ElementLaw, SpringDamper
 from sprung.model.laws.along import force_along
+from sprung.model.laws.channel import SensorResponse, passed
 from sprung.model.laws.following import Covariate
 from sprung.model.laws.placed import PlacedLaw
 from sprung.model.signals import FloatArray
 
 _STEPS = 40  # evaluations of a search for shapes
 _ENOUGH = 1e-6  # change of the squares, or of the shapes, at which it ends: far below any deviation
+DIRECT = SensorResponse()
+_FORGETS = 5.0  # time constants after which a filter shows nothing of what was before
 _KEPT = 2_500_000  # samples of columns that a task remembers: rounds of trials and refinements ask for them again
 
 
@@ -43,14 +46,18 @@ class ComponentTask:
     noise: float = 0.0  # N, of the force as the record itself shows it, apart from any model
     declared: float = 0.0  # N, the same as the system file states it; 0: it states none
     held: tuple[PlacedLaw, ...] = ()  # laws whose values are known and not estimated
+    delay_std: float = 0.0  # s, between the force's channel and the motion's, as instruments leave it
+    lag: float = 0.0  # s, time constant of a first-order filter that the force passes in its channel
 
     @cached_property
     def seen(self) -> Seen:
         return Seen.of(self.motion, self.rules)
 
-    def delayed(self, late: float) -> ComponentTask:
-        """The same with the motion of that long ago, s."""
-        return self if late == 0.0 else replace(self, motion=self.motion.delayed(late))
+    def through(self, channel: SensorResponse) -> ComponentTask:
+        """The same with what a late or slow channel shows of the modelled force."""
+        if channel == DIRECT:
+            return self
+        return replace(self, motion=self.motion.delayed(channel.delay), lag=self.lag + channel.lag)
 
     def columns_of(self, piece: Part, shape: tuple[float, ...]) -> FloatArray:
         """Force per strength of a piece along the motion, (T, m); what was asked for lately is remembered."""
@@ -58,8 +65,12 @@ class ComponentTask:
         if key not in self._columns:
             if len(self._columns) * len(self.force) > _KEPT:
                 self._columns.clear()
-            self._columns[key] = (piece, piece.columns(self.motion, shape))
+            self._columns[key] = (piece, self._shown(piece.columns(self.motion, shape)))
         return self._columns[key][1]
+
+    def _shown(self, columns: FloatArray) -> FloatArray:
+        """What the channel shows of forces (T, m)."""
+        return passed(columns.T, SensorResponse(lag=self.lag), 1 / self.motion.step).T if self.lag else columns
 
     @cached_property
     def _columns(self) -> dict[tuple[int, tuple[float, ...]], tuple[Part, FloatArray]]:
@@ -82,7 +93,8 @@ class ComponentTask:
         columns = np.column_stack([np.ones(len(self.force)), self.motion.deflection, self.motion.rate])
         known = np.array([0.0, self.nominal.stiffness or 0.0, self.nominal.damping or 0.0])
         free = np.array([True, self.nominal.stiffness is None, self.nominal.damping is None])
-        return columns[:, free], free, self.force - columns @ known - self._held_force
+        given = columns @ known + self._held_force
+        return self._shown(columns[:, free]), free, self.force - self._shown(given[:, None])[:, 0]
 
     @property
     def _held_force(self) -> FloatArray:
@@ -120,13 +132,16 @@ class ComponentModel:
         )
 
     @property
-    def late(self) -> float:
-        """By how much the force's channel is late against the motion's, s."""
-        return sum(shape[0] for piece, shape in zip(self.pieces, self.shapes, strict=True) if isinstance(piece, Lag))
+    def channel(self) -> SensorResponse:
+        """What the force's channel makes of it against the motion's."""
+        for piece, shape in zip(self.pieces, self.shapes, strict=True):
+            if isinstance(piece, Lag):
+                return piece.response(shape)
+        return DIRECT
 
     def columns(self, task: ComponentTask) -> FloatArray:
         """(T, m) of all pieces."""
-        late = task.delayed(self.late)
+        late = task.through(self.channel)
         found = [late.columns_of(p, s) for p, s in zip(self.pieces, self.shapes, strict=True)]
         return np.column_stack(found) if found else np.zeros((len(task.force), 0))
 
@@ -238,10 +253,11 @@ def bounded_solution(columns: FloatArray, target: FloatArray, signs: tuple[int, 
 
 def fitted(task: ComponentTask, model: ComponentModel) -> ComponentFit:
     """Strengths, preload, spring and damper for given shapes."""
-    base, free, force = task.delayed(model.late).linear
+    base, free, force = task.through(model.channel).linear
     columns = np.column_stack([base, model.columns(task)])
-    if model.late != 0.0:  # before the record nobody knows the motion
-        earlier = task.motion.time - model.late
+    late = model.channel.delay + _FORGETS * model.channel.lag
+    if late != 0.0:  # before the record nobody knows the motion
+        earlier = task.motion.time - late
         known = (earlier >= task.motion.time[0]) & (earlier <= task.motion.time[-1])
         columns, force = columns * known[:, None], force * known
     signs = tuple(np.array([0, 1, 1])[free].tolist()) + model.signs

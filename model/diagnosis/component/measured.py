@@ -176,8 +176,15 @@ def _record(
         noise=max(noise_at_rest(f, rests) or 0.0, white_noise(f[run])),
         declared=system.file.sensors[sensor].noise,
         held=held,
+        delay_std=min(_delay_std(system, sensor), 1 / sample_rate),
     )
     return ComponentRecord(element, sensor, task, tuple(notes), given, own)
+
+
+def _delay_std(system: System, sensor: str) -> float:
+    """Standard deviation of a channel's delay by its data sheet, s."""
+    names = [channel.name for channel in system.channels][-len(system.tolerances) :]
+    return float(system.tolerances[names.index(sensor)].delay)
 
 
 def _deflection(

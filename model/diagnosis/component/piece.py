@@ -19,6 +19,7 @@ from sprung.model.diagnosis.rules import RULES, ComponentRules
 from sprung.model.laws import CLOCK_LEAD, ElementLaw, SpringDamper, reversal_step
 from sprung.model.laws.along import force_along
 from sprung.model.laws.basis import UNKNOWN
+from sprung.model.laws.channel import SensorResponse
 from sprung.model.laws.following import Covariate
 from sprung.model.laws.paths import stop_path
 from sprung.model.laws.sensor_faults import SENSOR_LAG
@@ -279,12 +280,15 @@ class SliderSurface:
 
 @dataclass(frozen=True)
 class Lag:
-    """The force's channel late against the motion's: no force of its own, everything follows the motion earlier."""
+    """The force's channel late against the motion's: no force of its own, every other one is seen later.
 
+    By a delay of its node, or by a filter of first order, which takes off from what is fast, too.
+    """
+
+    filters: bool = False  # whether its time is a filter's constant
     effect: str = SENSOR_LAG.name
     speaks_for: EffectKind = EffectKind.FAULT
     title: str = SENSOR_LAG.title
-    key: str = SENSOR_LAG.name
     kind: PieceKind = STATIC
     dissipates: bool = False
     believed: Believed = lambda fitted: (
@@ -294,12 +298,21 @@ class Lag:
     shapes: tuple[str, ...] = ("time",)
     signs: tuple[int, ...] = ()
 
+    @property
+    def key(self) -> str:
+        """Apart from the other kind."""
+        return f"{self.effect} of a filter" if self.filters else self.effect
+
+    def response(self, shape: Shape) -> SensorResponse:
+        """What the channel makes of a force."""
+        return SensorResponse(lag=shape[0]) if self.filters else SensorResponse(delay=shape[0])
+
     def grid(self, seen: Seen) -> FloatArray:
         late = np.geomspace(2e-4, seen.latest, 12)
-        return np.concatenate([late, -late])[:, None]
+        return (late if self.filters else np.concatenate([late, -late]))[:, None]
 
     def limits(self, seen: Seen) -> list[tuple[float, float]]:
-        return [(-1.5 * seen.latest, 1.5 * seen.latest)]
+        return [(1e-5 if self.filters else -1.5 * seen.latest, 1.5 * seen.latest)]
 
     def columns(self, motion: ElementMotion, shape: Shape) -> FloatArray:
         return np.zeros((len(motion.deflection), 0))
@@ -314,7 +327,7 @@ class Lag:
 _REACHES = np.array([0.01, 0.03, 0.1, 0.25, 0.5, 0.9])  # of the travel, of a family of sliders
 _RATES = np.array([0.1, 0.3, 0.6, 0.85])  # quantiles of the rate at which a force over it may bend
 SURFACE = SliderSurface()
-LAG = Lag()
+LAGS = (Lag(), Lag(filters=True))
 LawPiece = Piece | Following | Lag  # what is searched among
 Part = LawPiece | SliderSurface
 

@@ -13,7 +13,7 @@ from itertools import islice
 
 import numpy as np
 
-from sprung.model.diagnosis.component.deviations import covariance, spread
+from sprung.model.diagnosis.component.deviations import covariance, left_open, spread
 from sprung.model.diagnosis.component.fit import (
     NO_LAWS,
     ComponentFit,
@@ -23,7 +23,7 @@ from sprung.model.diagnosis.component.fit import (
     fitted,
     refined,
 )
-from sprung.model.diagnosis.component.piece import LAG, FittedPiece, Following, Lag, LawPiece, Part
+from sprung.model.diagnosis.component.piece import LAGS, FittedPiece, Following, Lag, LawPiece, Part
 from sprung.model.diagnosis.component.pieces import PIECES
 from sprung.model.diagnosis.component.pieces_following import pieces_following
 from sprung.model.diagnosis.rules import ComponentRules
@@ -95,7 +95,7 @@ def search(
     """
     rules = task.rules
     tests = rules.trials_of_a_law * len(pieces)
-    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), LAG)
+    pieces = (*pieces, *(piece for signal in task.signals for piece in pieces_following(signal)), *LAGS)
     quick = task.every(max(1, len(task.force) // rules.search))
     fine = task.every(max(1, len(task.force) // rules.fit))
     base = refined(quick, given)
@@ -211,7 +211,7 @@ def _trials(current: ComponentFit, piece: LawPiece, rules: ComponentRules) -> li
         late = (current.model.plus(piece, (float(row[0]),)) for row in piece.grid(task.seen))
         fits = [fitted(task, model) for model in late]
         return sorted(((fit.error * task.split, fit.model) for fit in fits), key=lambda t: t[0])[: rules.starts]
-    task = task.delayed(current.model.late)
+    task = task.through(current.model.channel)
     base, free, force = task.linear
     train = slice(0, task.split)
     fixed = np.column_stack([base, current.model.columns(current.task)])[train]
@@ -249,10 +249,14 @@ def plausible(fit: ComponentFit, index: int = -1) -> bool:
     )
 
 
-def _determined(fit: ComponentFit) -> bool:
-    """Whether the last law's first quoted value, or its first parameter, is larger than its deviation."""
+def _determined(fit: ComponentFit, *, by_all: bool = False) -> bool:
+    """Whether the last law's first quoted value, or its first parameter, is larger than its deviation.
+
+    by_all: with what the record leaves open besides chance.
+    """
     index = len(fit.model.pieces) - 1
-    sigma = spread(fit, index, *covariance(fit))
+    full, names = covariance(fit)
+    sigma = spread(fit, index, full + left_open(fit) if by_all else full, names)
     values = [fit.values(index), fit.quoted(index)]
     told = [
         abs(next(iter(of.values()))[0]) > fit.task.rules.told * float(s[0])
@@ -291,9 +295,11 @@ def _accepted(
     # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
     alone = len(current.fit.model.pieces) == len(base.model.pieces)
     most = 1 - rules.by_lag if alone else rules.together
-    near = [r for r in near if r.last is not LAG or _leaves_nothing(r.fit, current.fit, most)]
+    near = [r for r in near if not isinstance(r.last, Lag) or _leaves_nothing(r.fit, current.fit, most)]
+    if not near and alone and not current.fit.leaves_more:
+        return None  # nothing but a channel's delay within what noise leaves open: no law in its place
     if not near:
-        near = [r for r in ranked if r.last is not LAG and r.evidence > 0][:1]
+        near = [r for r in ranked if not isinstance(r.last, Lag) and r.evidence > 0][:1]
     if not near:
         return None
     chosen, before = _plainest(near, rules), current
@@ -303,6 +309,8 @@ def _accepted(
     p_value = chance(chosen.gain, freedom, tests)
     if p_value > rules.alpha or chosen.fit.held_out >= before.fit.held_out:
         return None
+    if alone and not before.fit.leaves_more and not _determined(chosen.fit, by_all=True):
+        return None  # within what may be noise, only a law that is sure counts
     if len(before.fit.model.pieces) > 0:
         removed = before.fit.held_out - chosen.fit.held_out
         if not told or removed < max(rules.least_share * before.fit.held_out, rules.minor * base.held_out):

@@ -187,11 +187,22 @@ def reversed_finding(sensor: str, element: str) -> Finding:
     )
 
 
-def late_finding(sensor: str, element: str, value: float, sigma: float, step: Step, alike: Sequence[str]) -> Finding:
-    """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics."""
-    size = LawParameter("time", abs(1e3 * value), 1e3 * sigma, "ms")
-    near, way = _family(SENSOR_LAG.name, alike), "later" if value > 0 else "earlier"
+def late_finding(
+    sensor: str, element: str, time: LawParameter, step: Step, alike: Sequence[str], *, filters: bool
+) -> Finding:
+    """The force's channel late against the motion's, or early: filters and nodes of the rig, no physics.
+
+    time: s, by which it is late, or, with `filters`, the constant of its filter.
+    """
+    size = LawParameter("time", abs(1e3 * time.value), 1e3 * time.std, "ms")
+    near, way = _family(SENSOR_LAG.name, alike), "later" if time.value > 0 else "earlier"
     sentence = f"{sensor}: the force comes {size.words()} {way} than the motion of {element}"
+    if filters:
+        corner = f"{1 / (2 * np.pi * time.value):.3g} Hz"
+        sentence = (
+            f"{sensor}: the force passes a filter of first order with a time constant of {size.words()} ({corner}), "
+            f"against the motion of {element}"
+        )
     if near is not None:
         sentence += f" ({near.replace('_', ' ')} fit almost equally well)"
     rival = next(iter(step.rivals), None)
@@ -199,7 +210,7 @@ def late_finding(sensor: str, element: str, value: float, sigma: float, step: St
         sensor,
         SENSOR_LAG.name,
         kind_of(SENSOR_LAG),
-        (LawParameter("time", value, sigma, "s"),),
+        (time,),
         step.p_value,
         step.delta_bic,
         runner_up=None if rival is None else (rival.last.effect, bic(rival.gain, 1, int(rival.count))),

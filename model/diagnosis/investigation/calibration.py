@@ -7,6 +7,8 @@ become parameters of the model with the tolerances as prior (`gain_std`, `offset
 the search restarts.  Values within tolerance are reported and have no effect on the verdict; their uncertainty is part
 of that of all other values.
 
+Masses belong to them as well: no body is weighed better than an instrument shows.
+
 With enough channels, one whose error is far larger than all others of its kind is a fault, however small: the
 instruments of one rig are comparable.
 """
@@ -29,7 +31,7 @@ from sprung.model.diagnosis.rules import PlausibleRules
 from sprung.model.diagnosis.screening.score import Screening
 from sprung.model.diagnosis.screening.screen import screen
 from sprung.model.diagnosis.selection.plausible import hardly_there
-from sprung.model.laws import Law, SensorLaw
+from sprung.model.laws import BodyLaw, Law, SensorLaw
 from sprung.model.laws.base import DataSheet
 from sprung.model.schema import SupportInput
 from sprung.model.system import System
@@ -59,8 +61,20 @@ def _size(signals: Signals, location: str) -> float:
 
 
 def within_tolerance(state: Investigation, term: Term) -> bool:
-    """Whether a fault is within the data sheet of its channel, and calibration errors are part of the model."""
-    return bool(state.calibrations) and within_data_sheet(state, term)
+    """Whether an error is one of calibration, where such errors are part of the model.
+
+    A fault within the data sheet of its channel, or a body's mass as well as bodies of such a rig are weighed.
+    """
+    return bool(state.calibrations) and (within_data_sheet(state, term) or _as_weighed(state, term))
+
+
+def _as_weighed(state: Investigation, term: Term) -> bool:
+    """Whether another mass is within what the system file knows of it."""
+    if not (isinstance(term.law, BodyLaw) and term.law.scales == "mass"):
+        return False
+    rules, mass = state.options.rules.plausible, state.system.file.bodies[term.location].mass
+    spread = rules.weighed if mass.std is None else mass.std / mass.value
+    return bool(abs(term.parameters[0] - 1.0) <= rules.calibration * spread)
 
 
 def within_data_sheet(state: Investigation, term: Term, instruments: int = 1) -> bool:

@@ -28,6 +28,10 @@ _INTEGRATED = 1e3  # an integrated displacement carries no weight of its own
 _ORDER = 8  # of the differences that tell those
 _WHITE_ORDER = 6  # of the differences that tell white noise
 _WHITE_BLOCKS = 40  # of them, the median counts: bursts are no noise
+_EDGE_BLOCK, _EDGE_BLOCKS = 100, 5  # samples of a block, and blocks, that tell a spectrum's edge
+_EVEN_BANDS = ((0.26, 0.30), (0.30, 0.34), (0.34, 0.38))  # of the sample rate, below the edge of any usual filter
+_EMPTY_BAND = (0.46, 0.5)  # of the sample rate, beyond it
+_EVEN, _EMPTY = 1.8, 0.2  # of power, within which bands are even and below which one is empty
 _SEEN = 1e-9  # of a loose motion
 _END = 9  # samples that tell the slope at an end of a record
 _END_DEGREE = 4  # of the polynomial through them, of a support's motion
@@ -156,11 +160,32 @@ def declared_noise(system: System, signals: Signals, rules: RecordRules = RULES.
 def white_noise(series: FloatArray) -> float:
     """Standard deviation of the white noise that a series (T,) carries, from its differences of high order.
 
-    Smooth motion leaves them by its power above about a third of the sample rate only.
+    Smooth motion leaves them by its power above about a third of the sample rate only.  Of a series from which a
+    filter took what is next to half the sample rate (`_below_an_edge`), that of the noise before the filter.
     """
     differences = np.diff(series, _WHITE_ORDER) ** 2 / comb(2 * _WHITE_ORDER, _WHITE_ORDER)
     blocks = np.array_split(differences, min(_WHITE_BLOCKS, max(1, len(differences) // 10)))
-    return float(np.sqrt(np.median([block.mean() for block in blocks])))
+    return max(float(np.sqrt(np.median([block.mean() for block in blocks]))), _below_an_edge(series))
+
+
+def _below_an_edge(series: FloatArray) -> float:
+    """Standard deviation of white noise that a filter has cut off below half the sample rate, as resampling does.
+
+    Its spectrum is even up to the filter's edge and has next to nothing beyond; 0 where it is not.
+    """
+    count = min(_WHITE_BLOCKS, len(series) // _EDGE_BLOCK)
+    if count < _EDGE_BLOCKS:
+        return 0.0
+    size = len(series) // count
+    window = np.hanning(size)
+    rest = np.diff(series[: count * size], prepend=series[0]).reshape(count, size)  # what moves slowly leaks less
+    frequency = np.fft.rfftfreq(size)
+    power = np.abs(np.fft.rfft(rest * window)) ** 2 / np.sum(window**2)
+    power[:, 1:] /= (2 * np.sin(np.pi * frequency[1:])) ** 2
+    bands = [(frequency >= low) & (frequency < high) for low, high in (*_EVEN_BANDS, _EMPTY_BAND)]
+    *even, empty = (float(np.median(power[:, band].mean(axis=1))) for band in bands)
+    cut = max(even) < _EVEN * min(even) and empty < _EMPTY * min(even)
+    return float(np.sqrt(np.mean(even))) if cut else 0.0
 
 
 def seen_noise(signals: Signals, declared: Noise, most: float) -> Noise:

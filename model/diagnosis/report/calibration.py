@@ -1,4 +1,4 @@
-"""Gains and zeros within what data sheets leave: told beside the findings, for whoever keeps the instruments."""
+"""Gains, zeros and masses within what data sheets leave: told beside the findings, for those who keep instruments."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from sprung.model.diagnosis.investigation.calibration import calibration_indices
 from sprung.model.diagnosis.investigation.state import Outcome
 from sprung.model.diagnosis.report.report import IdentifiedLaw, LawParameter
 from sprung.model.diagnosis.report.values import law_parameters
+from sprung.model.laws.bodies import MASS_CHANGE
 
 _SHOWN = 4  # in the summary
 
@@ -38,6 +39,12 @@ def in_words(calibration: Sequence[IdentifiedLaw]) -> str:
     """In short; empty where there is nothing to tell."""
     if not calibration:
         return ""
-    shown = [f"{one.location} {p.name} {p.words()}" for one in calibration[:_SHOWN] for p in one.parameters]
+    shown = [f"{one.location} {_name(one)} {p.words()}" for one in calibration[:_SHOWN] for p in one.parameters]
     more = f" and {len(calibration) - _SHOWN} more" if len(calibration) > _SHOWN else ""
     return f"within calibration: {', '.join(shown)}{more}"
+
+
+def _name(one: IdentifiedLaw) -> str:
+    """What is off, in a word or two."""
+    (parameter,) = one.parameters
+    return f"mass {parameter.name}" if one.effect == MASS_CHANGE.name else parameter.name

@@ -11,12 +11,14 @@ from __future__ import annotations
 import numpy as np
 
 from sprung.model.diagnosis.fit.optimise import Fit
+from sprung.model.diagnosis.record.highpass import slowest_mode
 from sprung.model.diagnosis.record.signals import Part
 from sprung.model.diagnosis.record.spectra import Grid
 from sprung.model.diagnosis.response.terms import Term
 from sprung.model.diagnosis.rules import RULES, PlausibleRules
 from sprung.model.laws import BodyLaw, ElementLaw, StructureLaw, SupportLaw, reversal_step
 from sprung.model.signals import FloatArray
+from sprung.model.system import System
 
 
 def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, before: Fit | None = None) -> str | None:
@@ -32,7 +34,7 @@ def doubt(fit: Fit, term: Term, rules: PlausibleRules = RULES.plausible, *, befo
     if isinstance(term.law, ElementLaw) and term.law.knees:
         return _unresolved(fit, term, rules)
     if isinstance(term.law, (BodyLaw, StructureLaw)) and term.law.adds_motion:
-        return _unheard(fit.forward.part.grid, term)
+        return _unheard(fit.forward.part.grid, term) or _too_slow(fit.forward.system, term, rules)
     if isinstance(term.law, (BodyLaw, SupportLaw)):
         return harmonic(fit.forward.part, term, rules)
     return None
@@ -45,6 +47,17 @@ def _unheard(grid: Grid, term: Term) -> str | None:
     highest = grid.omega[grid.band][-1] / (2 * np.pi)
     frequency = term.parameters[term.law.names.index("frequency")]
     return f"{frequency:.3g} Hz is above the {highest:.3g} Hz that are compared" if frequency > highest else None
+
+
+def _too_slow(system: System, term: Term, rules: PlausibleRules) -> str | None:
+    """An elastic mode far below what bodies do on their springs: above it nothing parts it from a lighter body."""
+    if not isinstance(term.law, BodyLaw) or "frequency" not in term.law.names:
+        return None
+    slowest = slowest_mode(system, RULES.record.held)
+    frequency = term.parameters[term.law.names.index("frequency")]
+    if frequency >= rules.slow_mode * slowest:
+        return None
+    return f"{frequency:.3g} Hz is far below the {slowest:.3g} Hz of bodies on their springs"
 
 
 def out_of_range(term: Term) -> str | None:

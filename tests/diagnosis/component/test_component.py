@@ -256,6 +256,16 @@ def test_paths_of_memories_follow_their_differential_equations() -> None:
     np.testing.assert_allclose(np.diff(stop)[inside], np.diff(d)[inside], atol=1e-12)
 
 
+def test_noise_is_told_below_the_edge_of_a_filter() -> None:
+    """Resampling leaves nothing next to half the sample rate, and what is left is no smooth motion's."""
+    random, (_, d, _) = np.random.default_rng(5), sweep()
+    noise = 2e-5 * random.standard_normal(len(d))
+    cut = sosfiltfilt(butter(8, 0.8, output="sos"), noise)
+    assert white_noise(d + cut) == pytest.approx(2e-5, rel=0.1)
+    smooth = sosfiltfilt(butter(2, 0.3, output="sos"), 100 * noise)
+    assert white_noise(d + smooth) < 2 * np.std(smooth)  # no even spectrum: nothing is made of it
+
+
 def test_a_displacement_is_differentiated_with_its_noise_known() -> None:
     _, d, v = sweep()
     noise = 2e-5

@@ -56,6 +56,20 @@ def test_a_filter_of_the_force_is_a_lag() -> None:
     assert [(f.location, f.effect) for f in found.findings if f.effect != "preload"] == [("cell", "sensor_lag")]
 
 
+def test_a_filter_of_first_order_is_told_with_its_time_constant_beside_true_values() -> None:
+    """A delay in its place would leave the stiffness and damping per cents off."""
+    d, v = random_motion()
+    lag = 0.004
+    filtered = sosfilt(butter(1, 1 / (2 * np.pi * lag), fs=RATE * FINER, output="sos"), K * d + C * v)[::FINER]
+    found = report(filtered, d[::FINER], noise=2.0)
+    (finding,) = [f for f in found.findings if f.effect != "preload"]
+    assert finding.effect == "sensor_lag" and "first order" in finding.sentence
+    assert finding.parameters[0].value == pytest.approx(lag, rel=0.03)
+    values = {p.name: p.value for p in found.augmented}
+    assert values["damper.stiffness"] == pytest.approx(K, rel=0.003)
+    assert values["damper.damping"] == pytest.approx(C, rel=0.003)
+
+
 def test_compressible_oil_is_not_called_late() -> None:
     d, v = random_motion()
     force, state, step, stiff = np.empty(len(d)), 0.0, 1 / (RATE * FINER), 3e5
@@ -72,6 +86,8 @@ def test_in_a_sine_test_nothing_tells_a_lag() -> None:
     found = report(0.01 * (K * np.sin(late) + C * 2 * np.pi * 1.3 * np.cos(late)), d)
     assert laws(found) == []
     assert found.verdict == "consistent"
+    damping = next(p for p in found.augmented if p.name == "damper.damping")
+    assert abs(damping.value - C) < 3 * damping.std  # which a delay of the file's instruments would change as much
 
 
 def test_a_delayed_motion_is_the_motion_of_then() -> None:

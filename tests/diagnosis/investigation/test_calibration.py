@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from sprung.benchmarks.sensitivity_cases import QUARTER_CAR as SYSTEM
-from sprung.model.diagnosis.api import diagnose
+from sprung.model.diagnosis.api import Options, diagnose
+from sprung.model.diagnosis.investigation.calibration import within_tolerance
 from sprung.model.diagnosis.report.report import Report
+from sprung.model.diagnosis.response.terms import Term
+from sprung.model.laws import find_law
 from sprung.model.laws.channel import delayed
 from sprung.model.system import parse_system
 from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
@@ -36,6 +42,14 @@ def test_a_rig_with_ordinary_instruments_is_consistent() -> None:
     late = told["bogie_b", "sensor_lag"][0] - told.get(("bogie_a", "sensor_lag"), (0.0, 0.0))[0]
     assert late == pytest.approx(4e-4, abs=1e-4)
     assert "within calibration: " in report.summary
+
+
+@pytest.mark.parametrize(("ratio", "calibrations", "told"), [(1.02, 5, True), (0.97, 5, False), (1.02, 0, False)])
+def test_a_mass_is_weighed_no_better_than_instruments_show(ratio: float, calibrations: int, told: bool) -> None:
+    """Where instruments are exact, it is a finding, however small."""
+    system = SimpleNamespace(file=quarter_car().file, tolerances=(), channels=())
+    state: Any = SimpleNamespace(system=system, options=Options(), calibrations=calibrations, signals=None)
+    assert within_tolerance(state, Term(find_law("mass_change"), "car", (ratio,))) == told
 
 
 @pytest.mark.slow

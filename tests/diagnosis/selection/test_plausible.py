@@ -20,6 +20,7 @@ from sprung.model.diagnosis.selection.plausible import (
     out_of_range,
 )
 from sprung.model.laws import find_law
+from tests.diagnosis_cases import quarter_car
 
 GRID = Grid(4000, 0.01)
 
@@ -65,7 +66,7 @@ def test_a_broad_excitation_has_no_harmonics() -> None:
 
 @pytest.mark.parametrize("law", ["suspended_mass", "flexible_mode"])
 def test_a_resonance_above_what_is_compared_is_no_resonance(law: str) -> None:
-    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID)))
+    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID), system=quarter_car()))
     found = find_law(law)
     highest = GRID.omega[GRID.band][-1] / (2 * np.pi)
     for factor, believed in ((0.9, True), (1.1, False)):
@@ -126,7 +127,7 @@ def test_a_knee_within_one_sample_is_not_believed(knee: float, believed: bool) -
 
 
 def test_what_is_damped_as_strongly_as_a_damper_is_no_elastic_mode() -> None:
-    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID)))
+    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID), system=quarter_car()))
     law = find_law("flexible_mode")
     for ratio, believed in ((0.05, True), (0.46, False)):
         assert (doubt(fit, Term(law, "floor", (3.0, ratio, 0.3), "z")) is None) == believed
@@ -151,3 +152,13 @@ def test_a_linear_part_leaves_a_spring_its_load(law: str, was: float, now: float
     found = find_law(law)
     reason = displaced_spring(before, fit, Term(found, "strut", found.absent))
     assert (reason is not None) == doubted
+
+
+@pytest.mark.parametrize(("frequency", "doubted"), [(0.3, True), (6.0, False)])
+def test_no_body_bends_far_below_its_motion_on_springs(frequency: float, doubted: bool) -> None:
+    """The slowest mode of the quarter car is at 1 Hz: above 0.3 Hz such a mode makes the body lighter, and no more."""
+    fit: Any = SimpleNamespace(forward=SimpleNamespace(part=SimpleNamespace(grid=GRID), system=quarter_car()))
+    fit.forward.part.grid = SimpleNamespace(omega=GRID.omega, band=GRID.omega < 2 * np.pi * 30)
+    law = find_law("flexible_mode")
+    values = tuple(frequency if name == "frequency" else 0.05 for name in law.names)
+    assert (doubt(fit, Term(law, "car", values)) is not None) == doubted
