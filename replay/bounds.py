@@ -57,12 +57,6 @@ def check_whole(path: Path, sizes: Iterator[int]) -> None:
             raise UnreadableRecording(f"{path}: unpacks to more than {total >> 20} MB, more than {FOR_ITS_SIZE}")
 
 
-def check_ratio(path: Path, name: str, packed: int, size: int) -> None:
-    """Raise UnreadableRecording when a part of a file states that it unpacks to more than is plausible."""
-    if size > WHOLE_ALWAYS + WHOLE_RATIO * packed:
-        raise UnreadableRecording(f"{path}: {name} states {size >> 20} MB packed in {packed} bytes: not plausible")
-
-
 def mat_sizes(path: Path) -> Iterator[int]:
     """Bytes that the compressed variables of a MATLAB file (version 5) inflate to, piece by piece."""
     with path.open("rb") as file:

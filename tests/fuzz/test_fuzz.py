@@ -97,3 +97,11 @@ def test_a_file_that_crashes_the_library_that_reads_it_is_one_line(
     pytest.importorskip("h5py")
     assert main(["inspect", str(KEPT.parent / "crashes" / "libhdf5-segv.h5")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_damaged_statistics_of_a_parquet_file_do_not_end_the_process() -> None:
+    """Found by mutants: pyarrow aborts where the metadata of a damaged column are asked for."""
+    pytest.importorskip("pyarrow")
+    outcome = MutantOutcome("parquet")
+    read_one(KEPT.parent / "crashes" / "pyarrow-abort.parquet", None, False, outcome)
+    assert outcome.refused == 1 and not outcome.faults
