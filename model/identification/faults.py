@@ -33,11 +33,10 @@ TRIED = 8  # windows of a batch; when none of them can be explained, the others 
 _FAR = (0.03, 1e-3, 0.03)  # gain, delay (s), load: beyond, a window is refined there rather than extrapolated
 _EVIDENT = 12.5  # log-likelihood ratio of such a step: five standard deviations
 _BETTER = 0.8  # a correction that leaves more of chi-square than this is none
-_REVERSED = 0.3  # share of the squares at nominal values that a reversed or exchanged channel leaves, at most
 _MARGIN = 2  # samples that a delay costs at either end beyond itself
 _LATE = (-0.045, -0.03, -0.02, -0.01, 0.01, 0.02, 0.03, 0.045)  # s: delays too large for a linear step
 _LATE_TRIED = 3  # windows of a batch that they are tried on; others begin with what these have in common
-_TRIALS = 3  # of those, by their squares at the nominal values
+_TRIALS = 3  # of such delays, reversed signs or exchanges, by their squares at the nominal values
 _SLIGHT = 0.1  # of what a data sheet leaves open; less is not taken back
 _FLAT = 0.8  # share of equal neighbours beyond which a channel is frozen
 _CLIPPED = 0.03  # share of samples at the very ends of the range, in runs, beyond which a channel is saturated
@@ -390,11 +389,11 @@ class Explainer:
         return (MeasurementFault(names, "frozen", float(window[-1, 0])),)
 
     def _reversed(self, window: FloatArray) -> list[tuple[FloatArray, MeasurementFault]]:
-        """Windows with one sign turned or two channels exchanged that fit much better at nominal values."""
+        """Windows with one sign turned or two channels exchanged that fit better at nominal values, the best first."""
         tries = [(one.undone(window), one.fault(self.names)) for one in self.contradictions.candidates]
         costs = self._nominal_cost(np.array([window, *(restored for restored, _ in tries)]))
         order = np.argsort(costs[1:])
-        return [tries[i] for i in order[:3] if costs[1 + i] < _REVERSED * costs[0]]
+        return [tries[i] for i in order[:_TRIALS] if costs[1 + i] < _BETTER * costs[0]]
 
     def _nominal_cost(self, windows: FloatArray) -> FloatArray:
         """Weighted squares at the nominal values with the best initial state, (B,)."""
