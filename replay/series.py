@@ -1,4 +1,4 @@
-"""Files that hold whole series: MATLAB, HDF5, JSON, UFF 58 and TDMS, each as a list of columns."""
+"""Files that hold whole series: MATLAB, HDF5, JSON, UFF 58, TDMS, NumPy and LabVIEW text, each as a list of columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.io import loadmat
 from scipy.io.matlab import MatReadError
 
-from sprung.replay import uff
+from sprung.replay import lvm, numpyfile, uff
 from sprung.replay.account import UnreadableRecording
 from sprung.replay.bounds import check_piece, check_whole, mat_sizes
 from sprung.replay.extras import needed
@@ -228,6 +228,16 @@ def _uff(path: Path) -> Iterator[list[Column]]:
     yield uff.columns(path)
 
 
+@contextmanager
+def _lvm(path: Path) -> Iterator[list[Column]]:
+    yield lvm.columns(path)
+
+
+@contextmanager
+def _numpy(path: Path) -> Iterator[list[Column]]:
+    yield [column for name, values in numpyfile.arrays(path) for column in of_matrix(name, values)]
+
+
 KINDS: dict[str, Callable[[Path], Any]] = {
     ".mat": _mat,
     ".json": _json,
@@ -237,4 +247,7 @@ KINDS: dict[str, Callable[[Path], Any]] = {
     ".tdms": _tdms,
     ".uff": _uff,
     ".unv": _uff,
+    ".npz": _numpy,
+    ".npy": _numpy,
+    ".lvm": _lvm,
 }

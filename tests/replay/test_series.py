@@ -1,4 +1,4 @@
-"""The same record as Parquet, MATLAB, HDF5, JSON, UFF and TDMS, written by the libraries that others use."""
+"""The same record as Parquet, MATLAB, HDF5, JSON, UFF, TDMS and NumPy, by libraries that others use; LabVIEW text."""
 
 import json
 from datetime import UTC, datetime
@@ -69,7 +69,12 @@ def test_a_series_that_is_there_twice_is_refused(tmp_path: Path) -> None:
         read(tmp_path / "a.json", (Channel("x", "m", 1.0, column="x"),))
 
 
+def write_npz(path: Path) -> None:
+    np.savez_compressed(path, time=COLUMNS["time"], x=COLUMNS["x"], F=COLUMNS["F"])
+
+
 WRITERS = {
+    "a.npz": write_npz,
     "a.parquet": write_parquet,
     "a.mat": write_mat,
     "b.mat": write_mat73,
@@ -99,6 +104,64 @@ def test_every_format_names_a_misspelt_column_and_refuses_what_it_is_not(tmp_pat
             read(tmp_path / name)
         assert str(error.value).startswith(str(tmp_path / name))
         assert "\n" not in str(error.value).strip()
+
+
+def test_numpy_tables_and_matrices(tmp_path: Path) -> None:
+    table = np.zeros(len(SECONDS), dtype=[("time", "f8"), ("x", "f4"), ("F", "f8")])
+    for name, values in COLUMNS.items():
+        table[name] = values
+    np.save(tmp_path / "table.npy", table)
+    x, f = (Channel(name, unit, 1.0, column=f"data.{name}") for name, unit in (("x", "m"), ("F", "N")))
+    _, values, _ = read(tmp_path / "table.npy", (x, f))
+    assert np.allclose(values, VALUES, atol=1e-7)
+    np.save(tmp_path / "matrix.npy", VALUES)
+    x, f = (Channel(name, "N", 1.0, column=f"data(:,{i})") for i, name in enumerate("xF", 1))
+    _, values, _ = read(tmp_path / "matrix.npy", (x, f), time=TimeColumn(rate=100.0))
+    np.testing.assert_array_equal(values, VALUES)
+
+
+def test_a_pickle_in_a_numpy_file_is_not_run(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object), allow_pickle=True)
+    with pytest.raises(UnreadableRecording, match="not a NumPy file that can be read"):
+        read(tmp_path / "a.npy")
+
+
+def _lvm(kind: str, point: str) -> str:
+    """As LabVIEW writes it: a header, a segment's header, rows, each ended by a comment's empty cell."""
+    head = [
+        *("LabVIEW Measurement\t", "Writer_Version\t2", "Reader_Version\t2", "Separator\tTab"),
+        *(f"Decimal_Separator\t{point}", "Multi_Headings\tNo", f"X_Columns\t{kind}", "Time_Pref\tRelative"),
+        *("***End_of_Header***\t", "\t", "Channels\t2\t\t", "Samples\t500\t500\t"),
+        *("Date\t2026/03/01\t2026/03/01\t", f"Time\t12:00:00{point}25\t12:00:00{point}25\t"),
+        *("Y_Unit_Label\tm\tN\t", f"X0\t0{point}0E+0\t0{point}0E+0\t", f"Delta_X\t0{point}01\t0{point}01\t"),
+        "***End_of_Header***\t\t\t",
+    ]
+    title = {"One": "X_Value\tx\tF", "Multi": "X_Value\tx\tX_Value\tF", "No": "X_Value\tx\tF"}[kind]
+    rows = []
+    for t, (x, f) in zip(SECONDS, VALUES, strict=True):
+        cells = {"One": (t, x, f), "Multi": (t, x, t, f), "No": ("", x, f)}[kind]
+        rows.append("\t".join(str(cell) for cell in cells).replace(".", point) + "\t")
+    return "\r\n".join([*head, title + "\tComment", *rows, ""])
+
+
+@pytest.mark.parametrize("kind", ["One", "Multi", "No"])
+@pytest.mark.parametrize("point", [".", ","])
+def test_labview_text_has_names_units_and_times(tmp_path: Path, kind: str, point: str) -> None:
+    (tmp_path / "a.lvm").write_text(_lvm(kind, point), newline="")
+    times, values, account = read(tmp_path / "a.lvm")
+    np.testing.assert_array_equal(values, VALUES)
+    assert datetime.fromtimestamp(times[0] / 1e9, UTC) == datetime(2026, 3, 1, 12, 0, 0, 250_000, tzinfo=UTC)
+    assert times[-1] - times[0] == 4_990_000_000 and not account.relative
+
+
+@pytest.mark.parametrize(
+    "damage", ["", "time,x\n1,2\n", _lvm("One", ".")[:300], _lvm("One", ".").replace("0.01", "often")]
+)
+def test_damaged_labview_text_is_refused_in_one_line(tmp_path: Path, damage: str) -> None:
+    (tmp_path / "a.lvm").write_text(damage)
+    with pytest.raises(UnreadableRecording) as error:
+        read(tmp_path / "a.lvm")
+    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("time", [TimeColumn("when"), TimeColumn()])
