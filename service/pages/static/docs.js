@@ -9,6 +9,7 @@ follow();
 const swagger = document.getElementById("swagger");
 const named = {
   "main#operations": () => ({ role: "group", "aria-label": "Operations" }), // the page has a main part already
+  "h1.title": () => ({ "aria-level": "2" }), // below the page's own
   "table.responses-table": (e) => ({ "aria-label": `Answers of ${operationOf(e)}` }),
   "select:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
   "textarea:not([aria-label])": (e) => ({ "aria-label": nameOf(e) }),
