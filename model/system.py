@@ -16,7 +16,7 @@ from sprung.model.laws import CATALOGUE, ElementLaw, Law
 from sprung.model.laws.in_place import Follower, Whole, all_in_place, misplaced
 from sprung.model.laws.placed import PlacedLaw, placed_laws
 from sprung.model.laws.undone import undone
-from sprung.model.mechanics import Mechanics, assemble
+from sprung.model.mechanics import Mechanics, Mode, assemble
 from sprung.model.parameters import LoadState, Parameter, Tolerance
 from sprung.model.schema import (
     RUNNING,
@@ -42,6 +42,7 @@ AXLE_STD = 0.03  # of an axle's mass that the file states without a deviation: w
 LOAD_STD = 0.15  # of the logarithm of a mass: a third more by passengers is two deviations
 USUAL_SPEED = 30.0  # m/s, taken for curves where only the yaw rate is measured
 COLDEST, HOTTEST = -70.0, 150.0  # degC; beyond, a probe is broken or short, and nobody knows the temperature
+_HELD = 1e-3  # Hz, a slower mode is one that nothing holds, but for rounding
 SHORTEST_TRACK = 10.0  # s, of a window of a vehicle whose wheels nobody measures
 
 
@@ -391,11 +392,21 @@ def checked(system: System, source: str) -> System:
         return system
     hidden = system.mechanics.unobservable_mode(system.bodies)
     if hidden is not None:
-        raise SystemFileError(
-            f"{source}: sensors: no sensor sees the {hidden.frequency:.3g} Hz mode of {hidden.body}; "
-            f"add a sensor on {hidden.body} (or on an element attached to it)"
-        )
+        raise SystemFileError(f"{source}: sensors: {_unseen(hidden)}")
     return system
+
+
+def _unseen(mode: Mode) -> str:
+    """That no sensor sees a mode, and what to do about it."""
+    if mode.frequency < _HELD:
+        return (
+            f"nothing holds {mode.body}, and no sensor sees where it drifts; add a displacement sensor on it, "
+            "or an element to ground that is too soft to matter, with fixed values"
+        )
+    return (
+        f"no sensor sees the {mode.frequency:.3g} Hz mode of {mode.body}; "
+        f"add a sensor on {mode.body} (or on an element attached to it)"
+    )
 
 
 def unsupported(file: SystemFile) -> list[str]:

@@ -149,3 +149,21 @@ def test_a_system_goes_to_another_process() -> None:
     system = load_system()
     copy = pickle.loads(pickle.dumps(system))
     assert copy.digest == system.digest and copy.catalogue is system.catalogue
+
+
+def test_a_body_that_nothing_holds_is_told_as_such() -> None:
+    """As in a drop test: accelerations do not tell where a free body is."""
+    text = """
+name: dropped
+sample_rate: 100
+window: 100
+bodies: {body: {mass: 400}, wheel: {mass: 25}}
+inputs:
+  ground_load: {kind: force, body: wheel, csv: g, noise: 10}
+elements:
+  oleo: {upper: body, lower: wheel, stiffness: 3.0e+4, damping: 4000}
+sensors:
+  acc: {kind: acceleration, body: body, csv: a, noise: 0.05}
+"""
+    with pytest.raises(SystemFileError, match=r"nothing holds body, and no sensor sees where it drifts; .*too soft"):
+        parse_system(text)
