@@ -12,6 +12,7 @@ from sprung.service.cli.console import print_table, width_of_output
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import plain_progress
 from sprung.service.cli.replay import closing_line, incomplete_line, readable
+from sprung.service.cli.targets import check_folder
 from sprung.service.core import Core
 from sprung.service.feed import Fed, OnBatch
 from sprung.service.logs import set_up
@@ -26,6 +27,7 @@ def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[st
         readable(path)
     settings = settings_with(options)
     set_up(settings.log_format, settings.log_level)
+    check_folder(settings.data_dir)  # before the model is loaded, which takes seconds
 
     def announce(address: str) -> None:
         print(

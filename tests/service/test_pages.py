@@ -107,7 +107,7 @@ def test_the_page_of_work_says_what_came_of_recordings_and_diagnoses(client: Tes
             work.add_job(connection, JobRow(str(number), kind, state, None, None, 1.0, result, error, number, number))
     page = client.get("/pages/work")
     assert page.status_code == 200, page.text
-    assert "7 windows used, 2 dropped" in page.text and "report: missing physics" in page.text
+    assert "7 windows used, 0 repaired, 2 dropped" in page.text and "report: missing physics" in page.text
     assert "the file is empty" in page.text
 
 

@@ -61,6 +61,7 @@ LONG = {
     "inspect": ["--write-system"],
     "export": ["--out"],
     "bench": ["--out", "--folder"],
+    "serve": ["--data-dir"],
 }
 
 
@@ -69,7 +70,8 @@ def test_what_cannot_be_written_is_told_before_the_work(
     command: str, option: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     target = "/proc/nowhere/x.csv" if option == "--folder" else "/proc/x.csv"
-    given = {"bench": ["sensors" if option == "--folder" else "concealed"], "train": [], "export": ["a"]}
+    given: dict[str, list[str]] = {"serve": []}
+    given |= {"bench": ["sensors" if option == "--folder" else "concealed"], "train": [], "export": ["a"]}
     given |= {"simulate": [str(MANCHESTER), "--inputs", str(RIDE)], "compare": [str(RIDE), str(RIDE)]}
     begun = time.monotonic()
     assert main([command, *given.get(command, [str(RIDE)]), option, target]) == 2
