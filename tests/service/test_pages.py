@@ -100,8 +100,11 @@ REPORTED = {"report": "one", "verdict": "missing_physics"}
 
 
 def test_the_page_of_work_says_what_came_of_recordings_and_diagnoses(client: TestClient, core: Core) -> None:
-    ended = [("recording", "done", RECORDED, None), ("diagnosis", "done", REPORTED, None), ("recording", "failed")]
-    ended[2] += (None, "the file is empty")
+    ended: list[tuple[str, str, dict[str, Any] | None, str | None]] = [
+        ("recording", "done", RECORDED, None),
+        ("diagnosis", "done", REPORTED, None),
+        ("recording", "failed", None, "the file is empty"),
+    ]
     with core.store.write() as connection:
         for number, (kind, state, result, error) in enumerate(ended):
             work.add_job(connection, JobRow(str(number), kind, state, None, None, 1.0, result, error, number, number))
