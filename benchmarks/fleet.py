@@ -23,17 +23,17 @@ from sprung.benchmarks.fleet_processes import busy_seconds
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
 from sprung.replay.writing import write_recording
-from sprung.service.compute import Compute
 from sprung.service.errors import UserError
-from sprung.service.feed import feed_file
 from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, engine_of, list_recordings, opened_store
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.spool import Spool
 from sprung.service.fleet.tasks import HereTasks, RayTasks, Tasks
-from sprung.service.pipeline import Pipeline
-from sprung.service.reading import Here, ReadRequest
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import feed_file
+from sprung.service.sources.reading import Here, ReadRequest
 
 Figures = Iterator[dict[str, Any]]
 FIRST = 1_790_000_000_000_000_000  # ns

@@ -32,7 +32,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from sprung.benchmarks.fleet_compare import differences
 from sprung.benchmarks.fleet_processes import descendants
 from sprung.model.identification.excitation import simulate_runs
-from sprung.service.compute import Compute
 from sprung.service.errors import UserError
 from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
@@ -41,7 +40,8 @@ from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.sending import HttpLink
 from sprung.service.fleet.spool import SpoolEntry
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import Store, open_store
 from sprung.service.store.schema import windows

@@ -20,11 +20,11 @@ from sqlalchemy import text
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.signals import Estimate, Window
-from sprung.service.compute import Compute
 from sprung.service.fleet import local_postgres as postgres
 from sprung.service.fleet.backfill import engine_of
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import ToFold
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import ToFold
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
 from sprung.service.store.archive import Archive

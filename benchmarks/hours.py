@@ -19,7 +19,7 @@ from sprung.benchmarks.generator.timetable import Service, draw_timetable
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.benchmarks.keeping import keep, kept
 from sprung.benchmarks.through import through
-from sprung.service.engine import Engine, load_engine
+from sprung.service.monitoring.engine import Engine, load_engine
 from sprung.service.settings import settings_with
 
 HOUR = 3600.0

@@ -26,7 +26,7 @@ from sprung.model.identification.identify import Identifier, load_identifier
 from sprung.model.identification.refine import Refiner
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import System, load_system
-from sprung.service.engine import load_engine
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import settings_with
 
 

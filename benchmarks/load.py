@@ -18,7 +18,7 @@ from sprung.benchmarks.generator.timetable import Service, Timetable, draw_timet
 from sprung.benchmarks.generator.vehicle import Vehicle, read_vehicle
 from sprung.benchmarks.through import through
 from sprung.model.system import load_system
-from sprung.service.engine import Engine, load_engine
+from sprung.service.monitoring.engine import Engine, load_engine
 from sprung.service.settings import settings_with
 
 RIDE = 120.0  # s from departure to departure

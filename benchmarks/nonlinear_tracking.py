@@ -28,7 +28,7 @@ from sprung.model.laws import CATALOGUE
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.system import MANCHESTER, System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerState
-from sprung.service.engine import make_tracker
+from sprung.service.monitoring.engine import make_tracker
 
 LAWS = ("coulomb_friction", "bump_stop", "bouc_wen")
 FIXED = ("smoothing", "beta", "n")  # what a window cannot tell

@@ -27,7 +27,7 @@ from sprung.model.identification.excitation import simulate_runs
 from sprung.model.signals import Window
 from sprung.model.system import System
 from sprung.service.core import Core, build_core
-from sprung.service.engine import load_engine
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import Settings
 from sprung.service.store import fleet, status
 from sprung.service.store.schema import rollups

@@ -19,12 +19,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from sprung.service import feed, reading
-from sprung.service.compute import Compute
-from sprung.service.engine import load_engine
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Batch
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import Batch
 from sprung.service.settings import Settings
+from sprung.service.sources import feed, reading
 from sprung.service.store import open_store
 
 RECORDING = Path(__file__).resolve().parents[1] / "tests" / "data" / "drift-600s.blf"

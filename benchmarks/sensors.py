@@ -24,7 +24,7 @@ from sprung.benchmarks.keeping import keep, kept
 from sprung.model.identification.identify import Identifier
 from sprung.model.system import BUNDLED, System, load_system
 from sprung.model.tracking.tracker import Tracker, TrackerState
-from sprung.service.engine import WEIGHED_OF, make_tracker
+from sprung.service.monitoring.engine import WEIGHED_OF, make_tracker
 
 Array = NDArray[np.float64]
 

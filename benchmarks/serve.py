@@ -25,10 +25,10 @@ from fastapi import FastAPI
 
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import build_core
-from sprung.service.engine import load_engine
-from sprung.service.numerics import numerics
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.numerics import numerics
 from sprung.service.settings import Settings
 
 TARGET_MS = 15.0

@@ -13,7 +13,7 @@ from sprung.benchmarks.generator.timetable import Timetable, channel_names
 from sprung.benchmarks.generator.vehicle import Vehicle
 from sprung.model.signals import Estimate, FloatArray
 from sprung.model.tracking.tracker import TrackerState
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 
 START = 1_790_000_000_000_000_000  # ns
 TOGETHER = 64  # windows of one batch

@@ -16,11 +16,11 @@ import typer
 
 from sprung.model.laws import CATALOGUE
 from sprung.model.systemfile import json_schema
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.cli import main as run
 from sprung.service.cli.app import app
 from sprung.service.core import build_core
-from sprung.service.engine import load_engine
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import Settings
 
 TARGET = Path(__file__).resolve().parent / "reference"

@@ -14,39 +14,39 @@ from prometheus_client import Histogram
 
 from sprung import __version__
 from sprung.model.signals import Tally
-from sprung.service.alarm_signals import AlarmSignals
-from sprung.service.batching import Batcher
-from sprung.service.board import Board
-from sprung.service.compute import Compute
+from sprung.service.access.oidc import Provider, provider_of
+from sprung.service.access.tokens import Tokens
 from sprung.service.condition import Condition
-from sprung.service.diagnoses import Diagnoses, DiagnosisJobs
-from sprung.service.engine import Engine
-from sprung.service.feed import OnTally
+from sprung.service.diagnosis.alarm_signals import AlarmSignals
+from sprung.service.diagnosis.reports import Diagnoses, DiagnosisJobs
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.telling import FleetTelling
-from sprung.service.following import Following, follow
 from sprung.service.housekeeping import Housekeeping
-from sprung.service.hub import Hub
-from sprung.service.jobs import Jobs, Kind
-from sprung.service.live import LiveFeed
-from sprung.service.metrics import Metrics
+from sprung.service.jobs.queue import Jobs, Kind
+from sprung.service.jobs.recordings import RecordingJobs
+from sprung.service.monitoring.batching import Batcher
+from sprung.service.monitoring.board import Board
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.following import Following, follow
+from sprung.service.monitoring.hub import Hub
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import Batch
+from sprung.service.monitoring.rides import RideCollector, Rides
+from sprung.service.monitoring.ring import Rings
+from sprung.service.monitoring.views import VehicleView, vehicle_view
 from sprung.service.notify.notices import Notices
-from sprung.service.oidc import Provider, provider_of
+from sprung.service.observability.metrics import Metrics
+from sprung.service.observability.queues import Waits
+from sprung.service.observability.vitals import Vitals, request_histogram
 from sprung.service.operations import Operations
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Batch
-from sprung.service.recordings import RecordingJobs
-from sprung.service.rides import RideCollector, Rides
-from sprung.service.ring import Rings
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import OnTally
+from sprung.service.sources.live import LiveFeed
 from sprung.service.store import Store, fleet, open_store, status
 from sprung.service.store.archive import Archive, open_archive
 from sprung.service.store.windows import latest_window
-from sprung.service.tokens import Tokens
 from sprung.service.upload_room import UploadRoom
-from sprung.service.views import VehicleView, vehicle_view
-from sprung.service.vitals import Vitals, request_histogram
-from sprung.service.waits import Waits
 
 log = logging.getLogger("sprung")
 

@@ -19,22 +19,22 @@ from typing import NoReturn
 from sprung.replay import UnreadableRecording
 from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
-from sprung.service.api.app import create_app
+from sprung.service.access.tokens import Tokens
 from sprung.service.api.guard import is_loopback
 from sprung.service.api.server import make_server
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
-from sprung.service.feed import Fed, OnBatch, feed_file, vehicle_of
-from sprung.service.live import LiveFeed
+from sprung.service.jobs.recordings import file_row, finish_row, reading_limits
 from sprung.service.lock import held
-from sprung.service.numerics import numerics
-from sprung.service.recordings import file_row, finish_row, reading_limits
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.numerics import numerics
+from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import Fed, OnBatch, feed_file, vehicle_of
+from sprung.service.sources.live import LiveFeed
 from sprung.service.store import open_store
 from sprung.service.store.work import add_recording
-from sprung.service.tokens import Tokens
-from sprung.service.worker import ProcessLimits
 
 log = logging.getLogger("sprung")
 

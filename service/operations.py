@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 
 from sqlalchemy import Connection
 
-from sprung.service.engines import ServedModel
 from sprung.service.errors import NotFound
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Batch
+from sprung.service.monitoring.engines import ServedModel
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import Batch
 from sprung.service.settings import Settings
 from sprung.service.store import audit, fleet, marks, status, vehicle_models
 from sprung.service.store.archive import Archive

@@ -23,11 +23,11 @@ from sprung.replay.auxiliary import AuxiliaryMeans
 from sprung.replay.record import Record
 from sprung.replay.recording import Recording
 from sprung.service.can_database import database_of
-from sprung.service.engine import Engine, make_tracker
-from sprung.service.following import Followed
-from sprung.service.opening import open_record, open_stream
-from sprung.service.reading import windower_of
+from sprung.service.monitoring.engine import Engine, make_tracker
+from sprung.service.monitoring.following import Followed
 from sprung.service.report import write_report
+from sprung.service.sources.opening import open_record, open_stream
+from sprung.service.sources.reading import windower_of
 from sprung.service.times import now_ns
 
 __all__ = [

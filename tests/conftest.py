@@ -17,14 +17,14 @@ import pytest
 
 from sprung.model.system import MANCHESTER_DBC, System, load_system
 from sprung.model.tracking.tracker import Tracker
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine, make_tracker
 from sprung.service.fleet import local_postgres as postgres_tests
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine, make_tracker
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.store import Store, open_store
 from tests.service_fakes import FakeIdentifier
 
-# a process for every file that a test reads would cost a second each; tests/service/test_apart.py has them
+# a process for every file that a test reads would cost a second each; tests/service/processes/test_apart.py has them
 os.environ.setdefault("SPRUNG_ISOLATE_READING", "false")
 
 

@@ -9,8 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from sprung.model.system import System
-from sprung.service.api.app import create_app
 from sprung.service.api.server import make_server
+from sprung.service.app import create_app
 from sprung.service.core import Core
 from tests.service_fakes import make_window
 

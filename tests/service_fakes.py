@@ -15,8 +15,8 @@ import numpy as np
 from sprung.model.identifier import StageTimes
 from sprung.model.signals import Estimate, FloatArray, Window
 from sprung.model.system import System
-from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
-from sprung.service.worker import Emit
+from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.processes.worker import Emit
 
 START = 1_790_000_000_000_000_000  # ns
 HOP = 500_000_000  # ns

@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sprung.service.worker import Emit, ProcessLimits, Worker
+from sprung.service.processes.worker import Emit, ProcessLimits, Worker
 
 if multiprocessing.current_process().name == "sprung-worker" and __name__ != "__mp_main__":
     Path(os.environ["SPRUNG_TEST_NOTE"]).write_text(str(os.getpid()))

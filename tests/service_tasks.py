@@ -8,7 +8,7 @@ import sys
 import time
 from pathlib import Path
 
-from sprung.service.worker import Emit, ProcessLimits, Worker
+from sprung.service.processes.worker import Emit, ProcessLimits, Worker
 
 
 def count(to: int, emit: Emit[int]) -> str:

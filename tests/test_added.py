@@ -20,7 +20,7 @@ from sprung.replay import recording
 from sprung.replay.writing import write_recording
 from sprung.service.cli import main
 from sprung.service.core import build_core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 
 READER = '''

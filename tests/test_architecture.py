@@ -44,6 +44,40 @@ ORDER = [
 ]
 _BELOW = ORDER[: ORDER.index("identification")]
 BESIDE = {"diagnosis": _BELOW, "exchange": _BELOW, "alps": ORDER}
+# Inside `service` every name imports only names to its left
+SERVICE_ORDER = (
+    "errors",
+    "times",
+    "settings",
+    "durable",
+    "lock",
+    "can_database",
+    "processes",
+    "store",
+    "migrations",
+    "condition",
+    "access",
+    "upload_room",
+    "monitoring",
+    "operations",
+    "housekeeping",
+    "sources",
+    "observability",
+    "jobs",
+    "report",
+    "diagnosis",
+    "backup",
+    "export",
+    "notify",
+    "fleet",
+    "core",
+    "rendering",
+    "api",
+    "pages",
+    "app",
+    "main",
+    "cli",
+)
 STAGES = (
     "rules",
     "record",
@@ -77,9 +111,9 @@ EXTRAS = {
 OF_POSIX = {"fcntl", "resource"}
 LATE_OUTSIDE = {
     "service/cli/": "a command loads what it needs when it is called: `--help` is there in a tenth of a second",
-    "service/engine.py": "torch, which processes that are forked before it may not have loaded",
-    "service/simulated.py": "torch, the same",
-    "service/diagnosing.py": "threads of linear algebra are bounded before it is loaded",
+    "service/monitoring/engine.py": "torch, which processes that are forked before it may not have loaded",
+    "service/monitoring/simulated.py": "torch, the same",
+    "service/diagnosis/worker.py": "threads of linear algebra are bounded before it is loaded",
 }
 CORE_KNOWS = {"numpy", "scipy", "torch", "torchdiffeq", "pydantic", "pydantic_core", "yaml", "safetensors"}
 STANDARD_BUT_NOT_FOR_THE_CORE = {"socket", "http", "sqlite3", "logging", "argparse", "asyncio"}
@@ -216,6 +250,17 @@ def test_the_diagnosis_is_built_in_one_order() -> None:
     assert wrong == []
 
 
+def test_the_service_is_built_in_one_order() -> None:
+    wrong = []
+    for name, targets in edges().items():
+        for target in targets:
+            if name.startswith("service.") and target.startswith("service."):
+                upper, lower = name.split(".")[1], target.split(".")[1]
+                if SERVICE_ORDER.index(lower) > SERVICE_ORDER.index(upper):
+                    wrong.append(f"{name} imports {target}")
+    assert wrong == []
+
+
 def test_class_names_are_unique() -> None:
     named = defaultdict(list)
     files = [path for folder in (*OURS, "tests") for path in modules(folder)] + sorted((ROOT / "sprung").glob("*.py"))
@@ -298,7 +343,7 @@ def test_status_codes_of_http_are_given_in_one_folder() -> None:
         for path in modules("service")
         if any(name.split(".")[0] in ("fastapi", "starlette") for name in imported(path))
     ]
-    assert all(name.startswith(("service/api/", "service/pages/")) for name in users), users
+    assert all(name.startswith(("service/api/", "service/pages/", "service/app.py")) for name in users), users
 
 
 def test_the_shared_vocabulary_is_a_leaf() -> None:

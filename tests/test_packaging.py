@@ -21,10 +21,10 @@ from setuptools import find_packages
 
 from sprung.model.signals import Tally
 from sprung.model.system import System
-from sprung.service.board import Board
-from sprung.service.engine import Engine
-from sprung.service.metrics import Metrics
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.board import Board
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.observability.metrics import Metrics
 from tests.service_fakes import make_window
 
 ROOT = Path(__file__).parent.parent

@@ -22,10 +22,10 @@ from sprung.model.simulate.ride import simulate_ride
 from sprung.model.system import System
 from sprung.replay.writing import write_recording
 from sprung.service.core import build_core
-from sprung.service.engine import Engine
-from sprung.service.feed import feed_file
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import feed_file
 from tests.served import served
 from tests.service_fakes import make_window
 

@@ -11,12 +11,12 @@ from fastapi.responses import Response
 from pydantic import TypeAdapter
 from sqlalchemy import Connection
 
+from sprung.service.access.tokens import Actor
 from sprung.service.api.clients import client_of
 from sprung.service.api.problems import ApiProblem
 from sprung.service.core import Core
 from sprung.service.store import audit
 from sprung.service.times import now_ns
-from sprung.service.tokens import Actor
 
 T = TypeVar("T")
 

@@ -15,8 +15,8 @@ from sprung.model.system import System
 from sprung.model.text import CONTROL, UNSEEN
 from sprung.service.api.problems import SHOWN_ERRORS, ApiProblem, from_validation
 from sprung.service.api.twice import keys_twice
-from sprung.service.engine import Engine
 from sprung.service.fleet.message import SentWindows
+from sprung.service.monitoring.engine import Engine
 from sprung.service.times import NANOSECONDS, from_iso, to_iso
 
 VehicleId = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9._:-]{0,127}$")]

@@ -9,9 +9,9 @@ from sqlalchemy import Connection
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.circumstance_models import CircumstancesAnswer
 from sprung.service.api.queries import FOREVER, Id, Since, Until, time_of
+from sprung.service.monitoring.views import UNITS
 from sprung.service.store import fleet
 from sprung.service.store.circumstances import RanSeries, circumstances_between
-from sprung.service.views import UNITS
 
 router = APIRouter(tags=["vehicles"])
 MOST_POINTS = 2000

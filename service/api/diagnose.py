@@ -10,6 +10,7 @@ from fastapi.responses import HTMLResponse, PlainTextResponse, RedirectResponse,
 from pydantic import ValidationError
 from sqlalchemy import Connection
 
+from sprung.service.access.tokens import Actor
 from sprung.service.api import job_models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, note, own_vehicle, read
 from sprung.service.api.bodies import DiagnoseBody
@@ -20,13 +21,12 @@ from sprung.service.api.scopes import FORM, content_kind
 from sprung.service.api.uploads import BODY as UPLOAD
 from sprung.service.api.uploads import receive
 from sprung.service.core import Core
-from sprung.service.diagnosis_task import IMPROVED
+from sprung.service.diagnosis.task import IMPROVED
 from sprung.service.errors import NotFound
-from sprung.service.links import with_links
 from sprung.service.notify.events import vehicle_page
+from sprung.service.report.links import with_links
 from sprung.service.store import fleet, work
 from sprung.service.store.work import JobRow, RecordingRow, ReportRow
-from sprung.service.tokens import Actor
 
 router = APIRouter(tags=["diagnosis"])
 MOST_REFERENCE_BYTES = 4096

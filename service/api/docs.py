@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import FileResponse, HTMLResponse, JSONResponse
 
-from sprung.service.pages.render import STATIC, render
+from sprung.service.rendering.render import STATIC, render
 
 router = APIRouter(include_in_schema=False)
 

@@ -12,7 +12,7 @@ from fastapi.responses import Response, StreamingResponse
 
 from sprung.service.api.access import ClientOf, CoreOf
 from sprung.service.core import Core
-from sprung.service.hub import Listener
+from sprung.service.monitoring.hub import Listener
 from sprung.service.times import optional_iso
 
 router = APIRouter(tags=["vehicles"])

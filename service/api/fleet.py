@@ -12,13 +12,13 @@ from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.queries import After, Id, Limit, with_cursor
 from sprung.service.core import Core
-from sprung.service.engines import ServedModel
+from sprung.service.monitoring.engines import ServedModel
+from sprung.service.monitoring.views import VehicleView, alarm_dict, vehicle_view
 from sprung.service.store import fleet, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.status import FleetRow, Sort, Wanted
 from sprung.service.store.windows import latest_window
 from sprung.service.times import NANOSECONDS, now_ns, optional_iso, to_iso
-from sprung.service.views import VehicleView, alarm_dict, vehicle_view
 
 router = APIRouter(tags=["vehicles"])
 SHOWN_ALARMS = 1000  # active ones of one vehicle

@@ -20,14 +20,14 @@ from starlette.concurrency import run_in_threadpool
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from sprung.service.access.oidc import AGAIN_SECONDS, Provider, Unreachable, looks_like_jwt
+from sprung.service.access.tokens import Actor, Refused, Tokens, digest_of
 from sprung.service.api.clients import client_of
 from sprung.service.api.problems import ApiProblem, problem_page, problem_response, wants_page
 from sprung.service.api.scopes import ADMIN, VEHICLE_PATH, Need, content_kind, need_of, place_of
-from sprung.service.logs import request_id
-from sprung.service.oidc import AGAIN_SECONDS, Provider, Unreachable, looks_like_jwt
-from sprung.service.pages.render import signed_in
+from sprung.service.observability.logs import request_id
+from sprung.service.rendering.render import signed_in
 from sprung.service.settings import Settings
-from sprung.service.tokens import Actor, Refused, Tokens, digest_of
 
 log = logging.getLogger("sprung.requests")
 COOKIE = "sprung_session"

@@ -17,15 +17,15 @@ from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.fleet import load_view
 from sprung.service.api.queries import FOREVER, Id, Since, Until, resolution_of, time_of, wrong_query
 from sprung.service.core import Core
-from sprung.service.engine import Engine
-from sprung.service.engines import ServedModel
 from sprung.service.errors import NotFound, UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.engines import ServedModel
+from sprung.service.monitoring.views import VehicleView, known_limit
 from sprung.service.store import fleet
 from sprung.service.store import history as store_history
 from sprung.service.store.history import Series
 from sprung.service.times import to_iso
-from sprung.service.views import VehicleView, known_limit
 
 router = APIRouter(tags=["vehicles"])
 

@@ -10,17 +10,17 @@ from fastapi.responses import Response
 
 from sprung.model.identifier import UnusableWindow
 from sprung.model.signals import Estimate, FloatArray
+from sprung.service.access.tokens import Actor
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, own_vehicle
 from sprung.service.api.bodies import WindowBody, read_window, start_of
 from sprung.service.api.problems import ApiProblem
-from sprung.service.batching import AskedWindow
 from sprung.service.core import Core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.batching import AskedWindow
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.views import fit_dict, physical, sensor_dict
 from sprung.service.store.windows import Solved
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.tokens import Actor
-from sprung.service.views import fit_dict, physical, sensor_dict
 
 router = APIRouter(tags=["identify"])
 

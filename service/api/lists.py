@@ -14,11 +14,11 @@ from sprung.service.api.access import CoreOf, json_response, read
 from sprung.service.api.queries import After, Limit, Since, time_of, with_cursor
 from sprung.service.api.recordings import job_dict
 from sprung.service.core import Core
+from sprung.service.monitoring.views import alarm_dict
 from sprung.service.store import fleet, lists
 from sprung.service.store.cursors import whole_number
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.views import alarm_dict
 
 router = APIRouter()
 OfVehicle = Annotated[str | None, Query(max_length=128)]

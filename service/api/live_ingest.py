@@ -1,7 +1,7 @@
 """The door of the fleet variant: estimates and windows in, handed to whoever identifies and folds.
 
 It is the same guard, the same bodies and the same answers as in the single process; behind it is anything that
-implements `Behind`, such as Ray Serve (`service.fleet.ray_serving`).
+implements `Behind`, such as Ray Serve (`service.api.ray_serving`).
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
 from sprung import __version__
+from sprung.service.access.tokens import Tokens
 from sprung.service.api import models, problems
 from sprung.service.api.access import ActorOf, json_response, own_vehicle
 from sprung.service.api.bodies import VehicleId, read_windows
 from sprung.service.api.guard import Guard
 from sprung.service.api.limits import BodyLimit
 from sprung.service.api.problems import ApiProblem
-from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.fleet.ingest import OtherModel, Taken, read_messages
 from sprung.service.fleet.message import SentWindows
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 from sprung.service.times import now_ns
-from sprung.service.tokens import Tokens
 
 _ID: TypeAdapter[str] = TypeAdapter(VehicleId)
 

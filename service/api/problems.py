@@ -20,7 +20,7 @@ from starlette.requests import ClientDisconnect
 from starlette.routing import BaseRoute, Match, Route
 
 from sprung.service.errors import NO_THREAD, Busy, NoSpace, NotFound, TooManyOfOne, UserError
-from sprung.service.pages.render import render
+from sprung.service.rendering.render import render
 
 MEDIA_TYPE = "application/problem+json"
 SHOWN_ERRORS = 20  # of a body with thousands of wrong numbers

@@ -13,22 +13,22 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import Response
 from sqlalchemy import Connection
 
-from sprung.service import alarm_signals
-from sprung.service.alarm_signals import Stretch
 from sprung.service.api import models
 from sprung.service.api.access import CoreOf, json_response, known_vehicle, read
 from sprung.service.api.head import headers_only
 from sprung.service.api.queries import FOREVER, Id
-from sprung.service.compute import Priority
 from sprung.service.core import Core
-from sprung.service.engines import ServedModel
+from sprung.service.diagnosis import alarm_signals
+from sprung.service.diagnosis.alarm_signals import Stretch
 from sprung.service.errors import NotFound
 from sprung.service.export.bundle import BUNDLE_MEDIA, Bundle, bundle
-from sprung.service.simulated import Compared, compare, compare_all, newest_window, whole_windows
+from sprung.service.monitoring.compute import Priority
+from sprung.service.monitoring.engines import ServedModel
+from sprung.service.monitoring.simulated import Compared, compare, compare_all, newest_window, whole_windows
+from sprung.service.monitoring.views import finite
 from sprung.service.store import fleet, history, marks, work
 from sprung.service.store.fleet import AlarmRow, WantedAlarms
 from sprung.service.times import NANOSECONDS, to_iso
-from sprung.service.views import finite
 
 router = APIRouter(tags=["vehicles"])
 DIGITS = 5

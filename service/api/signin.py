@@ -12,13 +12,13 @@ from fastapi import APIRouter, Query, Request
 from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
+from sprung.service.access.oidc import CALLBACK, Provider, Unreachable
+from sprung.service.access.tokens import SESSION_SECONDS, Refused
 from sprung.service.api.access import CoreOf, note
 from sprung.service.api.guard import COOKIE, session_of
 from sprung.service.core import Core
 from sprung.service.errors import NotFound
-from sprung.service.oidc import CALLBACK, Provider, Unreachable
-from sprung.service.pages.render import render
-from sprung.service.tokens import SESSION_SECONDS, Refused
+from sprung.service.rendering.render import render
 
 pages = APIRouter(include_in_schema=False)
 returns = APIRouter(include_in_schema=False)  # where providers send browsers back, with parameters of their own

@@ -10,6 +10,7 @@ from fastapi.responses import PlainTextResponse, Response
 from pydantic import ConfigDict, Field
 from sqlalchemy import Connection
 
+from sprung.service.access.tokens import Actor
 from sprung.service.api import models
 from sprung.service.api.access import ActorOf, CoreOf, json_response, known_vehicle, read
 from sprung.service.api.bodies import StrictBody
@@ -18,12 +19,11 @@ from sprung.service.api.idempotency import OnceOf
 from sprung.service.api.problems import ApiProblem
 from sprung.service.api.queries import Id, Version
 from sprung.service.core import Core
-from sprung.service.diagnosis_task import IMPROVED
+from sprung.service.diagnosis.task import IMPROVED
 from sprung.service.errors import NotFound, UserError
 from sprung.service.store import fleet, vehicle_models, work
 from sprung.service.store.vehicle_models import SERVICE_FILE, ModelVersion
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.tokens import Actor
 
 router = APIRouter(tags=["operation"])
 MOST_CHARACTERS = 500_000  # of a system file

@@ -9,10 +9,10 @@ from typing import TypeVar
 
 from sprung.replay.inspection import Inspection
 from sprung.replay.record import Record
-from sprung.service.loading import InspectionRequest, RecordRequest, inspect_task, load_task
-from sprung.service.reading import SLOWEST_BYTES_PER_SECOND, Reading, ReadRequest, ReadWindows, reading_of
+from sprung.service.processes.worker import ProcessLimits, Task, carried_out
 from sprung.service.settings import Settings, settings_with
-from sprung.service.worker import ProcessLimits, Task, carried_out
+from sprung.service.sources.loading import InspectionRequest, RecordRequest, inspect_task, load_task
+from sprung.service.sources.reading import SLOWEST_BYTES_PER_SECOND, Reading, ReadRequest, ReadWindows, reading_of
 
 Request = TypeVar("Request")
 Result = TypeVar("Result")

@@ -11,7 +11,7 @@ from sprung import __version__
 from sprung.service.cli import fleet_commands, store_commands
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
 from sprung.service.cli.plain import PlainTyper
-from sprung.service.threads import hand_over_often, one_thread_each
+from sprung.service.processes.threads import hand_over_often, one_thread_each
 
 app = PlainTyper(
     name="sprung",

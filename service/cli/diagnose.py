@@ -20,10 +20,10 @@ from sprung.service.cli.console import errors, silent_stage, stages
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
 from sprung.service.cli.targets import check_file, check_folder
-from sprung.service.diagnosing import load_excerpt
-from sprung.service.improved import left_out, write_improved
-from sprung.service.loading import RecordRequest
-from sprung.service.own_laws import write_laws
+from sprung.service.diagnosis.improved import left_out, write_improved
+from sprung.service.diagnosis.own_laws import write_laws
+from sprung.service.diagnosis.worker import load_excerpt
+from sprung.service.sources.loading import RecordRequest
 
 
 @dataclass(frozen=True)

@@ -18,17 +18,17 @@ from sprung.replay.bus import parse_bus
 from sprung.replay.live import LiveBus
 from sprung.service.cli import apart
 from sprung.service.cli.replay import readable
-from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
-from sprung.service.feed import vehicle_of
 from sprung.service.fleet.nats_broker import NatsLink
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.sending import HttpLink, Link, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool
-from sprung.service.live import LiveFeed
-from sprung.service.logs import set_up
-from sprung.service.reading import ReadRequest
+from sprung.service.monitoring.engine import Engine, load_engine
+from sprung.service.observability.logs import set_up
 from sprung.service.settings import Settings, settings_with
+from sprung.service.sources.feed import vehicle_of
+from sprung.service.sources.live import LiveFeed
+from sprung.service.sources.reading import ReadRequest
 
 log = logging.getLogger("sprung.edge")
 LAST_SECONDS = 20.0  # to send what is left when it stops

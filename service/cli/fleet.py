@@ -15,28 +15,28 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from sprung.service.access.tokens import Tokens
+from sprung.service.api import ray_serving
+from sprung.service.api.ray_serving import ServingSizes
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_folder
-from sprung.service.compute import Compute
-from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
-from sprung.service.fleet import ray_serving
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings
 from sprung.service.fleet.broker import Broker, ConsumerCounts, consume
 from sprung.service.fleet.ingest import Ingest
 from sprung.service.fleet.kafka_broker import open_kafka
 from sprung.service.fleet.many import diagnose_many
 from sprung.service.fleet.nats_broker import NatsBroker, ack_seconds, without_password
-from sprung.service.fleet.ray_serving import ServingSizes
 from sprung.service.fleet.tasks import tasks_for
-from sprung.service.logs import set_up
 from sprung.service.main import access_notice, announce_access
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.observability.logs import set_up
 from sprung.service.settings import settings_with
 from sprung.service.store import open_store
 from sprung.service.store.partitions import prepare
 from sprung.service.times import NANOSECONDS, now_ns
-from sprung.service.tokens import Tokens
 
 FOREVER = 2**62
 

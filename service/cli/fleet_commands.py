@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from sprung.service.cli.options import Dbc, Json, StoreUrl, System, Weights
-from sprung.service.threads import one_thread_each
+from sprung.service.processes.threads import one_thread_each
 
 Place = Annotated[str, typer.Argument(help="Folder of recordings, or an address such as s3://bucket/folder.")]
 On = Annotated[str, typer.Option("--on", help="here, ray, or auto: Ray where it is installed.")]
@@ -135,8 +135,8 @@ def serve(
 ) -> int:
     """Ingest on Ray Serve: POST /ingest/estimates and /ingest/windows, identified in batches, folded into one store."""
     one_thread_each()
+    from sprung.service.api.ray_serving import ServingSizes
     from sprung.service.cli.fleet import run_serve
-    from sprung.service.fleet.ray_serving import ServingSizes
 
     options = {"system": system, "weights": weights, "store": store, "host": host, "port": port}
     return run_serve(options, ServingSizes(replicas=replicas, cores=cores), ray_address, workers)

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from sprung.service.cli.options import time_of
 from sprung.service.cli.targets import check_file
-from sprung.service.engine import load_engine
 from sprung.service.errors import UserError
 from sprung.service.export.tables import MEDIA_TYPES, history_file
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import settings_with
 from sprung.service.store import fleet, history, open_store
 from sprung.service.store.archive import open_archive

@@ -19,7 +19,7 @@ from sprung.service.cli import apart
 from sprung.service.cli.console import print_table
 from sprung.service.cli.targets import check_file
 from sprung.service.errors import UserError
-from sprung.service.loading import InspectionRequest
+from sprung.service.sources.loading import InspectionRequest
 from sprung.service.times import to_iso
 
 

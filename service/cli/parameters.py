@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.table import Table
 from rich.text import Text
 
-from sprung.service.pages.render import percent, quantity
-from sprung.service.views import VehicleView
+from sprung.service.monitoring.views import VehicleView
+from sprung.service.rendering.render import percent, quantity
 
 COLUMNS = {  # of the table of parameters, and the width from which they are shown
     "parameter": 0,

@@ -10,8 +10,8 @@ from contextlib import contextmanager
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from sprung.service.cli.console import errors
-from sprung.service.feed import OnBatch
-from sprung.service.processed import Batch
+from sprung.service.monitoring.processed import Batch
+from sprung.service.sources.feed import OnBatch
 
 PLAIN_SECONDS = 2.0  # between lines where there is no terminal
 

@@ -17,17 +17,17 @@ from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.progress import progress
 from sprung.service.cli.starts import start_time
 from sprung.service.cli.stdin import CALLED, spooled
-from sprung.service.compute import Compute
-from sprung.service.engine import load_engine
-from sprung.service.feed import Fed, comfort_dict, feed_file
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Batch
-from sprung.service.recordings import file_row, finish_row
+from sprung.service.jobs.recordings import file_row, finish_row
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import load_engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import Batch
+from sprung.service.monitoring.views import VehicleView, alarm_dict, load_parameters, told, vehicle_view, window_dict
+from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import settings_with
+from sprung.service.sources.feed import Fed, comfort_dict, feed_file
 from sprung.service.store import Store, open_store, work
 from sprung.service.times import to_iso
-from sprung.service.views import VehicleView, alarm_dict, load_parameters, told, vehicle_view, window_dict
-from sprung.service.worker import ProcessLimits
 
 SLACK_SECONDS = 3.0  # to start
 KEPT_UP = 0.9  # of the speed asked for

@@ -14,11 +14,11 @@ from sprung.service.cli.progress import plain_progress
 from sprung.service.cli.replay import closing_line, incomplete_line, readable
 from sprung.service.cli.targets import check_folder
 from sprung.service.core import Core
-from sprung.service.feed import Fed, OnBatch
-from sprung.service.logs import set_up
 from sprung.service.main import Feeds, serve
+from sprung.service.monitoring.views import vehicle_view
+from sprung.service.observability.logs import set_up
 from sprung.service.settings import settings_with
-from sprung.service.views import vehicle_view
+from sprung.service.sources.feed import Fed, OnBatch
 
 
 def run(options: dict[str, Any], files: list[Path], speed: float, buses: list[str], vehicle: str | None) -> int:

@@ -16,9 +16,9 @@ from sprung.replay.writing import WRITERS, UnwritableRecording, write_recording
 from sprung.service.can_database import database_of
 from sprung.service.cli import apart
 from sprung.service.cli.targets import check_file, check_folder
-from sprung.service.comparison import SYSTEM_FILES, Comparison, compare
 from sprung.service.errors import UserError
-from sprung.service.loading import RecordRequest
+from sprung.service.report.recordings import SYSTEM_FILES, Comparison, compare
+from sprung.service.sources.loading import RecordRequest
 
 
 def simulate(

@@ -19,7 +19,7 @@ from sprung.model.system import MANCHESTER, System, load_system, parse_system
 from sprung.model.systemfile import json_schema
 from sprung.service.cli.export import export, left_out
 from sprung.service.cli.targets import check_file
-from sprung.service.pages.render import quantity
+from sprung.service.rendering.render import quantity
 
 KNOWN_SHARE = 0.5  # of the prior's standard deviation, above which one window tells nothing worth having
 

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from sprung.service.access.tokens import Tokens
 from sprung.service.errors import UserError
 from sprung.service.settings import settings_with
 from sprung.service.store import open_store
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.tokens import Tokens
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from sprung.service.cli import apart
 from sprung.service.cli.console import errors
 from sprung.service.cli.targets import check_folder
 from sprung.service.errors import UserError
-from sprung.service.reading import ReadRequest
+from sprung.service.sources.reading import ReadRequest
 
 OPTIONAL = (
     "training is optional: without weights every window is refined from the nominal values, to the same result; "

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sprung.service.alarm_signals import Stretch
-from sprung.service.engine import Engine
+from sprung.service.diagnosis.alarm_signals import Stretch
 from sprung.service.export.messages import COMPARED, ESTIMATE, FIT, SIGNAL, McapSink
 from sprung.service.export.tables import estimate, values_of
-from sprung.service.ring import Excerpt
-from sprung.service.simulated import Compared
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.ring import Excerpt
+from sprung.service.monitoring.simulated import Compared
+from sprung.service.monitoring.views import told
 from sprung.service.store.fleet import AlarmRow
 from sprung.service.store.history import Series
 from sprung.service.store.marks import MarkRow
 from sprung.service.times import NANOSECONDS
-from sprung.service.views import told
 
 BUNDLE_MEDIA = "application/octet-stream"
 INFO, WARNING, ERROR = 2, 3, 4  # levels of foxglove.Log

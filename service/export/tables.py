@@ -9,12 +9,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sprung.model.signals import FloatArray
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.export.messages import ESTIMATE, McapSink
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.views import known_limit
 from sprung.service.store.history import Series
 from sprung.service.times import to_iso
-from sprung.service.views import known_limit
 
 MEDIA_TYPES = {
     "csv": "text/csv; charset=utf-8",

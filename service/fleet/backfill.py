@@ -20,23 +20,23 @@ from typing import Any
 import numpy as np
 
 from sprung.model.signals import Window
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine, load_engine
 from sprung.service.errors import UserError
-from sprung.service.feed import vehicle_of
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
 from sprung.service.fleet.tasks import Tasks, WorkLost
-from sprung.service.loading import RecordRequest, head_task
-from sprung.service.pipeline import Pipeline
-from sprung.service.reading import ReadRequest, reading_of
-from sprung.service.recordings import reading_limits
+from sprung.service.jobs.recordings import reading_limits
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine, load_engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.processes.worker import ProcessLimits, carried_out
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import vehicle_of
+from sprung.service.sources.loading import RecordRequest, head_task
+from sprung.service.sources.reading import ReadRequest, reading_of
 from sprung.service.store import Store, fleet, open_store, status, work
 from sprung.service.store.partitions import prepare
 from sprung.service.store.staging import staging_digest, swap
 from sprung.service.store.work import RecordingRow
 from sprung.service.times import now_ns
-from sprung.service.worker import ProcessLimits, carried_out
 
 KINDS = (".mcap", ".blf", ".asc", ".log", ".mf4", ".csv", ".parquet", ".mat", ".h5", ".hdf5", ".tdms")
 AHEAD = 4  # files a core that may be identified before their turn: bounds what waits in memory or on disk

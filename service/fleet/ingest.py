@@ -16,11 +16,11 @@ import numpy as np
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import Message, UnreadableMessage, WindowEstimate, decode, encode
-from sprung.service.pipeline import Pipeline
-from sprung.service.processed import Folded, HeldVehicle, ToFold
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.monitoring.processed import Folded, HeldVehicle, ToFold
 from sprung.service.store import pending
 from sprung.service.store.partitions import prepare
 from sprung.service.store.pending import Waiting

@@ -12,8 +12,8 @@ from typing import Any
 from sprung import __version__
 from sprung.model.system import MANCHESTER, load_system
 from sprung.service.can_database import database_of
-from sprung.service.diagnosing import run
-from sprung.service.diagnosis_task import DiagnosisRequest
+from sprung.service.diagnosis.task import DiagnosisRequest
+from sprung.service.diagnosis.worker import run
 from sprung.service.durable import sync_file
 from sprung.service.errors import UserError
 from sprung.service.fleet.backfill import FoundFile, list_recordings, local_copy, told_of

@@ -16,12 +16,12 @@ import numpy as np
 from sprung.model.signals import Estimate, Window
 from sprung.model.tracking.tracker import TrackerState
 from sprung.replay.writing import write_recording
-from sprung.service.compute import Priority
-from sprung.service.engine import Engine
 from sprung.service.fleet.message import Message, WindowEstimate, encode
 from sprung.service.fleet.spool import Spool
-from sprung.service.following import Followed
-from sprung.service.ring import Rings
+from sprung.service.monitoring.compute import Priority
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.following import Followed
+from sprung.service.monitoring.ring import Rings
 from sprung.service.times import NANOSECONDS, now_ns, to_iso
 
 log = logging.getLogger("sprung.edge")

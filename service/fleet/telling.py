@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from sprung.service.engine import Engine
 from sprung.service.fleet.knowledge import FleetKnowledge, Standing, fastest, knowledge, sure_slope, worst
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.views import known_limit
 from sprung.service.store import Store
 from sprung.service.store.levels import fleet_levels
 from sprung.service.times import NANOSECONDS, now_ns, to_iso
-from sprung.service.views import known_limit
 
 DAYS = 60
 AHEAD_DAYS = (30, 90, 365)

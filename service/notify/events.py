@@ -6,9 +6,9 @@ import uuid
 from typing import Any
 from urllib.parse import quote
 
+from sprung.service.monitoring.views import finite, spoken, unclear
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.times import optional_iso, to_iso
-from sprung.service.views import finite, spoken, unclear
 
 ALARM_TYPES = {"opened": "sprung.alarm.opened", "changed": "sprung.alarm.changed", "closed": "sprung.alarm.closed"}
 REPORT_READY = "sprung.report.ready"

@@ -17,11 +17,11 @@ from typing import Any
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from sprung.service import outside
+from sprung.service.access import outside
 from sprung.service.errors import UserError
-from sprung.service.live import FeedStatus
 from sprung.service.notify import events, senders
 from sprung.service.settings import Settings
+from sprung.service.sources.live import FeedStatus
 from sprung.service.store import Store, outbox
 from sprung.service.store.fleet import AlarmChange
 from sprung.service.store.outbox import DeliveryRow

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from email.message import EmailMessage
 from typing import Any
 
-from sprung.service import outside
+from sprung.service.access import outside
 from sprung.service.notify.events import sentence
 from sprung.service.settings import Settings
 

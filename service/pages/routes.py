@@ -16,8 +16,8 @@ from sprung.service.api.access import ActorOf, CoreOf, read
 from sprung.service.api.fleet import silent_before
 from sprung.service.api.queries import one_of
 from sprung.service.fleet.telling import knowledge_dict
-from sprung.service.pages.drawing import columns, small_view
-from sprung.service.pages.render import render
+from sprung.service.rendering.drawing import columns, small_view
+from sprung.service.rendering.render import render
 from sprung.service.store import status
 from sprung.service.store.status import Sort, Wanted
 

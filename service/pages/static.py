@@ -14,7 +14,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from sprung.service.pages.render import STATIC
+from sprung.service.rendering.render import STATIC
 
 PIECE = 1 << 16  # bytes handed to a connection at a time: it holds no more of what its client does not take
 

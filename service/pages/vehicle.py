@@ -18,17 +18,17 @@ from sprung.service.api.history import MAX_POINTS, served_by
 from sprung.service.api.lists import report_dict
 from sprung.service.api.queries import FOREVER, Since, Until, time_of
 from sprung.service.api.vehicle_model import models_answer
-from sprung.service.diagnosis_task import IMPROVED
-from sprung.service.pages.drawing import Mark, plan_view, side_view
-from sprung.service.pages.render import percent, render
+from sprung.service.diagnosis.task import IMPROVED
+from sprung.service.monitoring.views import ParameterView, VehicleView, alarm_dict, suspected
 from sprung.service.pages.routes import HEALTH
-from sprung.service.pages.states import hints
+from sprung.service.rendering.drawing import Mark, plan_view, side_view
+from sprung.service.rendering.render import percent, render
+from sprung.service.rendering.states import hints
 from sprung.service.store import fleet, lists, marks, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.standing import UNINFORMATIVE, standing_points
 from sprung.service.store.status import FleetRow
 from sprung.service.times import NANOSECONDS, to_iso
-from sprung.service.views import ParameterView, VehicleView, alarm_dict, suspected
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50  # alarms, marks, reports

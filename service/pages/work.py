@@ -12,11 +12,11 @@ from sprung.replay.recording import EXTENSIONS
 from sprung.service.api.access import CoreOf, read
 from sprung.service.api.lists import delivery_dict, report_dict
 from sprung.service.api.recordings import job_dict
-from sprung.service.pages.render import render
+from sprung.service.monitoring.views import alarm_dict
 from sprung.service.pages.routes import linker
+from sprung.service.rendering.render import render
 from sprung.service.store import fleet, lists
 from sprung.service.store.fleet import WantedAlarms
-from sprung.service.views import alarm_dict
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 30

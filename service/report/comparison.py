@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from scipy import signal
 
 from sprung.model.signals import FloatArray
-from sprung.service.comparison import Comparison
 from sprung.service.report import ink
+from sprung.service.report.recordings import Comparison
 
 SHOWN = 4  # sensors
 LOOPS = 4  # elements

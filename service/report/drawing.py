@@ -14,8 +14,8 @@ from matplotlib.patches import Circle, Polygon
 
 from sprung.model.schema import ElementSensor, ForceInput
 from sprung.model.system import System
-from sprung.service.layout import Layout, Point, lay_out
 from sprung.service.report import ink
+from sprung.service.report.layout import Layout, Point, lay_out
 
 WIDTH, NARROWEST, TALLEST = 10.5, 3.2, 5.6  # in
 WORDS_BESIDE = 3.6  # in, of what was found

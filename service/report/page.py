@@ -12,8 +12,8 @@ from jinja2 import Environment, StrictUndefined
 from markupsafe import Markup
 
 from sprung.model.diagnosis.report.report import Report
-from sprung.service.links import BACK
 from sprung.service.report import words
+from sprung.service.report.links import BACK
 from sprung.service.report.values import rows
 
 TEMPLATES = Path(__file__).parent / "templates"

@@ -15,7 +15,7 @@ from sprung.benchmarks.through import through
 from sprung.model.identification.deviations import CARGO, deviations
 from sprung.model.simulate.linear import LinearSimulator
 from sprung.model.system import load_system
-from sprung.service.engine import load_engine
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import settings_with
 
 CARRIED = np.array([0.2, -0.05, -0.02, 0.01, -0.02])

@@ -17,15 +17,15 @@ import pytest
 import uvicorn
 
 from sprung.model.system import MANCHESTER, System, load_system
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult, Stage
-from sprung.service.engine import Engine
+from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult, Stage
+from sprung.service.monitoring.engine import Engine
+from sprung.service.processes.worker import Emit
 from sprung.service.report import write_report
 from sprung.service.settings import Settings
 from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.schema import fleet_status
-from sprung.service.worker import Emit
 from tests.oidc_provider import provider_settings, running_provider
 from tests.report_made import friction_report
 from tests.service_fakes import REPORT, STANDING, START, make_window
@@ -54,7 +54,7 @@ def serving(core: Core) -> Iterator[str]:
 def served(tmp_path_factory: pytest.TempPathFactory, system: System) -> Iterator[tuple[str, Core]]:
     """A running service with an alarmed vehicle and a good one."""
     from sprung.model.system import MANCHESTER_DBC
-    from sprung.service.engine import make_tracker
+    from sprung.service.monitoring.engine import make_tracker
     from tests.service_fakes import FakeIdentifier
 
     engine = Engine(system, FakeIdentifier(system), make_tracker(system), MANCHESTER_DBC)

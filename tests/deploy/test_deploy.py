@@ -17,11 +17,11 @@ import yaml
 
 from sprung.model.signals import Tally
 from sprung.model.system import System
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
-from sprung.service.live import FeedStatus
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
+from sprung.service.sources.live import FeedStatus
 from tests.monitoring import DEPLOY, RULES, ask, made, prometheus, queries
 from tests.service_fakes import make_window
 

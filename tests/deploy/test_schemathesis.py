@@ -14,9 +14,9 @@ import pytest
 import uvicorn
 
 from sprung.model.system import System
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import build_core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from tests.service_fakes import make_window
 

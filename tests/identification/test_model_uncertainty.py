@@ -7,7 +7,7 @@ from sprung.model.identification.excitation import simulate_runs
 from sprung.model.identification.identify import Identifier
 from sprung.model.identification.model_uncertainty import model_uncertainty, sampling_uncertainty
 from sprung.model.system import System, load_system, parse_system
-from sprung.service.engine import make_tracker
+from sprung.service.monitoring.engine import make_tracker
 from tests.strut import TEXT
 
 QUARTER_CAR = """

@@ -94,7 +94,7 @@ def test_more_values_than_a_file_can_hold_are_refused_from_what_it_states(
     assert "states 600 values" in refused(tmp_path / name)
 
 
-def test_row_groups_that_state_more_than_is_plausible_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_row_groups_that_state_too_much_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pyarrow = pytest.importorskip("pyarrow")
     from pyarrow.parquet import write_table
 

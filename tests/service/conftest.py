@@ -9,9 +9,9 @@ import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.system import System
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from tests.served import worsen
 
@@ -36,4 +36,4 @@ def broken(client: TestClient, core: Core, system: System) -> str:
 @pytest.fixture
 def reading_here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Uploads are read in this process: one of their own costs each test seconds; test_apart.py has them."""
-    monkeypatch.setattr("sprung.service.recordings.reading_limits", lambda settings, path: None)
+    monkeypatch.setattr("sprung.service.jobs.recordings.reading_limits", lambda settings, path: None)

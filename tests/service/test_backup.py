@@ -13,11 +13,11 @@ import pytest
 from sprung.model.system import System
 from sprung.service.backup import back_up, restore
 from sprung.service.cli import main
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.lock import held
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import open_store
 from tests.service_fakes import make_window

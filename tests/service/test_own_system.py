@@ -13,10 +13,10 @@ from fastapi.testclient import TestClient
 from sprung.model.identification.excitation import simulate_runs
 from sprung.model.system import System, load_system
 from sprung.model.tracking.tracker import Tracker
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.cli import main
 from sprung.service.core import build_core
-from sprung.service.engine import load_engine
+from sprung.service.monitoring.engine import load_engine
 from sprung.service.settings import Settings
 from tests.strut import TEXT
 from tests.test_system import QUARTER_CAR

@@ -13,7 +13,7 @@ from fastapi.testclient import TestClient
 from sqlalchemy.exc import OperationalError
 
 from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 
 

@@ -20,7 +20,7 @@ from sprung.model.laws.paths import maxwell_path, presliding_path, stop_path
 from sprung.model.laws.reversals import bouc_wen_memory
 from sprung.model.signals import FloatArray
 from sprung.model.system import System, load_system, parse_system
-from sprung.service.improved import write_improved
+from sprung.service.diagnosis.improved import write_improved
 
 RATE = 200.0
 K, C = 4.0e4, 1.5e3

@@ -21,8 +21,8 @@ from sprung.model.laws import CATALOGUE, ElementLaw
 from sprung.model.laws.own import load_laws
 from sprung.model.system import parse_system
 from sprung.service.cli.export import export
-from sprung.service.improved import improved_text
-from sprung.service.own_laws import write_laws
+from sprung.service.diagnosis.improved import improved_text
+from sprung.service.diagnosis.own_laws import write_laws
 from sprung.service.report.forces import force_figure
 from tests.diagnosis_cases import MadeRecord, quarter_car, simulate
 from tests.named_laws import element_law

@@ -12,7 +12,7 @@ from sprung.model.diagnosis.api import Options, diagnose
 from sprung.model.laws import SpringDamper
 from sprung.model.laws.along import force_along
 from sprung.model.system import parse_system
-from sprung.service.improved import improved_text, left_out
+from sprung.service.diagnosis.improved import improved_text, left_out
 from tests.diagnosis_cases import DAMPING, STIFFNESS, MadeRecord, quarter_car
 from tests.named_laws import element_law
 

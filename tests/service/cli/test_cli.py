@@ -21,8 +21,8 @@ from sprung.model.identification.estimator import Estimator, new_estimator
 from sprung.model.system import MANCHESTER, System
 from sprung.service.cli import describe, main
 from sprung.service.cli.bench import parse
-from sprung.service.engine import Engine, make_tracker
 from sprung.service.errors import UserError
+from sprung.service.monitoring.engine import Engine, make_tracker
 from sprung.service.settings import Settings
 from tests.diagnosis_cases import simulate
 from tests.service_fakes import START, FakeIdentifier
@@ -110,7 +110,7 @@ def test_replay_prints_a_line_per_window_and_a_summary(
 def test_a_recording_of_the_future_is_told_to_machines_and_people(
     healthy: Path, csv_system: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("sprung.service.feed.now_ns", lambda: START - 86_400 * 10**9)
+    monkeypatch.setattr("sprung.service.sources.feed.now_ns", lambda: START - 86_400 * 10**9)
     assert main(["replay", str(healthy), "--system", str(csv_system), "--json"]) == 0
     captured = capsys.readouterr()
     (problem,) = lines(captured.out)[-1]["summary"]["problems"]

@@ -23,9 +23,9 @@ from sprung.service.cli import describe, main
 from sprung.service.cli.doctor import _bus
 from sprung.service.cli.parameters import parameter_table
 from sprung.service.cli.replay import slower_line, told_when_interrupted
-from sprung.service.engine import Engine
-from sprung.service.feed import Fed
-from sprung.service.views import vehicle_view
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.views import vehicle_view
+from sprung.service.sources.feed import Fed
 
 ROOT = Path(__file__).parents[3]
 RIDE = ROOT / "tests" / "data" / "drift-600s.blf"

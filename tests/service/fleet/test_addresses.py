@@ -11,17 +11,17 @@ import pytest
 
 from sprung.model.system import System
 from sprung.replay.writing import write_recording
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill, list_recordings, local_copy
 from sprung.service.fleet.tasks import HereTasks
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import Store, history
 from sprung.service.store.archive import Archive
 from sprung.service.store.history import older_windows
-from tests.service.test_archive import forget
-from tests.service.test_store import DAY, fill, record
+from tests.service.store.test_archive import forget
+from tests.service.store.test_store import DAY, fill, record
 
 pytest.importorskip("pyarrow")
 START = 1_790_000_000_000_000_000

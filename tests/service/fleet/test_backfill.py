@@ -12,20 +12,20 @@ from sqlalchemy import func, select
 
 from sprung.model.system import System
 from sprung.replay.writing import write_recording
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
-from sprung.service.feed import feed_file
 from sprung.service.fleet import backfill as module
 from sprung.service.fleet.backfill import BackfillPlan, FoldedFile, backfill
 from sprung.service.fleet.tasks import HereTasks, WorkLost
-from sprung.service.pipeline import Pipeline
-from sprung.service.reading import ReadRequest, reading_of
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
+from sprung.service.processes.worker import ProcessLimits
 from sprung.service.settings import Settings
+from sprung.service.sources.feed import feed_file
+from sprung.service.sources.reading import ReadRequest, reading_of
 from sprung.service.store import Store, fleet, history, open_store, status
 from sprung.service.store.fleet import WantedAlarms
 from sprung.service.store.schema import alarms, models, windows
-from sprung.service.worker import ProcessLimits
 
 START = 1_790_000_000_000_000_000
 SECONDS = 12

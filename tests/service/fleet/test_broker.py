@@ -16,7 +16,6 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from sprung.model.system import System
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet import broker as module
 from sprung.service.fleet.broker import Broker, BrokerMessage, ConsumerCounts, consume
@@ -25,7 +24,8 @@ from sprung.service.fleet.kafka_broker import KafkaBroker
 from sprung.service.fleet.message import encode
 from sprung.service.fleet.nats_broker import NatsBroker, NatsLink, ack_seconds
 from sprung.service.fleet.spool import SpoolEntry
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from tests.service.fleet.test_ingest import Clock, messages
 
 

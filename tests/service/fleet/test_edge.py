@@ -14,12 +14,12 @@ import pytest
 
 from sprung.model.system import System
 from sprung.replay import open_recording
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.message import decode
 from sprung.service.fleet.onboard import Onboard, OnboardSettings
 from sprung.service.fleet.sending import Answer, HttpLink, LinksByKind, Sending
 from sprung.service.fleet.spool import Spool, SpoolEntry
+from sprung.service.monitoring.engine import Engine
 from tests.service_fakes import make_window
 
 

@@ -11,12 +11,12 @@ import pytest
 from sqlalchemy import event
 
 from sprung.model.system import System
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine
 from sprung.service.errors import UserError
 from sprung.service.fleet.ingest import Ingest, due_windows
 from sprung.service.fleet.message import Message, WindowEstimate, decode, encode
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.store import Store, open_store
 from sprung.service.store.status import Wanted, fleet_page
 from sprung.service.store.windows import known_windows

@@ -10,10 +10,10 @@ import pytest
 from fastapi.testclient import TestClient
 
 from sprung.model.system import System
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import build_core
-from sprung.service.engine import Engine
 from sprung.service.fleet.message import MEDIA_TYPE, Message, encode
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from tests.service.fleet.test_ingest import messages
 

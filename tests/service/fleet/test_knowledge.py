@@ -21,7 +21,7 @@ from sprung.service.store import Store, fleet, history
 from sprung.service.store.circumstances import Ran, add_circumstances
 from sprung.service.store.levels import FleetLevels, fleet_levels
 from sprung.service.store.windows import VehicleWindows, add_windows
-from tests.service.test_store import DAY, HOP, START, record
+from tests.service.store.test_store import DAY, HOP, START, record
 
 NAMES = ("secondary_1l.damping", "secondary_2l.damping", "primary_11l.stiffness")
 DAYS = 20

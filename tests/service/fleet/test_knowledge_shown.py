@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from fastapi.testclient import TestClient
 
-from sprung.service.api.app import create_app
+from sprung.service.app import create_app
 from sprung.service.core import Core, build_core
-from sprung.service.engine import Engine
+from sprung.service.monitoring.engine import Engine
 from sprung.service.settings import Settings
 from sprung.service.store import fleet, history
 from sprung.service.store.windows import Posterior, VehicleWindows, WindowRecord

@@ -12,11 +12,11 @@ from fastapi.testclient import TestClient
 
 from sprung.model.system import System
 from sprung.service.api.live_ingest import ingest_app
-from sprung.service.engine import Engine
 from sprung.service.errors import Busy
 from sprung.service.fleet.ingest import Ingest, Taken, read_messages
 from sprung.service.fleet.message import MEDIA_TYPE, Message, SentWindows, WindowEstimate, encode
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.settings import Settings
 from sprung.service.store import Store
 from tests.service.fleet.test_ingest import messages

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sprung.service.diagnosis_task import DiagnosisRequest, DiagnosisResult
+from sprung.service.diagnosis.task import DiagnosisRequest, DiagnosisResult
 from sprung.service.errors import UserError
 from sprung.service.fleet import many
 from sprung.service.fleet.many import DiagnosedFile, diagnose_many

@@ -9,10 +9,10 @@ import numpy as np
 
 from sprung.model.system import System
 from sprung.service.cli import main
-from sprung.service.compute import Compute
-from sprung.service.engine import Engine
 from sprung.service.fleet import local_postgres
-from sprung.service.pipeline import Pipeline
+from sprung.service.monitoring.compute import Compute
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.pipeline import Pipeline
 from sprung.service.store import Store, history, open_store
 from tests.service_fakes import make_window
 

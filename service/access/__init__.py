@@ -1,0 +1,1 @@
+"""Who may ask, and whom the service may call: tokens, OpenID Connect, addresses."""

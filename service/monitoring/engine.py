@@ -1,0 +1,177 @@
+"""The model side of the service, loaded once: system, identifier and tracker, and what the store keeps of them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sprung.model.identification.deviations import deviations
+from sprung.model.identifier import Identifies
+from sprung.model.signals import Estimate, FloatArray
+from sprung.model.system import MANCHESTER, System, load_system
+from sprung.model.tracking.alarms import LoadLimit
+from sprung.model.tracking.tracker import Tracker, TrackerSettings, TrackerState, TrackerStateError
+from sprung.service.can_database import database_of
+from sprung.service.errors import UserError
+from sprung.service.monitoring.signed import check_signature
+from sprung.service.settings import Settings
+
+WEIGHED_OF = (
+    2  # windows, one is weighed for gains and delays, so that a gain of 2 % is told in a minute: it costs as much
+)
+# as a refinement
+_SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall far apart
+
+log = logging.getLogger("sprung.engine")
+
+
+@dataclass(frozen=True, slots=True)
+class Engine:
+    """Everything that turns windows into tracked parameters."""
+
+    system: System
+    identifier: Identifies
+    tracker: Tracker
+    dbc: Path | None = None
+    weighed_of: int = WEIGHED_OF  # windows, one is weighed for gains, delays and loads
+
+    @property
+    def digest(self) -> str:
+        """The key of the model under which estimates are stored."""
+        return self.identifier.digest
+
+    def description(self) -> dict[str, Any]:
+        """What the store must know to read its arrays without this code."""
+        return {
+            "parameters": [{"name": p.name, "unit": p.unit, "nominal": p.nominal} for p in self.system.tracked],
+            "sensors": list(self.system.sensors),
+            "window": self.system.window,
+            "sample_rate": self.system.sample_rate,
+            "structure": self.system.structure,
+        }
+
+    def identify(
+        self, values: FloatArray, states: bool = False, starts: Sequence[int] | None = None
+    ) -> tuple[list[Estimate], dict[str, float]]:
+        """Estimates of windows, values of shape (B, T, C), and the seconds they took by stage.
+
+        starts: ns, of windows that will be tracked: measurements that are wrong are looked for, too.
+        """
+        examine = getattr(self.identifier, "examine", None)  # not every identifier can
+        if starts is None or examine is None:
+            estimates = self.identifier.identify(values, states=states)
+        else:
+            estimates = examine(values, np.array([self._weighed(start) for start in starts]))
+        times = self.identifier.times
+        return estimates, {"estimate": times.estimate, "refine": times.refine}
+
+    def _weighed(self, start: int) -> bool:
+        """Whether a window's evidence on gains and delays is computed: one of `weighed_of`."""
+        number = start // round(self.tracker.settings.hop * 1e9)
+        return bool(number * _SCATTERED % 2**32 < 2**32 // self.weighed_of)
+
+    def load_state(self, data: dict[str, Any]) -> TrackerState:
+        """A stored tracker state; one that cannot be read starts anew rather than stopping the service."""
+        try:
+            return self.tracker.upgraded(TrackerState.from_dict(data))
+        except TrackerStateError as error:
+            log.warning("a stored tracker state cannot be read (%s); the vehicle's baseline is learned anew", error)
+            return self.tracker.initial_state()
+
+
+def one_thread_an_operation() -> None:
+    """Have torch split none: batches are shared among workers instead, and single operations are too small.
+
+    In a process that was forked this comes before its first thread: there torch makes its threads anew when they are
+    first needed, and two threads that need them at the same moment fail ("Invalid thread pool", torch 2.13).
+    """
+    import torch
+
+    torch.set_num_threads(1)
+
+
+def load_engine(settings: Settings) -> Engine:
+    """Load the system file and the trained estimator that belongs to it.
+
+    Raises UserError, or the model's own one-line ValueErrors, when one of them cannot be used.
+    """
+    # takes a second; a bad system file is told before
+    from sprung.model.identification.identify import load_identifier, without_weights
+
+    one_thread_an_operation()
+    path = settings.system or MANCHESTER
+    system = load_system(path)
+    if not system.bodies:
+        raise UserError(
+            f"{path}: a component test has no bodies, so nothing to follow from window to window; "
+            f"`sprung diagnose FILE --system {path}` identifies it from a whole recording"
+        )
+    if not system.tracked:
+        raise UserError(f"{path}: estimates nothing; name stiffness, damping or mass under `estimate`")
+    if settings.weights is not None and (reason := without_weights(system)):
+        log.warning("%s: these weights are not used: %s", settings.weights, reason)
+    if settings.weights is not None and settings.weights_key is not None:
+        check_signature(settings.weights, settings.weights_key)
+    return Engine(
+        system,
+        load_identifier(system, settings.weights, workers=os.cpu_count() or 1),
+        make_tracker(system),
+        database_of(system, settings.dbc),
+    )
+
+
+def engine_like(engine: Engine, system: System) -> Engine:
+    """An engine of another system file with the same measurements.
+
+    Raises the model's one-line ValueErrors for a system whose windows cannot be identified.
+    """
+    from sprung.model.identification.identify import load_identifier  # brings torch
+
+    identifier = load_identifier(system)  # one worker: the other processors are for vehicles without such a file
+    return replace(engine, system=system, identifier=identifier, tracker=make_tracker(system))
+
+
+def seconds_of_a_window(engine: Engine) -> float:
+    """Processor time that one simulated window takes to be identified; 0 for systems without measured inputs."""
+    from sprung.model.identification.excitation import simulate_runs  # brings torch
+
+    system = engine.system.whole_system
+    if system.on_track or not system.file.inputs:
+        return 0.0
+    runs = simulate_runs(system, np.zeros((1, len(system.parameters))), system.window, np.random.default_rng(0))
+    begin = time.thread_time()
+    engine.identify(runs.values, starts=[0])
+    return time.thread_time() - begin
+
+
+def make_tracker(system: System) -> Tracker:
+    """The tracker of a system, told its window and hop."""
+    rate = system.sample_rate
+    settings = TrackerSettings(window=system.window / rate, hop=system.hop / rate)
+    limits = {load.body: LoadLimit(load.empty, load.least, load.most) for load in system.loads if load.declared}
+    elements = system.file.elements.items()
+    masses = {body: tuple(n for n, e in elements if body in (e.upper, e.lower)) for body in system.built}
+    return Tracker(
+        system.tracked,
+        settings,
+        deviations(system),
+        limits=limits,
+        model_uncertainty=_model_uncertainty(system),
+        masses=masses,
+    )
+
+
+def _model_uncertainty(system: System) -> tuple[FloatArray, FloatArray] | None:
+    """Systematic variances of parameters, and covariance of gains, delays and loads, from masses, positions and laws;
+    None: there are none."""
+    from sprung.model.identification.model_uncertainty import model_uncertainty  # brings torch
+
+    found = model_uncertainty(system, loads=True, tracked=True)
+    return None if found.none else (np.diag(found.parameters), found.deviations)

@@ -1,0 +1,95 @@
+"""Measured against simulated: what the identified model makes of the samples that are still held of a vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sprung.model.signals import Estimate, FloatArray
+from sprung.service.errors import NotFound
+from sprung.service.monitoring.engine import Engine
+from sprung.service.monitoring.ring import Excerpt
+from sprung.service.times import NANOSECONDS
+
+
+@dataclass(frozen=True, slots=True)
+class Compared:
+    """One window."""
+
+    start: int  # ns since epoch
+    sample_rate: float  # Hz
+    measured: FloatArray  # sensors, shape (T, S); NaN: absent
+    simulated: FloatArray  # shape (T, S)
+    estimate: Estimate
+
+
+def newest_window(engine: Engine, excerpt: Excerpt | None, vehicle: str) -> tuple[int, FloatArray]:
+    """Start and values (T, C) of the newest whole window that is held.  Raises NotFound where there is none."""
+    if unmeasured(engine):
+        raise NotFound(f"what moves {vehicle} is not measured, so there is nothing to simulate its sensors from")
+    for start, values in reversed(list(whole_windows(engine, excerpt))):
+        return start, values
+    raise NotFound(f"no recent samples of {vehicle} are held; they are kept for a minute after they came")
+
+
+def unmeasured(engine: Engine) -> bool:
+    """Whether the system is identified from its sensors alone."""
+    return engine.system.on_track or not engine.system.file.inputs
+
+
+def whole_windows(engine: Engine, excerpt: Excerpt | None) -> Iterator[tuple[int, FloatArray]]:
+    """Windows one after the other, oldest first, counted back from the newest sample; none with a missing input."""
+    if excerpt is None or unmeasured(engine):
+        return
+    length, inputs = engine.system.window, len(engine.system.inputs)
+    for first in range(len(excerpt.values) % length, len(excerpt.values) - length + 1, length):
+        values = excerpt.values[first : first + length]
+        present = np.isfinite(values)
+        sensors = present[:, inputs:]
+        if present[:, :inputs].all() and sensors.all(axis=0).any():
+            holed = sensors.any(axis=0) & ~sensors.all(axis=0)  # a sensor with a gap counts as absent
+            values = values.copy()
+            values[:, inputs:][:, holed] = np.nan
+            yield excerpt.start + round(first * NANOSECONDS / excerpt.sample_rate), values
+
+
+def compare(engine: Engine, start: int, values: FloatArray) -> Compared:
+    """Identify one window (T, C) and simulate its sensors; for the thread of the numerics."""
+    return compare_all(engine, [(start, values)])[0]
+
+
+def compare_all(engine: Engine, windows: Sequence[tuple[int, FloatArray]]) -> list[Compared]:
+    """Identify windows, starts and values (T, C), at once and simulate their sensors; as `compare`."""
+    if not windows:
+        return []
+    import torch  # as the engine does: it takes a second
+
+    from sprung.model.simulate.linear import LinearSimulator
+
+    values = np.stack([held for _, held in windows])  # shape (B, T, C)
+    estimates, _ = engine.identify(values, states=True)
+    inputs = len(engine.system.inputs)
+    outputs = [estimate.outputs for estimate in estimates]
+    linear = [i for i, found in enumerate(outputs) if found is None]
+    if linear:
+        simulator = LinearSimulator(engine.system)
+        drives = torch.as_tensor(simulator.knots(values[linear, :, :inputs]))
+        ratios = np.stack([estimates[i].log_ratio for i in linear])
+        discrete = simulator.discretise(simulator.element_values(torch.as_tensor(ratios)))
+        states = torch.as_tensor(np.stack([_states(estimates[i]) for i in linear]))
+        found = states @ discrete.C.transpose(1, 2) + drives @ discrete.D.transpose(1, 2)
+        for i, simulated in zip(linear, found.numpy(), strict=True):
+            outputs[i] = simulated
+    rate = engine.system.sample_rate
+    return [
+        Compared(start, rate, held[:, inputs:], simulated, estimate)
+        for (start, held), simulated, estimate in zip(windows, outputs, estimates, strict=True)
+        if simulated is not None
+    ]
+
+
+def _states(estimate: Estimate) -> FloatArray:
+    assert estimate.states is not None
+    return estimate.states

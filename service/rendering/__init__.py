@@ -1,0 +1,1 @@
+"""Pages as HTML and SVG: templates, static files, drawings; no HTTP."""

@@ -1,0 +1,1 @@
+"""Recordings and live buses into the pipeline."""

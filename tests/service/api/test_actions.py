@@ -1,0 +1,338 @@
+"""What operators do, and what they look at: actions, lists, the newest window, the bundle, the pages."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx2
+import jsonschema
+import numpy as np
+import pytest
+from fastapi.testclient import TestClient
+from mcap.reader import make_reader
+from sqlalchemy import select
+
+from sprung.model.system import System, parse_system
+from sprung.service.api import signals
+from sprung.service.app import create_app
+from sprung.service.core import Core, build_core
+from sprung.service.monitoring.engine import Engine
+from sprung.service.rendering.drawing import Mark, plan_view, side_view
+from sprung.service.settings import Settings
+from sprung.service.store import retention, work
+from sprung.service.store.schema import audit, metadata
+from sprung.service.times import from_iso
+from tests.service_fakes import START, FakeIdentifier, make_window
+
+
+def deeds(core: Core) -> list[str]:
+    with core.store.read() as connection:
+        return list(connection.execute(select(audit.c.action).order_by(audit.c.id)).scalars())
+
+
+def test_an_alarm_is_acknowledged_once_and_stays_active(client: TestClient, core: Core, broken: str) -> None:
+    alarms = client.get("/alarms?acknowledged=false&limit=1").json()
+    assert alarms["next"] is not None
+    one = alarms["alarms"][0]
+    assert client.post("/vehicles/a/acknowledge", json={"alarm": one["id"]}).status_code == 200
+    line = client.get("/vehicles").json()["vehicles"][0]
+    assert line["unacknowledged"] == line["alarms"] - 1
+    client.post("/vehicles/a/acknowledge", json={})
+    assert client.get("/vehicles?acknowledged=false").json()["vehicles"] == []
+    assert client.get("/vehicles/a").json()["health"] == "out_of_specification"
+    assert all(a["acknowledged_by"] == "local" for a in client.get("/vehicles/a/alarms").json()["alarms"])
+    assert deeds(core) == ["acknowledge", "acknowledge"]
+    assert client.post("/vehicles/a/acknowledge", json={"alarm": 999}).status_code == 404
+
+
+def test_a_maintenance_closes_alarms_and_learns_anew(
+    client: TestClient, core: Core, system: System, broken: str
+) -> None:
+    one = "secondary_2l.damping"
+    answer = client.post("/vehicles/a/maintenance", json={"text": "damper replaced", "parameters": [one]})
+    assert answer.status_code == 201 and answer.json()["parameters"] == [one]
+    states = {p["name"]: p["state"] for p in client.get("/vehicles/a").json()["parameters"]}
+    assert states.pop(one) == "learning" and set(states.values()) <= {"alarm", "ok"}
+    client.post("/vehicles/a/maintenance", json={"text": "overhaul"})
+    after = client.get("/vehicles/a").json()
+    assert after["health"] == "ok" and after["alarms"] == []
+    assert 'sprung_alarms_active{severity="alarm",vehicle="a"} 0.0' in client.get("/metrics").text
+    core.pipeline.process("a", [make_window(system, 140 + i, 0.3) for i in range(80)])
+    assert {p["state"] for p in client.get("/vehicles/a").json()["parameters"]} == {"ok"}
+    assert [m["text"] for m in client.get("/vehicles/a/marks").json()["marks"]] == ["overhaul", "damper replaced"]
+    wrong = client.post("/vehicles/a/maintenance", json={"text": "x", "parameters": ["wing.stiffness"]})
+    assert wrong.status_code == 422 and wrong.json()["errors"][0]["field"] == "parameters"
+
+
+def test_names_retirement_and_deletion(client: TestClient, core: Core, broken: str) -> None:
+    assert client.patch("/vehicles/a", json={"label": "Car 17"}).json()["label"] == "Car 17"
+    assert "Car 17" in client.get("/").text
+    assert client.get("/vehicles?q=car%2017").json()["vehicles"][0]["vehicle"] == "a"
+    client.patch("/vehicles/a", json={"retired": True})
+    assert client.get("/vehicles").json()["vehicles"] == []
+    assert 'vehicle="a"' not in client.get("/metrics").text
+    assert [v["vehicle"] for v in client.get("/vehicles?retired=true").json()["vehicles"]] == ["a"]
+    assert client.delete("/vehicles/a?confirm=b").status_code == 422
+    assert client.delete("/vehicles/a?confirm=a").status_code == 204
+    assert client.get("/vehicles/a").status_code == 404
+    with core.store.read() as connection:
+        for table in metadata.tables.values():
+            if "vehicle_id" in table.c:
+                assert connection.execute(select(table).where(table.c.vehicle_id == "a")).first() is None, table
+    assert deeds(core) == ["rename", "retire", "delete"]
+
+
+def test_the_same_key_does_the_same_thing_once(client: TestClient, broken: str) -> None:
+    headers = {"Idempotency-Key": "k1"}
+    first = client.post("/vehicles/a/notes", json={"text": "seen"}, headers=headers)
+    second = client.post("/vehicles/a/notes", json={"text": "seen"}, headers=headers)
+    assert first.json() == second.json() and second.headers["idempotency-replayed"] == "true"
+    assert len(client.get("/vehicles/a/marks").json()["marks"]) == 1
+    other = client.post("/vehicles/a/notes", json={"text": "another"}, headers=headers)
+    assert other.status_code == 422
+    files = {"file": ("ride.csv", b"time,a\n0,1\n")}
+    jobs = [client.post("/recordings", files=files, headers={"Idempotency-Key": "k2"}).json()["id"] for _ in "ab"]
+    assert jobs[0] == jobs[1]
+    assert len(client.get("/jobs").json()["jobs"]) == 1
+
+
+@pytest.mark.parametrize("path", ["/recordings", "/diagnose"])
+def test_a_key_that_was_used_for_another_upload_is_refused(client: TestClient, path: str) -> None:
+    headers = {"Idempotency-Key": "k"}
+
+    def send(name: str = "ride.csv", content: bytes = b"time,a\n0,1\n", vehicle: str = "a") -> httpx2.Response:
+        return client.post(path, files={"file": (name, content)}, data={"vehicle": vehicle}, headers=headers)
+
+    first = send()
+    assert first.status_code == 202
+    for other in (send(content=b"time,a\n0,2\n"), send(name="other.csv"), send(vehicle="b")):
+        assert other.status_code == 422 and other.json()["errors"][0]["field"] == "Idempotency-Key"
+    again = send()
+    assert again.json() == first.json() and again.headers["idempotency-replayed"] == "true"
+    headers["Idempotency-Key"] = "another"
+    assert send(content=b"time,a\n0,2\n").json()["id"] != first.json()["id"]
+
+
+def test_a_body_counts_however_its_type_is_written(client: TestClient, broken: str) -> None:
+    headers = {"Idempotency-Key": "k", "Content-Type": "Application/JSON ; charset=utf-8"}
+    first, other = (
+        client.post("/vehicles/a/notes", content=f'{{"text": "{text}"}}', headers=headers) for text in ("one", "two")
+    )
+    assert (first.status_code, other.status_code) == (201, 422)
+
+
+def test_tokens_of_one_name_share_no_answers(client: TestClient, core: Core, broken: str) -> None:
+    answers = []
+    for fleet in ("", "a"):
+        text, _ = core.tokens.create("depot", ["operate"], fleet)
+        headers = {"Idempotency-Key": "k", "Authorization": f"Bearer {text}"}
+        answers.append(client.post("/vehicles/a/notes", json={"text": "seen"}, headers=headers))
+    assert [answer.status_code for answer in answers] == [201, 201]
+    assert "idempotency-replayed" not in answers[1].headers
+
+
+def test_wrong_notes_are_refused(client: TestClient, broken: str) -> None:
+    for body, field in (
+        ({}, "text"),
+        ({"text": ""}, "text"),
+        ({"text": "x", "time": "noon"}, "time"),
+        ({"text": "x", "who": 1}, "who"),
+    ):
+        answer = client.post("/vehicles/a/notes", json=body)
+        assert answer.status_code == 422 and answer.json()["errors"][0]["field"] == field, body
+
+
+def test_the_newest_window_measured_and_simulated(client: TestClient, broken: str, system: System) -> None:
+    answer = client.get("/vehicles/a/window").json()
+    assert set(answer["sensors"]) == set(system.sensors)
+    trace = answer["sensors"]["car_1l"]
+    assert len(trace["measured"]) == len(trace["simulated"]) == system.window
+    assert np.subtract(trace["measured"], trace["simulated"]) == pytest.approx(trace["residual"], rel=1e-3, abs=1e-9)
+    assert client.get("/vehicles/nobody/window").status_code == 404
+
+
+def test_the_bundle_is_read_by_mcap_itself(client: TestClient, broken: str, system: System) -> None:
+    client.post("/vehicles/a/notes", json={"text": "looked at"})
+    answer = client.get("/vehicles/a/bundle")
+    reader = make_reader(io.BytesIO(answer.content), validate_crcs=True)
+    topics: dict[str, int] = {}
+    for schema, channel, message in reader.iter_messages(log_time_order=False):
+        assert schema is not None and schema.encoding == "jsonschema"
+        topics[channel.topic] = topics.get(channel.topic, 0) + 1
+        if channel.topic != "/events" and topics[channel.topic] > 10:  # all others of a topic are made the same way
+            continue
+        body, wanted = json.loads(message.data), json.loads(schema.data)
+        assert set(wanted["required"]) <= set(body) <= set(wanted["properties"])
+        if schema.name == "foxglove.Log":
+            jsonschema.validate(body, FOXGLOVE_LOG)
+    assert topics["/signals/car_1l"] >= 6000
+    assert topics["/compared/car_1l"] >= 5900
+    assert topics["/estimate/secondary_2l/damping"] > 50
+    assert topics["/events"] >= 3
+    assert {"/fit", "/signals/wheel_11l.displacement"} <= set(topics)
+
+
+def logged(content: bytes) -> list[str]:
+    """What the events of a bundle about itself say."""
+    found = make_reader(io.BytesIO(content)).iter_messages(topics=["/events"])
+    bodies = [json.loads(message.data) for _, _, message in found]
+    return [body["message"] for body in bodies if body["name"] == "bundle"]
+
+
+@pytest.fixture
+def brief(engine: Engine, data_dir: Path, system: System) -> Iterator[tuple[TestClient, Core]]:
+    """A service that holds ten seconds of samples, and a vehicle with an alarm that was raised longer ago."""
+    core = build_core(Settings(data_dir=data_dir, ring_seconds=10.0), engine)
+    with TestClient(create_app(core), raise_server_exceptions=False) as client:
+        core.pipeline.process("a", [make_window(system, i) for i in range(80)])
+        for first in range(80, 140, 2):  # as they come live
+            core.pipeline.process("a", [make_window(system, first + i, 0.3) for i in range(2)])
+        yield client, core
+
+
+def test_an_alarms_bundle_holds_its_signals_when_it_is_long_over(
+    brief: tuple[TestClient, Core], system: System
+) -> None:
+    client, core = brief
+    first = client.get("/vehicles/a/alarms").json()["alarms"][-1]
+    assert first["bundle"] == f"/vehicles/a/bundle?alarm={first['id']}"
+    answer = client.get(first["bundle"])
+    assert "alarm-" in answer.headers["content-disposition"]
+    times = [m.log_time for _, _, m in make_reader(io.BytesIO(answer.content)).iter_messages(["/signals/car_1l"])]
+    onset, raised = (from_iso(first[name]) for name in ("onset", "raised"))
+    assert times[0] <= onset <= raised <= times[-1] < make_window(system, 130).start
+    assert ["the onset of alarm" in text for text in logged(answer.content)] == [True]
+    rows = [row for row in client.get("/recordings").json()["recordings"] if row["source"] == "alarm"]
+    files = list(core.settings.uploads.iterdir())
+    assert len(rows) == len(files) == 1, "alarms of one cause share their signals"
+    files[0].unlink()
+    assert ["could not be read" in text for text in logged(client.get(first["bundle"]).content)] == [True]
+    assert client.get("/vehicles/a/bundle?alarm=999").status_code == 404
+    assert client.get("/vehicles/a/bundle?alarm=0").status_code == 422
+
+
+def test_signals_of_alarms_are_bounded_and_go_with_the_vehicle(brief: tuple[TestClient, Core]) -> None:
+    client, core = brief
+    with core.store.write() as connection:
+        assert retention.surplus_alarm_signals(connection, "a", 1, 1_000_000_000) == []
+    files = list(core.settings.uploads.iterdir())
+    assert len(files) == 1
+    with core.store.read() as connection:
+        assert retention.surplus_alarm_signals(connection, "b", 1, 1) == [files[0].name], "more than all may take"
+        connection.rollback()
+    assert client.delete("/vehicles/a?confirm=a").status_code == 204
+    assert list(core.settings.uploads.iterdir()) == []
+
+
+def test_a_bundle_is_not_made_for_its_head(client: TestClient, broken: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signals, "bundle", None)
+    monkeypatch.setattr(signals, "compare_all", None)
+    answer = client.head("/vehicles/a/bundle")
+    assert answer.status_code == 200 and answer.headers["content-disposition"].endswith('"a.mcap"')
+    assert client.head("/vehicles/nobody/bundle").status_code == 404
+    assert client.head("/vehicles/a/bundle?alarm=999").status_code == 404
+
+
+@pytest.mark.parametrize("kind", ["csv", "mcap"])
+def test_histories_as_files_hold_every_parameter(client: TestClient, broken: str, system: System, kind: str) -> None:
+    answer = client.get(f"/vehicles/a/history?format={kind}")
+    assert answer.headers["content-disposition"].endswith(f'a-history.{kind}"')
+    if kind == "csv":
+        head, *rows = answer.text.splitlines()
+        assert head.split(",")[:4] == [
+            "time", "seconds", "windows", f"{system.parameters[0].name} [N/m]",
+        ]  # fmt: skip
+        assert len(head.split(",")) == 3 + 2 * len(system.parameters) and len(rows) == 140
+        assert float(rows[-1].split(",")[3]) == pytest.approx(system.parameters[0].nominal * np.exp(0.3), rel=0.01)
+    else:
+        topics = {channel.topic for _, channel, _ in make_reader(io.BytesIO(answer.content)).iter_messages()}
+        assert topics == {f"/estimate/{p.element}/{p.quantity}" for p in system.parameters}
+
+
+def test_histories_as_parquet(client: TestClient, broken: str, system: System) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(io.BytesIO(client.get("/vehicles/a/history?format=parquet").content))
+    assert table.num_rows == 140 and system.parameters[0].name in table.column_names
+    assert table.schema.metadata[b"vehicle"] == b"a"
+
+
+def test_pages_show_states_and_what_to_do(client: TestClient, core: Core, system: System, broken: str) -> None:
+    page = client.get("/pages/vehicles/a").text
+    assert "All of them together" in page and 'class="spring alarm"' in page
+    assert page.count('class="element"') == len(system.elements)
+    assert page.count('data-sensor="') >= len(system.sensors)
+    core.pipeline.process("young", [make_window(system, i) for i in range(5)])
+    assert "no baseline yet" in client.get("/pages/vehicles/young").text
+    core.pipeline.process("lossy", [make_window(system, i, outcome="dropped") for i in range(5)])
+    assert "Most windows are dropped" in client.get("/pages/vehicles/lossy").text
+    assert "acknowledge" in client.get("/pages/alarms").text
+    assert client.get("/pages/work").status_code == 200
+
+
+def test_a_misfit_tells_what_became_of_its_diagnosis(
+    client: TestClient, core: Core, system: System, identifier: FakeIdentifier
+) -> None:
+    identifier.chi_square = 5.0
+    core.pipeline.process("a", [make_window(system, i) for i in range(12)])
+    assert "no diagnosis yet" in client.get("/pages/vehicles/a").text
+    row = work.JobRow("one", "diagnosis", "running", None, "a", 0.1, None, None, START, START)
+    with core.store.write() as connection:
+        work.add_job(connection, row)
+    assert "diagnosis running" in client.get("/pages/vehicles/a").text
+    with core.store.write() as connection:
+        work.update_job(connection, "one", START, state="failed", error="the job took longer than 600 s")
+    assert "diagnosis failed</a>: the job took longer than 600 s" in client.get("/pages/vehicles/a").text
+
+
+def test_data_in_pages_cannot_break_out(client: TestClient, broken: str) -> None:
+    client.post("/vehicles/a/notes", json={"text": "</script><script>alert(1)</script>"})
+    client.patch("/vehicles/a", json={"label": "<b>x</b>"})
+    for path in ("/pages/vehicles/a", "/"):
+        text = client.get(path).text
+        assert "<script>alert" not in text and "<b>x</b>" not in text
+
+
+FOXGLOVE_LOG = {  # what Foxglove publishes of its schema foxglove.Log, without descriptions
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {
+                "sec": {"type": "integer", "minimum": 0},
+                "nsec": {"type": "integer", "minimum": 0, "maximum": 999_999_999},
+            },
+        },
+        "level": {"enum": [0, 1, 2, 3, 4, 5]},
+        "message": {"type": "string"},
+        "name": {"type": "string"},
+        "file": {"type": "string"},
+        "line": {"type": "integer", "minimum": 0},
+    },
+    "additionalProperties": False,
+}
+
+
+RIG = """
+name: rig
+sample_rate: 200
+window: 128
+bodies:
+  body: {mass: 300.0}
+inputs:
+  shaker: {kind: displacement, displacement: {csv: z, noise: 1e-5}}
+elements:
+  strut: {upper: body, lower: shaker, stiffness: 18500.0, damping: 1190.0}
+sensors:
+  top: {kind: acceleration, body: body, csv: a, noise: 0.01}
+"""
+
+
+def test_a_test_rig_is_not_drawn_as_a_railway_vehicle(system: System) -> None:
+    rig = parse_system(RIG)
+    drawn = side_view(rig, {"strut.stiffness": Mark("ok")}, {"top": Mark("ok")})
+    assert 'class="wheel"' not in drawn and 'class="table"' in drawn
+    assert side_view(system, {}, {}).count('class="wheel"') == 8
+    assert "strut: not estimated" not in plan_view(rig, {"strut.stiffness": Mark("ok")})

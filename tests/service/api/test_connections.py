@@ -1,0 +1,94 @@
+"""Who holds connections: in total, from several addresses, and without taking what is answered."""
+
+from __future__ import annotations
+
+import socket
+import time
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import pytest
+
+from sprung.service.api.server import STALLED_SECONDS
+from sprung.service.core import build_core
+from sprung.service.monitoring.engine import Engine
+from tests.served import served
+from tests.service.api.test_server import ask, settings
+
+HALF = b"GET /vehicles HTTP/1.1\r\nHost: loc"
+ONE = b"GET /static/vendor/swagger-ui-bundle.js HTTP/1.1\r\nHost: localhost\r\n\r\n"  # 1.5 MB, without a token
+LARGE = 5 * ONE  # more than the kernel holds for a client
+
+
+def client(stack: ExitStack, port: int, host: str, data: bytes) -> socket.socket:
+    """A client of an address of this machine that takes next to nothing by itself."""
+    one = stack.enter_context(socket.socket())
+    one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+    one.bind((host, 0))
+    one.settimeout(10)
+    one.connect(("127.0.0.1", port))
+    one.sendall(data)
+    return one
+
+
+@pytest.mark.parametrize("data", [HALF, LARGE])
+def test_many_addresses_together_do_not_lock_others_out(engine: Engine, tmp_path: Path, data: bytes) -> None:
+    limits = {"connections": 24, "client_connections": 10, "header_seconds": 60, "body_idle_seconds": 60}
+    core = build_core(settings(tmp_path, **limits), engine)
+    with served(core) as port, ExitStack() as stack:
+        for address in [f"127.0.0.{k}" for k in (2, 3, 4)] * 10:
+            client(stack, port, address, data)
+        deadline, served_others = time.monotonic() + STALLED_SECONDS + 20, 0
+        while served_others < 3:
+            with suppress(ConnectionError):  # the first seconds: their answers are still on the way
+                served_others += b"200 OK" in ask(port)
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+
+
+def test_an_answer_that_nobody_takes_is_given_up(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, body_idle_seconds=1), engine)
+    with served(core) as port, ExitStack() as stack:
+        for data in (LARGE, 4 * ONE + ONE.replace(b"\r\n\r\n", b"\r\nConnection: close\r\n\r\n")):
+            silent, taken = client(stack, port, "127.0.0.2", data), 0
+            time.sleep(3.0)
+            with suppress(ConnectionError):
+                while piece := silent.recv(65536):
+                    taken += len(piece)
+            assert taken < 6_000_000
+        assert len(ask(port, "/static/vendor/swagger-ui-bundle.js")) > 1_400_000
+
+
+def test_others_are_served_while_slow_clients_are_answered(engine: Engine, tmp_path: Path) -> None:
+    """They take a little all the time, so that none of them only waits."""
+    core = build_core(settings(tmp_path, connections=24, client_connections=12), engine)
+    with served(core) as port, ExitStack() as stack:
+        slow = [client(stack, port, f"127.0.0.{2 + k % 2}", LARGE) for k in range(24)]
+        for _ in range(5):
+            for one in slow:
+                with suppress(OSError):
+                    one.recv(512)
+            assert b"200 OK" in ask(port)
+            time.sleep(0.1)
+
+
+def test_who_is_refused_hears_why(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, client_connections=2), engine)
+    with served(core) as port, ExitStack() as stack:
+        following = b"GET /events HTTP/1.1\r\nHost: localhost\r\n\r\n"
+        for one in [client(stack, port, "127.0.0.1", following) for _ in range(2)]:
+            assert one.recv(100).startswith(b"HTTP/1.1 200")
+        answer = ask(port, headers="X-Long: " + 5000 * "x" + "\r\n")
+        assert answer.startswith(b"HTTP/1.1 503")
+        assert b"retry-after" in answer
+
+
+def test_what_is_given_up_does_not_stay_in_the_kernel(engine: Engine, tmp_path: Path) -> None:
+    core = build_core(settings(tmp_path, body_idle_seconds=1), engine)
+    with served(core) as port, ExitStack() as stack:
+        silent, taken = client(stack, port, "127.0.0.2", ONE), 0
+        time.sleep(3.0)
+        with pytest.raises(ConnectionResetError):
+            while taken < 1_500_000:
+                taken += len(silent.recv(65536)) or 1_500_000
+        assert taken < 400_000

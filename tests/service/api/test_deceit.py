@@ -1,0 +1,99 @@
+"""Names, texts and requests that would deceive who reads them somewhere else: a terminal, a proxy, another database."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import logging
+import socket
+from pathlib import Path
+
+import pytest
+from fastapi.testclient import TestClient
+
+from sprung.model.system import System
+from sprung.service.core import Core, build_core
+from sprung.service.monitoring.engine import Engine
+from sprung.service.observability.logs import PlainLines
+from tests.served import served
+from tests.service.api.test_server import settings
+from tests.service_fakes import make_window
+
+DECEIVING = ["a\0b", "\x1b[31mred", "a\rb", "\x85", "\u202egnp.exe", "\u2066x", "a\u200bb", "a\u2028b"]
+
+
+@pytest.mark.parametrize("text", [*DECEIVING, "two\nlines"])
+def test_labels_are_one_line_without_hidden_characters(
+    core: Core, client: TestClient, system: System, text: str
+) -> None:
+    core.pipeline.process("a", [make_window(system, 0)])
+    assert client.patch("/vehicles/a", json={"label": text}).status_code == 422
+    assert client.patch("/vehicles/a", json={"label": "Größe 😀 <b>"}).status_code == 200
+
+
+def test_notes_may_have_lines_and_tabs_and_nothing_else_hidden(core: Core, client: TestClient, system: System) -> None:
+    core.pipeline.process("a", [make_window(system, 0)])
+    for text in (text for text in DECEIVING if text != "a\rb"):
+        assert client.post("/vehicles/a/notes", json={"text": text}).status_code == 422, text
+    assert client.post("/vehicles/a/notes", json={"text": "two\r\nlines\tand more"}).status_code == 201
+
+
+def test_an_upload_is_called_without_hidden_characters(core: Core, client: TestClient) -> None:
+    name = "\x1b[31m\u202ea.csv"
+    form = f'--b\r\nContent-Disposition: form-data; name="file"; filename="{name}"\r\n\r\nx\r\n--b--\r\n'.encode()
+    answer = client.post("/recordings", content=form, headers={"Content-Type": "multipart/form-data; boundary=b"})
+    assert answer.status_code == 202
+    detail = client.get("/audit").json()[0]["detail"]
+    assert detail["name"] == "_[31m_a.csv"
+
+
+def test_a_terminal_is_told_nothing_by_a_log() -> None:
+    told = {"name": "x", "levelno": 40, "levelname": "ERROR", "msg": "%s", "args": ("\x1b[2Jof\x07\nx.csv",)}
+    assert PlainLines().format(logging.makeLogRecord(told)) == r"sprung: ERROR: \x1b[2Jof\x07 x.csv"
+
+
+def test_a_body_of_two_lengths_is_refused_and_the_connection_closed(engine: Engine, tmp_path: Path) -> None:
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        two = b"POST /identify HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nContent-Length: 5\r\n"
+        line.sendall(two + b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\nGET /health/live HTTP/1.1\r\nHost: x\r\n\r\n")
+        answer = b""
+        while piece := line.recv(65536):  # until it is closed
+            answer += piece
+        assert answer.startswith(b"HTTP/1.1 400 ") and answer.count(b"HTTP/1.1") == 1
+        assert b"give Content-Length or Transfer-Encoding" in answer
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [b"\x16\x03\x01\x02\x00", b"GET /\r\n\r\n", b"POST /identify HTTP/1.1\r\nHost: x\r\nContent-Length: +2\r\n\r\n{}"],
+)
+def test_what_is_no_http_is_answered_as_every_error(engine: Engine, tmp_path: Path, request_: bytes) -> None:
+    with (
+        served(build_core(settings(tmp_path), engine)) as port,
+        socket.create_connection(("127.0.0.1", port), timeout=10) as line,
+    ):
+        line.sendall(request_ + b"\r\n\r\n")
+        answer = b""
+        while piece := line.recv(65536):
+            answer += piece
+    head, body = answer.split(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 400 ") and b"application/problem+json" in head
+    assert json.loads(body)["status"] == 400
+
+
+def test_a_compressed_body_is_not_guessed_at(client: TestClient) -> None:
+    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
+    answer = client.post("/identify", content=gzip.compress(b"0" * 1_000_000), headers=headers)
+    assert answer.status_code == 415 and answer.headers["accept-encoding"] == "identity"
+    assert (
+        client.post("/identify", content=b"{}", headers=headers | {"Content-Encoding": "Identity"}).status_code == 422
+    )
+
+
+def test_a_query_that_says_two_things_is_refused(client: TestClient) -> None:
+    assert client.get("/vehicles?limit=5&limit=7").json()["detail"] == "limit: is there more than once"
+    several = "/vehicles/a/history?parameter=primary_11l.stiffness&parameter=primary_11r.stiffness"
+    assert client.get(several).status_code == 404  # of the vehicle
