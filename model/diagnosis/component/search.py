@@ -295,7 +295,9 @@ def _accepted(
     # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
     alone = len(current.fit.model.pieces) == len(base.model.pieces)
     most = 1 - rules.by_lag if alone else rules.together
-    near = [r for r in near if not isinstance(r.last, Lag) or _leaves_nothing(r.fit, current.fit, most)]
+    lags = [r.last for r in near if isinstance(r.last, Lag) and _leaves_nothing(r.fit, current.fit, most)]
+    lags = [lag for lag in lags if alone or not lag.filters]  # oil behind valves filters their force likewise
+    near = [r for r in near if not isinstance(r.last, Lag) or r.last in lags]
     if not near and alone and not current.fit.leaves_more:
         return None  # nothing but a channel's delay within what noise leaves open: no law in its place
     if not near:
@@ -350,7 +352,8 @@ def _swapped(chosen: Ranked, pieces: tuple[LawPiece, ...], rules: ComponentRules
     best = chosen
     for index in range(given, len(model.pieces) - 1):
         rest = fitted(chosen.fit.task, model.without(index))
-        for rival in next_laws(rest, _beside(pieces, rest.model, given), rules)[:2]:
+        others = tuple(p for p in _beside(pieces, rest.model, given) if not isinstance(p, Lag))  # see `_accepted`
+        for rival in next_laws(rest, others, rules)[:2]:
             same = _rank([rival.fit, best.fit], rest, rules)
             if same[0].fit is rival.fit and same[0].evidence > same[1].evidence + rules.naming_margin:
                 best = same[0]
