@@ -87,7 +87,7 @@ def test_valves_behind_oil_that_gives_way_are_no_filter_of_the_cell(stiff: float
     force, state, step = np.empty(len(d)), 0.0, 1 / (RATE * FINER)
     knee = C * 0.04
     for i, rate in enumerate(v.tolist()):
-        sign, size = (1.0, abs(state)) if state > 0 else (0.6, abs(state) / 0.6)
+        size = abs(state) if state > 0 else abs(state) / 0.6
         valve = np.sign(state) * (size / C if size < knee else 0.04 + (size - knee) / (0.3 * C))
         state += step * stiff * (rate - valve)
         force[i] = state

@@ -81,8 +81,9 @@ def test_what_cannot_be_written_is_told_before_the_work(
 
 
 def test_names_in_a_recording_are_no_markup_and_tell_a_terminal_nothing(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
     path = tmp_path / "signals.csv"
     path.write_text("time,a [/b],\x1b[31mc\u202e\n" + "".join(f"{i / 100},{i},{i % 7}\n" for i in range(100)))
     assert main(["inspect", str(path)]) == 0

@@ -53,7 +53,7 @@ def test_a_backfill_without_ray_reads_stores_and_goes_on(
         ("fleet backfill {0} --since 2026-03-01T00:00:00Z --until 2026-02-01T00:00:00Z", "is not after --since"),
         ("fleet backfill {0} --since yesterday", "--since yesterday: give an RFC 3339 time"),
         ("fleet backfill {0} --on moon", "--on moon: known are here, ray, auto"),
-        ("fleet diagnose {0} --on here --out {0}/a.mcap", "a.mcap: is no folder"),
+        ("fleet diagnose {0} --on here --out {0}/a.mcap", "a.mcap: is a file; a folder is needed"),
         ("fleet consume http://127.0.0.1", "give nats://HOST:PORT or kafka://HOST:PORT/TOPIC"),
         ("fleet consume nats://127.0.0.1:1", "no NATS server answers"),
         ("fleet consume kafka:///topic", "give an address as in kafka://HOST:9092/TOPIC"),
