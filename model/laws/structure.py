@@ -74,8 +74,7 @@ MISSING_CONNECTION = StructureLaw(
     absent=(0.0, 0.0, 0.0, 0.0),
     looks_like="two bodies pull each other; springs between them or to others seem off together",
     confused_with=("anti_roll_bar", "wrong_position", "suspended_mass", "mass_change"),
-    sentence="they are connected by a spring of {stiffness} and a damper of {damping} that the system file does not "
-    "have",
+    sentence="the system file lacks a connection between them: stiffness {stiffness}, damping {damping}",
     axes={2: "x", 3: "y"},
     powers={0: (1.0, 0.0), 1: (0.0, 1.0)},
     strengths=(0, 1),
