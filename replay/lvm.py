@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -35,17 +35,19 @@ def columns(path: Path) -> list[Column]:
     lines = path.read_text(encoding="utf-8-sig", errors="replace").splitlines()
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
         raise UnreadableRecording(f"{path}: not a LabVIEW measurement file (its first line says 'LabVIEW Measurement')")
-    words = {cells[0]: cells[1:] for cells in (line.split("\t") if "\t" in line else line.split(",") for line in lines)}
+    start = next((i + 1 for i, line in enumerate(lines) if line.startswith(END)), len(lines))
+    head = (line.split("\t") if "\t" in line else line.split(",") for line in lines[:start])
+    words = {cells[0]: cells[1:] for cells in head}
     separator = _SEPARATORS.get("".join(words.get("Separator", ["Tab"])[:1]).strip().lower(), "\t")
     point = "".join(words.get("Decimal_Separator", ["."])[:1]).strip() or "."
     shape = "".join(words.get("X_Columns", ["One"])[:1]).strip().lower()
     found: list[Column] = []
     seen: Counter[str] = Counter()
     try:
-        for segment in _segments(lines, separator):
+        for segment in _segments(lines[start:], separator):
             for column in _of_segment(segment, point, shape):
-                seen[column.name] += 1
-                found.append(column if seen[column.name] == 1 else _renamed(column, seen[column.name]))
+                number = seen[column.name] = seen[column.name] + 1
+                found.append(column if number == 1 else replace(column, name=f"{column.name} #{number}"))
     except (ValueError, IndexError) as error:
         raise UnreadableRecording(f"{path}: a damaged segment: {error}") from error
     if not found:
@@ -53,13 +55,9 @@ def columns(path: Path) -> list[Column]:
     return found
 
 
-def _renamed(column: Column, number: int) -> Column:
-    return Column(f"{column.name} #{number}", column.length, column.read, column.unit, column.clock)
-
-
 def _segments(lines: Sequence[str], separator: str) -> Iterator[_Segment]:
-    """Segments after the file's own header."""
-    at = next((i + 1 for i, line in enumerate(lines) if line.startswith(END)), len(lines))
+    """Segments of the lines after the file's own header."""
+    at = 0
     while at < len(lines):
         end = next((i for i in range(at, len(lines)) if lines[i].startswith(END)), None)
         if end is None or end + 1 >= len(lines):

@@ -40,9 +40,8 @@ from sprung.model.system import System
 TOGETHER_STD = 0.01  # relative, common to all masses without `std` (bogies of one drawing); no window shows it
 MASS_STD = 0.005  # relative, of each of them beside that; four times as much fits no window
 INERTIA_STD = 0.005  # relative, of a roll or pitch inertia beyond that of its mass; likewise
-PLACE_STD = (
-    0.002  # of a body's furthest point, of where springs and sensors are: 3 mm on a bogie, 2 cm on a car; likewise
-)
+# of a body's furthest point, of where springs and sensors are: 3 mm on a bogie, 2 cm on a car; likewise
+PLACE_STD = 0.002
 INERTIAS = "roll_inertia", "pitch_inertia"
 _WINDOWS = 8  # of the simulated reference ride; sensitivities differ little between them
 _RIDE = 120.0  # windows that a tracker soon has averaged

@@ -23,10 +23,9 @@ from sprung.service.errors import UserError
 from sprung.service.monitoring.signed import check_signature
 from sprung.service.settings import Settings
 
-WEIGHED_OF = (
-    2  # windows, one is weighed for gains and delays, so that a gain of 2 % is told in a minute: it costs as much
-)
-# as a refinement
+# one window of so many is weighed for gains and delays, which costs as much as a refinement: enough to tell a gain of
+# 2 % in a minute
+WEIGHED_OF = 2
 _SCATTERED = 2654435761  # 2^32 over the golden ratio (Knuth): neighbours fall far apart
 
 log = logging.getLogger("sprung.engine")

@@ -295,9 +295,12 @@ def _accepted(
     # beside a valve or a loop a lag is as well oil or rubber that gives way, unless next to nothing is left with it
     alone = len(current.fit.model.pieces) == len(base.model.pieces)
     most = 1 - rules.by_lag if alone else rules.together
-    lags = [r.last for r in near if isinstance(r.last, Lag) and _leaves_nothing(r.fit, current.fit, most)]
-    lags = [lag for lag in lags if alone or not lag.filters]  # oil behind valves filters their force likewise
-    near = [r for r in near if not isinstance(r.last, Lag) or r.last in lags]
+    # and never a filter: oil behind valves filters their force likewise
+    near = [
+        r
+        for r in near
+        if not isinstance(r.last, Lag) or ((alone or not r.last.filters) and _leaves_nothing(r.fit, current.fit, most))
+    ]
     if not near and alone and not current.fit.leaves_more:
         return None  # nothing but a channel's delay within what noise leaves open: no law in its place
     if not near:
